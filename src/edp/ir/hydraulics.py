@@ -1,4 +1,4 @@
-"""The layer of a grey box: one tick of pumps, valves, cylinders and their load as differential equations."""
+"""The layer of a grey box: one tick of pumps, valves, cylinders, motors and their load as differential equations."""
 
 from __future__ import annotations
 

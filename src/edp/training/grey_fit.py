@@ -136,11 +136,12 @@ class GreyProblem:
             return self.tie.numbers(theta)
         table = self.twin.table
         grown = self.begin * np.exp(np.clip(theta * self.plausible, -12.0, 12.0))
-        return np.where(table.positive, grown, self.begin + table.width * theta)
+        return np.where(table.positive, grown, self.begin + table.width * theta)[table.leader]
 
     def slope(self, numbers: Doubles) -> Doubles:
-        """Derivative of each number by its own coordinate."""
-        return np.where(self.twin.table.positive, numbers * self.plausible, self.twin.table.width)
+        """Derivative of each number by its own coordinate, or by that of its leader."""
+        table = self.twin.table
+        return np.where(table.positive, numbers * self.plausible, table.width)[table.leader]
 
     def losses(self, theta: Doubles, drawn: GreyRound, full: bool) -> tuple[Doubles, Doubles, Doubles]:
         """Matrix and gradient by the coordinates, and the loss of each lane."""
@@ -157,8 +158,18 @@ class GreyProblem:
             matrix, gradient = slopes.T @ matrix @ slopes, slopes.T @ gradient
         elif full:
             slope = self.slope(numbers)
-            matrix, gradient = matrix * slope * slope[:, None], gradient * slope
+            matrix, gradient = _led(matrix * slope * slope[:, None], gradient * slope, self.twin.table.leader)
         return matrix, gradient, np.nan_to_num(losses, nan=1e12, posinf=1e12)
+
+
+def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple[Doubles, Doubles]:
+    """What is by a number that always has another one's value is by that one's coordinate; its own does nothing."""
+    for index in np.flatnonzero(leader != np.arange(len(leader))):
+        matrix[leader[index]] += matrix[index]
+        matrix[:, leader[index]] += matrix[:, index]
+        gradient[leader[index]] += gradient[index]
+        matrix[index], matrix[:, index], gradient[index] = 0.0, 0.0, 0.0
+    return matrix, gradient
 
 
 def fit_grey_box(

@@ -104,6 +104,7 @@ def test_logs_and_machines_that_do_not_fit_are_refused_and_nothing_is_written(ed
     ("change", "message"),
     [
         ("twin.kind=residual", "twin.kind = 'residual' came"),
+        ('twin.motors=[{name="swing", velocity="rate"}]', "the grey box has motors; a machine of the simulator has"),
         ('twin.without=["play"]', "twin.without = ['play'] leaves out numbers that a machine file has"),
     ],
 )

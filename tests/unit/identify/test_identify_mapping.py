@@ -8,7 +8,8 @@ import pytest
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.numbers import KNOTS, Travel, number_table
+from edp.networks.twin.grey.numbers import number_table
+from edp.networks.twin.grey.plausible import KNOTS, Travel
 from edp.networks.twin.grey.steps import GAMMA
 from edp.signals import VOCABULARY, Channel, Kind
 from edp.sim.machine.machine_files import load_machine, parse_machine

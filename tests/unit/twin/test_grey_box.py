@@ -14,7 +14,8 @@ from edp.networks.twin import fit_scales
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
 from edp.networks.twin.grey.elements import CylinderElement, Elements, PumpElement, ValveElement
-from edp.networks.twin.grey.numbers import Travel, monomials, number_table
+from edp.networks.twin.grey.numbers import monomials, number_table
+from edp.networks.twin.grey.plausible import Travel
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators

@@ -1,4 +1,4 @@
-"""A grey box: pumps, valves, cylinders and their load as differential equations, with numbers fitted to free runs."""
+"""A grey box: pumps, valves, cylinders, motors and their load as differential equations, fitted to free runs."""
 
 from __future__ import annotations
 
@@ -15,20 +15,23 @@ from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
+from edp.networks.twin.grey.connections import check_elements
 from edp.networks.twin.grey.correction import Cell, Trace
 from edp.networks.twin.grey.elements import (
     CylinderElement,
     Elements,
+    MotorElement,
     PumpElement,
     ValveElement,
-    check_elements,
     default_elements,
 )
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.grey.lowering import add_layer
-from edp.networks.twin.grey.numbers import KNOTS, LEFT_OUT, NumberTable, Travel, number_table
+from edp.networks.twin.grey.numbers import LEFT_OUT, NumberTable, number_table
+from edp.networks.twin.grey.plausible import KNOTS, Travel
 from edp.networks.twin.grey.run import run_lanes
 from edp.networks.twin.grey.start import load_start
+from edp.networks.twin.grey.wiring import Wiring, turning_scales
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
 from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, integer
 
@@ -48,7 +51,8 @@ class GreyBox:
 
     Attributes:
         cylinders: with their channels.
-        valves: spools between pumps and cylinders.
+        motors: with their channels.
+        valves: spools between pumps and cylinders or motors.
         pumps: with their lines; none: valves are fed at constant pressure.
         inertia_degree: of the polynomials of the strokes that stand for the root of the inertia.
         potential_degree: of the polynomial that stands for gravity.
@@ -62,6 +66,7 @@ class GreyBox:
     """
 
     cylinders: tuple[CylinderElement, ...] = ()
+    motors: tuple[MotorElement, ...] = ()
     valves: tuple[ValveElement, ...] = ()
     pumps: tuple[PumpElement, ...] = ()
     inertia_degree: int = 2
@@ -73,7 +78,7 @@ class GreyBox:
     def __post_init__(self) -> None:
         degree = integer(0, 4)
         check_bounds("grey box", self, inertia_degree=degree, potential_degree=integer(1, 6), prefix_ticks=PREFIX)
-        for name in ("cylinders", "valves", "pumps"):
+        for name in ("cylinders", "motors", "valves", "pumps"):
             check_count("grey box", name, getattr(self, name), MOST_NAMES)
         check_count("grey box", "without", self.without, len(LEFT_OUT))
         for part in self.without:
@@ -89,8 +94,8 @@ class GreyBox:
         Raises:
             ConfigError: a port that is not connected, or pressures that no element has.
         """
-        if self.cylinders or self.valves or self.pumps:
-            elements = Elements(self.pumps, self.cylinders, self.valves)
+        if self.cylinders or self.motors or self.valves or self.pumps:
+            elements = Elements(self.pumps, self.cylinders, self.valves, self.motors)
         else:
             elements = default_elements(channels)
         check_elements(elements, channels)
@@ -104,14 +109,15 @@ class GreyBox:
         full = [_full(commands[:, _sides(valve, channels)]) for valve in elements.valves]
         arrays = {"numbers": table.nominal.astype(np.float32), "full": np.array(full, np.float32)}
         twin = self.build(channels, scales, arrays | self._network(channels, seed))
-        declared = [cylinder.areas is not None for cylinder in elements.cylinders]
+        # Both sides of a motor are the same, so that there is nothing to learn of the second one.
+        declared = [isinstance(one, MotorElement) or one.areas is not None for one in elements.actuators]
         values = load_start(table, train, twin.wiring.columns, twin.wiring.z_of, channels.rate_hz, declared)
         return twin.with_numbers(values)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """All numbers, and the full command of each valve."""
         elements = self.elements(channels)
-        travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.cylinders)
+        travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.actuators)
         table = number_table(elements, travels, [1.0] * len(elements.pumps), self._degrees, self.without)
         return {"numbers": (len(table.numbers),), "full": (len(elements.valves),)}
 
@@ -122,6 +128,9 @@ class GreyBox:
         numbers = arrays["numbers"].astype(np.float64)
         if not (numbers[table.positive] > 0).all():
             raise ValueError("one of its numbers is not positive")
+        if not (numbers == numbers[table.leader]).all():
+            raise ValueError("both sides of one of its motors have not the same displacement")
+        scales = turning_scales(elements, channels, scales)
         wiring = Wiring.of(elements, channels, scales)
         return GreyTwin(channels, scales, self, (table, wiring), numbers, arrays["full"])
 
@@ -141,11 +150,11 @@ class GreyBox:
             return float(scales.high[names.index(name)]) / HIGHEST / 1e6 if name else 30.0
 
         travels = []
-        for cylinder in elements.cylinders:
-            i = names.index(cylinder.velocity)
+        for actuator in elements.actuators:
+            i = names.index(actuator.velocity)
             low, high = (scales.low[count + i], scales.high[count + i]) if channels.strokes else (-0.5, 0.5)
-            fastest = float(scales.high[i]) / FASTEST
-            travels.append(Travel(float(low), float(high), fastest, (highest(cylinder.head), highest(cylinder.rod))))
+            fastest, (first, second) = float(scales.high[i]) / FASTEST, actuator.chambers
+            travels.append(Travel(float(low), float(high), fastest, (highest(first), highest(second))))
         pumps = [highest(pump.pressure) * HIGHEST for pump in elements.pumps]
         return number_table(elements, travels, pumps, self._degrees, self.without)
 
@@ -158,71 +167,6 @@ def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
 def _full(commands: Array) -> float:
     """The largest command; a command that never moved is full at 1."""
     return float(np.abs(commands).max()) or 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Wiring:
-    """Which channel is which state of the grey box.
-
-    Attributes:
-        sides: columns of the commands that extend and retract ``(valve, 2)``; -1: none.
-        actuator: of each valve; `pump` its pump, -1: supply.
-        pump: of each valve.
-        ports: kind (velocity, stroke, pressure) and number of the state behind each answer ``(answer, 2)``.
-        columns: answers of velocity, stroke, head and rod pressure of each cylinder; -1: not measured.
-        z_of: middle of the strokes (m) and scale to -1..1; a scale of 0 where a stroke is not measured.
-        nodes: pressures that are states.
-    """
-
-    sides: NDArray[np.int64]
-    actuator: NDArray[np.int64]
-    pump: NDArray[np.int64]
-    ports: NDArray[np.int64]
-    columns: tuple[tuple[int, int, int, int], ...]
-    z_of: tuple[Doubles, Doubles]
-    nodes: int
-
-    @staticmethod
-    def of(elements: Elements, channels: TwinChannels, scales: TwinScales) -> Wiring:
-        """The wiring of connected elements."""
-        names = [channel.name for channel in channels.answers]
-        commands = [channel.name for channel in channels.commands]
-        speeds = [channel.name for channel in channels.velocities]
-        n, count = len(elements.cylinders), len(speeds)
-        column = {name: i for i, name in enumerate(names)} | {"": -1}
-        ports = np.zeros((len(names), 2), np.int64)
-        columns, middle, scale = [], np.zeros(n), np.zeros(n)
-        for i, cylinder in enumerate(elements.cylinders):
-            speed = speeds.index(cylinder.velocity)
-            stroke = count + speed if channels.strokes else -1
-            head, rod = column[cylinder.head], column[cylinder.rod]
-            columns.append((speed, stroke, head, rod))
-            for answer, kind, which in ((speed, 0, i), (stroke, 1, i), (head, 2, i), (rod, 2, n + i)):
-                if answer >= 0:
-                    ports[answer] = kind, which
-            if stroke >= 0:
-                low, high = float(scales.low[stroke]), float(scales.high[stroke])
-                middle[i], scale[i] = 0.5 * (low + high), 2.0 / (high - low)
-        for m, pump in enumerate(elements.pumps):
-            if pump.pressure:
-                ports[column[pump.pressure]] = 2, 2 * n + m
-        cylinders = [cylinder.name for cylinder in elements.cylinders]
-        pumps = [pump.name for pump in elements.pumps]
-        sides = [(commands.index(v.extend), commands.index(v.retract) if v.retract else -1) for v in elements.valves]
-        return Wiring(
-            np.array(sides),
-            np.array([cylinders.index(v.actuator) for v in elements.valves]),
-            np.array([pumps.index(v.supply) if v.supply else -1 for v in elements.valves]),
-            ports,
-            tuple(columns),
-            (middle, scale),
-            2 * n + len(pumps),
-        )
-
-    @property
-    def whole(self) -> bool:
-        """Whether every state of the load is measured."""
-        return len(self.ports) == self.nodes + 2 * len(self.columns)
 
 
 @dataclass(frozen=True, eq=False)

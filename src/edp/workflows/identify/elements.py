@@ -17,6 +17,10 @@ from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
 from edp.workflows.identify.mapping import GreyParts
 
+NO_MOTORS = (
+    "the grey box has motors; a machine of the simulator has the cylinders of boom, arm and bucket alone: leave "
+    "twin.motors out, and channels of motors out of the logs with [channels]"
+)
 BEYOND = 0.03
 """Share of a stroke that logs may lie beyond the machine's, and of its full pilot that commands may."""
 
@@ -104,6 +108,8 @@ def parts_of(twin: GreyTwin, elements: Elements, machine: Machine, celsius: floa
     Raises:
         ConfigError: elements that are no excavator front, or pumps that are paired otherwise.
     """
+    if elements.motors:
+        raise ConfigError(NO_MOTORS)
     names = [cylinder.name for cylinder in elements.cylinders]
     if len(names) != len(CYLINDERS) or len(elements.pumps) != 2:
         raise ConfigError(

@@ -32,7 +32,7 @@ from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.twin_bundle import load_twin
 from edp.workflows.identify.bodies import Poses, realised
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
-from edp.workflows.identify.elements import check_strokes, excavator_elements, full_commands, parts_of
+from edp.workflows.identify.elements import NO_MOTORS, check_strokes, excavator_elements, full_commands, parts_of
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
 from edp.workflows.identify.machine_text import machine_text
 from edp.workflows.identify.mapping import GreyParts
@@ -174,6 +174,8 @@ def _whole_grey_box(spec: TwinSpec | AutoTwin) -> GreyBox:
             f"settings: a machine is identified by a grey box, twin.kind = '{KINDS.name_of(spec)}' came; leave it out, "
             "or set twin.kind = 'greybox'"
         )
+    if spec.motors:
+        raise ConfigError(NO_MOTORS)
     if spec.without:
         raise ConfigError(
             f"settings: twin.without = {list(spec.without)} leaves out numbers that a machine file has; identify with "

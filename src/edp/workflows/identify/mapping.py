@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as grey
-from edp.networks.twin.grey.numbers import KNOTS, NumberTable
+from edp.networks.twin.grey.numbers import NumberTable
+from edp.networks.twin.grey.plausible import KNOTS
 from edp.networks.twin.grey.steps import GAMMA
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Machine

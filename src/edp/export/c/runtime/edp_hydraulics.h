@@ -1,4 +1,4 @@
-/* Pumps, valves, cylinders and their load as differential equations: one tick of a grey box, in double precision.
+/* Pumps, valves, cylinders, motors and their load as differential equations: one tick of a grey box, in double precision.
  *
  * Units within are m, s, MPa, MN and Gg (10^6 kg). The state is kept in single precision from tick to tick. Each implicit
  * stage takes as many Newton iterations as it needs, EDP_MOST_ITERATIONS at most: time a tick on the target.

@@ -22,7 +22,7 @@ BASIS = (
 
 
 def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, Any]]:
-    """A row for each number that is fitted, SI units.
+    """A row for each number that is fitted, and for the inertia of each actuator, which follows of them; SI units.
 
     Args:
         table: of the grey box.
@@ -50,6 +50,35 @@ def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list
                 "low": low,
                 "high": high,
                 "excited": bool(deviation < UNEXCITED),
+            }
+        )
+    return rows + _inertias(table, values, information)
+
+
+def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, Any]]:
+    """A row for the inertia of each actuator with the others at rest, at the middle of all strokes.
+
+    It is the sum of squares of its row of the root, whose first coefficients are the root there; its interval follows
+    from theirs and their covariance.
+    """
+    covariance = np.linalg.inv(information + np.eye(len(values)))
+    rows, first = [], table.inertia_at
+    for a, first_number in enumerate(table.actuator_at):
+        own = first + table.inertia_terms * np.arange(a + 1)
+        first = int(own[-1]) + table.inertia_terms
+        root = table.numbers[own[0]]
+        value, slope = float(values[own] @ values[own]), 2.0 * values[own] * table.width[own]
+        deviation = float(np.sqrt(slope @ covariance[np.ix_(own, own)] @ slope))
+        reach, factor = NORMAL * deviation, root.factor**2
+        rows.append(
+            {
+                "element": "load",
+                "name": f"inertia_{table.numbers[first_number].element}",
+                "unit": root.unit.replace("kg^0.5", "kg").replace(" m", " m^2"),
+                "value": value * factor,
+                "low": max(value - reach, 0.0) * factor,
+                "high": (value + reach) * factor,
+                "excited": bool(deviation < UNEXCITED * float(np.sqrt(slope @ slope))),
             }
         )
     return rows

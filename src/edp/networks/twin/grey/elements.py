@@ -1,4 +1,4 @@
-"""Elements of which a grey box is made, as a settings file names them, and how they are connected."""
+"""Elements of which a grey box is made, as a settings file names them, or as names and kinds of channels tell them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 
 from edp.data.roles import roles_of
 from edp.data.twin_channels import TwinChannels
-from edp.errors import ConfigError, closest
+from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.settings.bounds import check_bounds, integer, span
+from edp.signals import Channel, Kind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,15 +71,78 @@ class CylinderElement:
         head = self.count * np.pi / 4 * self.bore**2
         return head, head - self.count * np.pi / 4 * self.rod_diameter**2
 
+    @property
+    def position(self) -> str:
+        """Channel of its position; empty: not named."""
+        return self.stroke
+
+    @property
+    def chambers(self) -> tuple[str, str]:
+        """Channels of both chambers' pressures; empty: not measured."""
+        return self.head, self.rod
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorElement:
+    """A hydraulic motor with its load: chambers of constant volume, as much oil a radian on both sides, no end stops.
+
+    A gear belongs to it: velocity, displacement and load are those of the shaft whose velocity is measured.
+
+    Attributes:
+        name: that valves call it by.
+        velocity: channel of its angular velocity, positive where oil goes from `a` to `b`.
+        angle: channel of its angle; empty: the one of the velocity, where positions are measured.
+        a: channel of the pressure at the port that extension feeds; empty: not measured.
+        b: channel of the pressure at the other port; empty: not measured.
+        displacement: of one motor, m^3/rad; 0: not known, learned from a plausible one.
+        count: motors side by side on one shaft.
+        load_by_angle: whether inertia and potential depend on its angle, which must be measured then and stays where it
+            was in the training data; otherwise it turns without end, and no load depends on it.
+
+    Raises:
+        ConfigError: a size out of range.
+    """
+
+    name: str
+    velocity: str
+    angle: str = ""
+    a: str = ""
+    b: str = ""
+    displacement: float = 0.0
+    count: int = 1
+    load_by_angle: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(f"motor '{self.name}'", self, displacement=span(0.0, 10.0), count=integer(1, 100))
+
+    @property
+    def areas(self) -> tuple[float, float] | None:
+        """Oil a radian of both sides, m^3/rad; None where the displacement is not known."""
+        return (self.count * self.displacement,) * 2 if self.displacement else None
+
+    @property
+    def position(self) -> str:
+        """Channel of its angle; empty: not named."""
+        return self.angle
+
+    @property
+    def chambers(self) -> tuple[str, str]:
+        """Channels of both ports' pressures; empty: not measured."""
+        return self.a, self.b
+
+
+Actuator = CylinderElement | MotorElement
+
 
 @dataclass(frozen=True, kw_only=True)
 class ValveElement:
-    """A spool that connects a pump with a cylinder.
+    """A spool that connects a pump with a cylinder or a motor.
 
     Attributes:
         name: for readers.
-        actuator: name of the cylinder.
-        extend: channel that commands extension, or both ways by its sign where `retract` is empty.
+        actuator: name of the cylinder or motor.
+        extend: channel that commands extension (of a motor: positive turning), or both ways by its sign where `retract`
+            is empty.
         retract: channel that commands retraction.
         supply: name of the pump; empty: a supply of constant pressure.
         meter_out: whether it opens the other chamber to the tank, too; a second spool may only feed.
@@ -96,15 +160,28 @@ class ValveElement:
 
 @dataclass(frozen=True)
 class Elements:
-    """A machine: its pumps, cylinders and valves, connected."""
+    """A machine: its pumps, cylinders, motors and valves, connected."""
 
     pumps: tuple[PumpElement, ...]
     cylinders: tuple[CylinderElement, ...]
     valves: tuple[ValveElement, ...]
+    motors: tuple[MotorElement, ...] = ()
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """Cylinders, then motors: the order of the states."""
+        return self.cylinders + self.motors
+
+    @property
+    def load_variables(self) -> tuple[int, ...]:
+        """Actuators on whose positions inertia and potential depend."""
+        return tuple(
+            i for i, one in enumerate(self.actuators) if not isinstance(one, MotorElement) or one.load_by_angle
+        )
 
 
 def default_elements(channels: TwinChannels) -> Elements:
-    """What names and kinds of the channels say: a cylinder for each velocity, a spool for each command of it.
+    """What names and kinds say: a cylinder for each velocity, a motor for each angular one, a spool for each command.
 
     Raises:
         ConfigError: pressures whose place they do not tell.
@@ -115,14 +192,13 @@ def default_elements(channels: TwinChannels) -> Elements:
     commands = tuple(channel.name for channel in channels.commands)
     roles = roles_of(recording)
     axes = {axis.velocity: axis for axis in roles.axes}
-    cylinders, valves, left = [], [], [c.name for c in channels.pressures]
+    actuators, valves, left = [], [], [c.name for c in channels.pressures]
     for i, velocity in enumerate(channels.velocities):
         axis = axes.get(velocity.name)
         name = axis.name if axis else velocity.name
         own = [p for p in (axis.pressures if axis else ()) if p in names]
         left = [p for p in left if p not in own]
-        head, rod = (*own, "", "")[:2]
-        cylinders.append(CylinderElement(name=name, velocity=velocity.name, head=head, rod=rod))
+        actuators.append(_actuator(name, velocity, own, bool(channels.strokes)))
         command = tuple(c for c in (axis.command if axis else ()) if c in commands)
         command = command or commands[i : i + 1] or commands[:1]
         valves.append(ValveElement(name=name, actuator=name, extend=command[0], retract=(*command, "")[1]))
@@ -137,87 +213,33 @@ def default_elements(channels: TwinChannels) -> Elements:
     if len(left) > 2:
         raise ConfigError(
             f"grey box: nothing tells which element has the pressure '{left[0]}'; name all elements in the tables "
-            "[[twin.cylinders]], [[twin.valves]] and [[twin.pumps]]"
+            "[[twin.cylinders]], [[twin.motors]], [[twin.valves]] and [[twin.pumps]]"
         )
     pumps = tuple(PumpElement(name=f"pump_{m + 1}", pressure=name) for m, name in enumerate(left))
-    return _paired(tuple(cylinders), valves, second, pumps)
+    return _paired(tuple(actuators), valves, second, pumps)
+
+
+def _actuator(name: str, velocity: Channel, pressures: Sequence[str], angles: bool) -> Actuator:
+    """A cylinder, or a motor where the velocity is an angular one."""
+    first, second = (*pressures, "", "")[:2]
+    if velocity.kind is Kind.ANGULAR_VELOCITY:
+        # A measured angle may be that of a joint, which gravity turns: nothing tells that it is not.
+        return MotorElement(name=name, velocity=velocity.name, a=first, b=second, load_by_angle=angles)
+    return CylinderElement(name=name, velocity=velocity.name, head=first, rod=second)
 
 
 def _paired(
-    cylinders: tuple[CylinderElement, ...],
+    actuators: tuple[Actuator, ...],
     valves: Sequence[ValveElement],
     second: Sequence[ValveElement],
     pumps: tuple[PumpElement, ...],
 ) -> Elements:
     """Valves with their pumps: of two pumps, neighbouring spools take turns, and a second spool has the other pump."""
+    cylinders = tuple(one for one in actuators if isinstance(one, CylinderElement))
+    motors = tuple(one for one in actuators if isinstance(one, MotorElement))
     if not pumps:
-        return Elements(pumps, cylinders, (*valves, *second))
-    turn = {cylinder.name: i % len(pumps) for i, cylinder in enumerate(cylinders)}
+        return Elements(pumps, cylinders, (*valves, *second), motors)
+    turn = {actuator.name: i % len(pumps) for i, actuator in enumerate(actuators)}
     first = tuple(replace(v, supply=pumps[turn[v.actuator]].name) for v in valves)
     other = tuple(replace(v, supply=pumps[(turn[v.actuator] + 1) % len(pumps)].name) for v in second)
-    return Elements(pumps, cylinders, first + other)
-
-
-def check_elements(elements: Elements, channels: TwinChannels) -> None:
-    """Refuse elements that do not connect.
-
-    Raises:
-        ConfigError: which port of which element, and what is missing.
-    """
-    commands = [c.name for c in channels.commands]
-    parts = {
-        "velocity": [c.name for c in channels.velocities],
-        "stroke": [c.name for c in channels.strokes],
-        "pressure": [c.name for c in channels.pressures],
-    }
-    used: dict[str, str] = {}
-
-    def port(element: str, which: str, name: str, choices: Sequence[str], what: str, needed: bool) -> None:
-        if not name and not needed:
-            return
-        if name not in choices:
-            came = (
-                f"is '{name}', which is no {what} of this twin{closest(name, choices)}" if name else "is not connected"
-            )
-            raise ConfigError(
-                f"grey box: port '{which}' of {element} {came}; connect it to one of "
-                f"{', '.join(choices) or 'none (this twin has none)'}"
-            )
-
-    def own(element: str, which: str, name: str) -> None:
-        if name and name in used:
-            raise ConfigError(f"grey box: '{name}' is connected to {used[name]} and to {element}, port '{which}'")
-        used[name] = element
-
-    for kind, entries in (("pump", elements.pumps), ("cylinder", elements.cylinders), ("valve", elements.valves)):
-        names = [entry.name for entry in entries]
-        twice = [name for name in names if names.count(name) > 1]
-        if twice:
-            raise ConfigError(f"grey box: two elements of kind {kind} are called '{twice[0]}'")
-    for pump in elements.pumps:
-        port(f"pump '{pump.name}'", "pressure", pump.pressure, parts["pressure"], "pressure", False)
-        own(f"pump '{pump.name}'", "pressure", pump.pressure)
-    for cylinder in elements.cylinders:
-        here = f"cylinder '{cylinder.name}'"
-        port(here, "velocity", cylinder.velocity, parts["velocity"], "velocity", True)
-        port(here, "stroke", cylinder.stroke, parts["stroke"], "stroke", False)
-        for which in ("velocity", "stroke", "head", "rod"):
-            if which in ("head", "rod"):
-                port(here, which, getattr(cylinder, which), parts["pressure"], "pressure", False)
-            own(here, which, getattr(cylinder, which))
-    for valve in elements.valves:
-        here = f"valve '{valve.name}'"
-        port(here, "actuator", valve.actuator, [c.name for c in elements.cylinders], "cylinder", True)
-        port(here, "supply", valve.supply, [p.name for p in elements.pumps], "pump", False)
-        port(here, "extend", valve.extend, commands, "command", True)
-        port(here, "retract", valve.retract, commands, "command", False)
-    for cylinder in elements.cylinders:
-        if not any(valve.actuator == cylinder.name for valve in elements.valves):
-            raise ConfigError(
-                f"grey box: cylinder '{cylinder.name}' has no valve; give one with this name at its port 'actuator'"
-            )
-    for name in (*parts["velocity"], *parts["pressure"]):
-        if name not in used:
-            raise ConfigError(
-                f"grey box: no element has the channel '{name}'; connect it, or leave it out of [channels]"
-            )
+    return Elements(pumps, cylinders, first + other, motors)

@@ -14,7 +14,7 @@ from edp.ir.builder import indices
 from edp.ir.hydraulics import NONE, HydraulicTick
 from edp.ir.reference import STEPS
 from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
-from edp.networks.twin.grey.numbers import KNOTS
+from edp.networks.twin.grey.plausible import KNOTS
 from edp.networks.twin.grey.run import run_lanes
 
 if TYPE_CHECKING:

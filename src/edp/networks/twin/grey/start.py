@@ -2,8 +2,8 @@
 
     A_A p_A = A_B p_B + M v' + grad U(s) + F_C sign(v) + F_v v
 
-It is linear in all that is not known, so it needs no starting values of its own. Pose-dependent inertia is left to the
-fit on free runs.
+For a motor these are torques, and both areas are its displacement. The balance is linear in all that is not known, so
+it needs no starting values of its own. Pose-dependent inertia is left to the fit on free runs.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ REACH = 2
 """Ticks before and after over which velocities are differenced: noise falls, and swings of a few Hz stay."""
 FEW = 40_000
 """Rows that are solved for at most."""
+LEAST_INERTIA = 0.02
+"""Of what is plausible."""
 SHARE_RANGE = (0.2, 1.0)
 """Of rod area by head area; what is moments outside is not believed."""
 
@@ -39,15 +41,18 @@ def load_start(
     Args:
         table: of numbers.
         train: training stretches.
-        columns: of velocity, stroke, head and rod pressure of each cylinder among the answers; -1: not measured.
+        columns: of velocity, stroke, head and rod pressure of each actuator among the answers; -1: not measured.
         z_of: middle and scale of the strokes.
         rate_hz: samples per second.
-        declared: whether the areas of each cylinder are known.
+        declared: whether the areas of each actuator are known, or one follows of the other.
     """
     values = table.nominal
-    if any(column < 0 for entry in columns for column in entry):
+    by_stroke = np.asarray(table.exponents.any(axis=0))
+    needed = np.ones((len(columns), 4), np.bool_)
+    needed[:, 1] = by_stroke
+    if (needed & (np.array(columns) < 0)).any():
         return values
-    rows = _rows(train, columns, rate_hz)
+    rows = _rows(train, columns, by_stroke, rate_hz)
     speed, pull, stroke, head, rod = (np.moveaxis(rows[:, :, k], 0, 0) for k in range(5))
     n, exponents = len(columns), table.exponents
     z = (stroke - z_of[0]) * z_of[1]
@@ -87,9 +92,11 @@ def _taken(
     mass = np.zeros((n, n))
     for k, (p, r) in enumerate(inertia):
         mass[p, r] = mass[r, p] = solution[k]
-    moments, vectors = np.linalg.eigh(mass)
-    # At least 200 kg along each direction: noise must not make an inertia negative.
-    low = np.linalg.cholesky((vectors * np.maximum(moments, 2e-4)) @ vectors.T)
+    # In plausible inertias of each actuator: those of a motor may be a millionth of a cylinder's.
+    start = np.diag([values[table.inertia_at + k * table.inertia_terms] for k, (p, r) in enumerate(inertia) if p == r])
+    moments, vectors = np.linalg.eigh(np.linalg.solve(start, np.linalg.solve(start, mass).T))
+    # At least a fiftieth of it along each direction (200 kg): noise must not make an inertia negative.
+    low = start @ np.linalg.cholesky((vectors * np.maximum(moments, LEAST_INERTIA)) @ vectors.T)
     for k, (p, r) in enumerate(inertia):
         values[table.inertia_at + k * table.inertia_terms] = low[p, r]
     potential = len(table.exponents) - 1
@@ -104,8 +111,13 @@ def _taken(
     return values
 
 
-def _rows(train: Sequence[Series], columns: Sequence[tuple[int, int, int, int]], rate_hz: float) -> Array:
-    """Velocity, acceleration, stroke, head and rod pressure ``(row, cylinder, 5)``, far from the stops."""
+def _rows(
+    train: Sequence[Series], columns: Sequence[tuple[int, int, int, int]], by_stroke: NDArray[np.bool_], rate_hz: float
+) -> Array:
+    """Velocity, acceleration, stroke, head and rod pressure ``(row, actuator, 5)``, far from the stops.
+
+    The stroke is zero where no load depends on it (`by_stroke`), as a motor has no stops.
+    """
     parts = []
     every = max(1, sum(series.samples for series in train) // FEW)
     for series in train:
@@ -115,12 +127,13 @@ def _rows(train: Sequence[Series], columns: Sequence[tuple[int, int, int, int]],
         for i, (speed, stroke, head, rod) in enumerate(columns):
             part[:, i, 0] = middle[:, speed]
             part[:, i, 1] = (values[2 * REACH :, speed] - values[: -2 * REACH, speed]) * rate_hz / (2 * REACH)
-            part[:, i, 2] = middle[:, stroke]
+            part[:, i, 2] = middle[:, stroke] if by_stroke[i] else 0.0
             part[:, i, 3], part[:, i, 4] = middle[:, head] / 1e6, middle[:, rod] / 1e6
         parts.append(part[::every])
     rows = np.concatenate(parts)
-    low, high = rows[:, :, 2].min(axis=0), rows[:, :, 2].max(axis=0)
-    inside = ((rows[:, :, 2] > low + 0.02 * (high - low)) & (rows[:, :, 2] < high - 0.02 * (high - low))).all(axis=1)
+    strokes = rows[:, by_stroke, 2]
+    low, high = strokes.min(axis=0), strokes.max(axis=0)
+    inside = ((strokes > low + 0.02 * (high - low)) & (strokes < high - 0.02 * (high - low))).all(axis=1)
     return rows[inside] if inside.sum() > 0.1 * len(rows) else rows
 
 

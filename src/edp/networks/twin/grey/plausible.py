@@ -1,0 +1,216 @@
+"""The numbers of each element of a grey box: meaning, unit, and a plausible value to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.elements import Actuator, MotorElement
+
+IntArray = NDArray[np.int64]
+KNOTS = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
+"""Of the opening curves, as shares of the spool's travel behind the dead band: denser where levers are finer."""
+MEGA, LITRE = 1e6, 1e3
+PLAUSIBLE_AREAS = (0.015, 0.008)
+"""m^2, of head and rod side where no bore is known."""
+PLAUSIBLE_FLOW = 0.005
+"""m^3/s at the fastest turning, of which the displacement of a motor follows where it is not known: 300 l/min."""
+NO_STOP = 1e9
+"""rad. The two stops of a motor stand crossed, the lower one here and the upper one at its negative: no chamber has
+room beyond its own volume then. A cushion that leaves all of the outflow, and a stop without stiffness, do nothing. So
+a motor has the equations of a cylinder, and none of its own."""
+START_CURVE = (0.25, 0.75)
+"""Linear and quadratic share of the opening that a curve starts from: fine control near closed, as spools are cut."""
+
+
+@dataclass(frozen=True)
+class GreyNumber:
+    """One number of a grey box.
+
+    Attributes:
+        element: that it belongs to.
+        name: what it is.
+        unit: SI; of the value times `factor`.
+        factor: from the units of the grey box to SI.
+        nominal: where a fit starts, in units of the grey box.
+        width: plausible deviation: of the logarithm where `positive`, else in units of the grey box; 0: not fitted.
+        positive: whether it is fitted by its logarithm.
+        leader: how many places before it the number lies whose value it always has; 0: it has its own.
+    """
+
+    element: str
+    name: str
+    unit: str
+    factor: float
+    nominal: float
+    width: float = 1.0
+    positive: bool = True
+    leader: int = 0
+
+    @property
+    def label(self) -> str:
+        """Element and name."""
+        return f"{self.element}.{self.name}"
+
+
+@dataclass(frozen=True)
+class Travel:
+    """What the data say of one actuator: stroke from `low` to `high` (m or rad), fastest speed, highest pressures."""
+
+    low: float
+    high: float
+    fastest: float
+    highest: tuple[float, float]
+
+
+def plausible_areas(actuator: Actuator, travel: Travel) -> tuple[float, float]:
+    """Of both sides, where they are not known."""
+    if isinstance(actuator, MotorElement):
+        return (PLAUSIBLE_FLOW / max(travel.fastest, 1e-3),) * 2
+    return PLAUSIBLE_AREAS
+
+
+def load_size(actuator: Actuator, area: float) -> float:
+    """Of the root of an actuator's inertia, as a multiple of a plausible cylinder's: a motor has that of its oil.
+
+    Inertia by the square of the area (or oil a radian) is what the oil carries, so that the root goes with the area.
+    """
+    return area / PLAUSIBLE_AREAS[0] if isinstance(actuator, MotorElement) else 1.0
+
+
+def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyNumber]:
+    """Numbers of a cylinder, as `layout` orders them; `declared`: its areas are told."""
+    head, rod = areas
+    length = travel.high - travel.low
+    hard = 30.0 * head  # MN at the pressure of a main relief
+    trust = 0.01 if declared else 0.5
+    play = 0.01 * length
+    rows = [
+        ("head_area", "m^2", 1.0, head, trust),
+        ("rod_area", "m^2", 1.0, rod, trust),
+        ("head_dead_volume", "m^3", 1.0, 0.15 * head * length, 1.0),
+        ("rod_dead_volume", "m^3", 1.0, 0.15 * head * length, 1.0),
+        ("piston_leakage", "m^3/s/Pa", 1e-6, 1e-8, 2.0),
+        ("spool_leakage", "m^3/s/Pa", 1e-6, 4e-9, 2.0),
+        ("head_relief", "Pa", MEGA, max(travel.highest[0], 5.0), 0.2),
+        ("rod_relief", "Pa", MEGA, max(travel.highest[1], 5.0), 0.2),
+        ("cushion_length", "m", 1.0, 0.05 * length, 0.5),
+        ("cushion_least", "1", 1.0, 0.1, 1.0),
+        ("coulomb", "N", MEGA, 0.012 * hard, 1.0),
+        ("static_less_coulomb", "N", MEGA, 0.006 * hard, 1.0),
+        ("stribeck", "m/s", 1.0, 0.01, 1.0),
+        ("viscous", "N s/m", MEGA, 0.03 * hard / max(travel.fastest, 0.01), 1.5),
+        ("bristle_stiffness", "N/m", MEGA, 15.0 * head / 0.015, 1.0),
+        ("bristle_damping", "N s/m", MEGA, 0.1 * head / 0.015, 1.0),
+    ]
+    numbers = [GreyNumber(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+    numbers.append(GreyNumber(name, "stop_closed", "m", 1.0, travel.low + 0.4 * play, play, False))
+    numbers.append(GreyNumber(name, "stop_open", "m", 1.0, travel.high - 0.4 * play, play, False))
+    numbers.append(GreyNumber(name, "stop_stiffness", "N/m", MEGA, 100.0 * head / 0.015, 0.7))
+    numbers.append(GreyNumber(name, "friction_asymmetry", "N", MEGA, 0.0, 0.005 * hard, False))
+    return numbers
+
+
+def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyNumber]:
+    """Numbers of a motor, in the order of a cylinder's; what a cylinder has by its stroke, it has by its speed."""
+    each, fastest = areas[0], max(travel.fastest, 1e-3)
+    hard, flow = 30.0 * each, each * fastest  # MN m at the pressure of a main relief; m^3/s
+    # Half a turn of its own oil, and a tenth of a second of its flow in the lines.
+    volume = np.pi * each + 0.1 * flow
+    rows = [
+        ("displacement", "m^3/rad", 1.0, each, 0.01 if declared else 0.5),
+        ("displacement_b", "m^3/rad", 1.0, each, 0.0),
+        ("volume_a", "m^3", 1.0, volume, 1.0),
+        ("volume_b", "m^3", 1.0, volume, 1.0),
+        ("internal_leakage", "m^3/s/Pa", 1e-6, 1e-3 * flow, 2.0),
+        ("external_leakage", "m^3/s/Pa", 1e-6, 5e-4 * flow, 2.0),
+        ("relief_a", "Pa", MEGA, max(travel.highest[0], 5.0), 0.2),
+        ("relief_b", "Pa", MEGA, max(travel.highest[1], 5.0), 0.2),
+        ("cushion_length", "rad", 1.0, 1.0, 0.0),
+        ("cushion_least", "1", 1.0, 1.0, 0.0),
+        ("coulomb", "N m", MEGA, 0.012 * hard, 1.0),
+        ("static_less_coulomb", "N m", MEGA, 0.006 * hard, 1.0),
+        ("stribeck", "rad/s", 1.0, 0.02 * fastest, 1.0),
+        ("viscous", "N m s/rad", MEGA, 0.03 * hard / fastest, 1.5),
+        ("bristle_stiffness", "N m/rad", MEGA, 500.0 * each / fastest, 1.0),
+        ("bristle_damping", "N m s/rad", MEGA, 3.0 * each / fastest, 1.0),
+        ("stop_low", "rad", 1.0, NO_STOP, 0.0),
+        ("stop_high", "rad", 1.0, -NO_STOP, 0.0),
+        ("stop_stiffness", "N m/rad", MEGA, 0.0, 0.0),
+    ]
+    numbers = [
+        GreyNumber(name, label, unit, factor, start, width, width > 0.0) for label, unit, factor, start, width in rows
+    ]
+    numbers[at.ROD_AREA] = replace(numbers[at.ROD_AREA], leader=at.ROD_AREA - at.HEAD_AREA)
+    numbers.append(GreyNumber(name, "friction_asymmetry", "N m", MEGA, 0.0, 0.005 * hard, False))
+    return numbers
+
+
+def pump_numbers(name: str, flow: float, highest: float) -> list[GreyNumber]:
+    """Numbers of a pump, from a plausible flow (m^3/s) and the highest pressure of its line (MPa)."""
+    rows = [
+        ("full_flow", "m^3/s", 1.0, flow, 0.5),
+        ("least_displacement", "1", 1.0, 0.15, 0.7),
+        ("lag", "s", 1.0, 0.07, 0.7),
+        ("line_volume", "m^3", 1.0, 4e-3, 1.0),
+        ("open_centre", "m^3/s/Pa^0.5", 1e-3, 1.2 * flow, 1.0),
+        ("open_centre_closed_at", "1", 1.0, 0.35, 0.4),
+        ("relief", "Pa", MEGA, max(highest / 1.1 * 0.96, 1.0), 0.1),
+    ]
+    return [GreyNumber(name, label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+
+
+def circuit_numbers(highest: float, flow: float) -> list[GreyNumber]:
+    """Numbers that all elements share, from the highest pressure (MPa) and the flow of all pumps (m^3/s)."""
+    rows = [
+        ("bulk_modulus", "Pa", MEGA, 1400.0, 0.3),
+        ("air", "1", 1.0, 0.005, 0.7),
+        ("tank", "Pa", MEGA, 0.2, 0.7),
+        ("supply", "Pa", MEGA, max(highest, 1.0), 0.5),
+        ("make_up", "m^3/s/Pa^0.5", 1e-3, 2.0 * flow, 1.0),
+        ("port_relief_slope", "m^3/s/Pa", 1e-6, 1e-2, 1.0),
+        ("relief_slope", "m^3/s/Pa", 1e-6, 2e-3, 1.0),
+        ("power_limit", "W", MEGA, 0.6 * flow * highest, 0.5),
+        ("play", "1", 1.0, 0.01, 0.7),
+        ("demand_start", "1", 1.0, 0.1, 0.3),
+        ("demand_span", "1", 1.0, 0.75, 0.2),
+    ]
+    return [GreyNumber("circuit", label, unit, factor, start, width) for label, unit, factor, start, width in rows]
+
+
+def valve_numbers(
+    name: str,
+    has: tuple[bool, bool],
+    areas: tuple[float, float],
+    travel: Travel,
+    places: IntArray,
+    first: int,
+) -> list[GreyNumber]:
+    """Numbers of a spool; `places` is filled in."""
+    rows = [("dead_time", "s", 0.04, 0.5), ("pilot_lag", "s", 0.025, 0.5), ("spool_lag", "s", 0.02, 0.5)]
+    numbers = [GreyNumber(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
+    places[at.DELAY : at.BAND] = first + np.arange(3)
+    linear, square = START_CURVE
+    curve = np.diff(KNOTS * (linear + square * KNOTS))
+    meter_out, regeneration = has
+    for d, way in enumerate(("extend", "retract")):
+        into, out = (areas[0], areas[1]) if d == 0 else (areas[1], areas[0])
+        places[at.BAND + d], places[at.GAIN + d] = first + len(numbers), first + len(numbers) + 1
+        numbers.append(GreyNumber(name, f"dead_band_{way}", "1", 1.0, 0.12, 0.4))
+        numbers.append(GreyNumber(name, f"pump_demand_{way}", "1", 1.0, 0.9, 0.5))
+        fed = [("into", at.INTO, into * travel.fastest / np.sqrt(2.0))]
+        if meter_out:
+            fed.append(("out_of", at.OUT_OF, out * travel.fastest / np.sqrt(1.5)))
+        for label, column, area in fed:
+            places[column + d] = first + len(numbers)
+            numbers += [
+                GreyNumber(name, f"{label}_{way}_{100 * KNOTS[k + 1]:.0f}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0)
+                for k, step in enumerate(curve)
+            ]
+        if meter_out and regeneration:
+            places[at.REGENERATION + d] = first + len(numbers)
+            numbers.append(GreyNumber(name, f"regeneration_{way}", "1", 1.0, 0.1, 2.0))
+    return numbers
