@@ -223,9 +223,7 @@ class NmpcController(Controller):
         near = (base < least + NEAR_LIMIT) | (base > largest - NEAR_LIMIT)
         return slopes.reshape(self._moves.count, -1)[:, near].T, (least - base)[near], (largest - base)[near]
 
-    def _solved(
-        self, hessian: Array, gradient: Array, rows: Array, low: Array, high: Array
-    ) -> tuple[Array, int]:
+    def _solved(self, hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> tuple[Array, int]:
         """The step of the plan, within the speeds that the levers' ranges give.
 
         Raises:

@@ -41,7 +41,9 @@ class Grade(TaskSpec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_bounds("task 'grade'", self, slope_deg=span(-80.0, 80.0), length_m=above(0.0, 100.0), depth_m=span(-5.0, 5.0))
+        check_bounds(
+            "task 'grade'", self, slope_deg=span(-80.0, 80.0), length_m=above(0.0, 100.0), depth_m=span(-5.0, 5.0)
+        )
         if self.attitude_deg is not None:
             check_bounds("task 'grade'", self, attitude_deg=span(-270.0, 90.0))
             check_order("task 'grade'", attitude_deg=self.attitude_deg)
