@@ -113,11 +113,6 @@ class Episodes:
         first = blocks.BLOCKS * blocks.ENTRY
         return bool(self.memory[index, first + blocks.TICK] >= self.memory[index, first + blocks.SAMPLES] - 1.0)
 
-    def measured(self, index: int) -> Array:
-        """A copy of the 24 signals of Table A.1 as sensors show them at this tick."""
-        signals: Array = blocks.view(blocks.MEASURED, self.memory[index], self.drawn[index])[0].copy()
-        return signals
-
     def moment(self, index: int) -> Moment:
         """This instant of an episode."""
         start = self.starts[index]
