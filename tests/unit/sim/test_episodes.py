@@ -62,7 +62,7 @@ def test_inactive_episodes_rest():
     before = episodes.memory.copy()
     episodes.step(np.full((2, 3), 0.7), out, np.array([True, False]))
     np.testing.assert_array_equal(episodes.memory[1], before[1])
-    assert (episodes.tick(0), episodes.tick(1)) == (1, 0)
+    assert (episodes.ticks(0), episodes.ticks(1)) == (1, 0)
 
 
 def test_dead_times_beyond_the_room_are_refused():
