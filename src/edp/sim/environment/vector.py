@@ -213,7 +213,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         self._in_soil = any(each is not None and bool(each.scenario.material) for each in starts)
 
     def _truth(self) -> Truth:
-        return Truth(self._present[1].copy(), self._pilots, self._in_soil)
+        return Truth(self._present[1].copy(), self._pilots.copy(), self._in_soil)
 
 
 def _side_by_side(
