@@ -2,8 +2,11 @@
 
 import copy
 import importlib
+import re
 import subprocess
 import sys
+from dataclasses import fields
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -115,13 +118,13 @@ def test_snapshots_copies_and_branches(scenario):
     env = env_of(scenario, loop_latency=2, lost_frames=0.1)
     env.reset(seed=scenario.seed)
     first, rest = levers_of(0, 160)[:100], levers_of(1, 90)
-    run(env, first)
+    last = run(env, first)[-1, :-1]
     moment = env.snapshot()
     kept = moment.memory.copy(), moment.drawn.copy()
     double = copy.deepcopy(env)
     whole = run(env, rest)
     other = env_of(scenario, loop_latency=2, lost_frames=0.1)
-    other.restore(moment)
+    np.testing.assert_array_equal(other.restore(moment), last)
     env.restore(moment)
     for again in (env, double, other):
         np.testing.assert_array_equal(run(again, rest), whole)
@@ -324,3 +327,20 @@ def test_a_missing_gymnasium_is_one_error(monkeypatch):
 def test_the_simulator_needs_no_gymnasium():
     code = "import sys; sys.modules['gymnasium'] = None; import edp, edp.sim; edp.sim.Simulation(edp.sim.Scenario())"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_page_runs_as_it_stands():
+    page = (Path(__file__).parents[3] / "docs" / "environment.md").read_text(encoding="utf-8")
+    blocks_of_page = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks_of_page) == 4
+    namespace: dict[str, object] = {}
+    for number, block in enumerate(blocks_of_page):
+        exec(compile(block, f"environment.md, block {number}", "exec"), namespace)
+
+
+def test_the_page_lists_every_setting_with_its_default():
+    page = (Path(__file__).parents[3] / "docs" / "environment.md").read_text(encoding="utf-8")
+    table = dict(re.findall(r"^\| `(\w+)` \| (.+?) \|", page, re.MULTILINE))
+    assert set(table) == {entry.name for entry in fields(EnvironmentSpec)}
+    for name in ("duration_s", "rate_hz", "step_s", "loop_latency", "lost_frames"):
+        assert float(table[name]) == getattr(EnvironmentSpec(), name)

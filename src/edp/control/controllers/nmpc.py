@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.control.base import CONTROLLERS, Controller, ControlFault
+from edp.control.base import CONTROLLERS, ControlFault, Controller
 from edp.control.controllers.pi import PiController, ProportionalIntegral
 from edp.control.geometry import AXES
 from edp.control.limits import LoopLimits

@@ -13,13 +13,13 @@ from edp.settings.bounds import shown
 from edp.signals import Channel
 from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
+from edp.sim.environment.rehearsal import rehearse_episodes
 from edp.sim.environment.single import spaces
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
 from edp.sim.environment.start import MOST_SEED, checked_seed, episode_start
 from edp.sim.environment.truth import Truth
 from edp.sim.episodes.episodes import Episodes, Moment
 from edp.sim.machine import layout as at
-from edp.sim.simulate import rehearse
 
 Array = NDArray[np.float64]
 AutoresetMode = gymnasium.vector.AutoresetMode
@@ -67,7 +67,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
             modes = ", ".join(entry.value for entry in AutoresetMode)
             raise ConfigError(f"environment: autoreset_mode = {autoreset_mode!r}; choose one of {modes}") from error
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        rehearse()
+        rehearse_episodes()
         self.channels: tuple[Channel, ...] = self.settings[0].channels
         self.rate_hz, self.render_mode = self.settings[0].rate_hz, None
         self.single_observation_space, self.single_action_space = spaces(self.channels)
@@ -149,15 +149,20 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         """
         return self._episodes.moment(index)
 
-    def restore(self, index: int, snapshot: Moment) -> None:
+    def restore(self, index: int, snapshot: Moment) -> NDArray[np.float32]:
         """Make one machine what it was at a moment, of this environment or of another.
+
+        Returns:
+            Its observation of that moment, shape (channel,).
 
         Raises:
             ConfigError: the snapshot is of an environment that shows other channels.
         """
         self._episodes.go_to(index, snapshot)
-        self._present[2][index] = self._episodes.ended(index)
+        self._episodes.show(index, self._present)
         self._enter(index)
+        observation: NDArray[np.float32] = self._present[0][index].copy()
+        return observation
 
     def _begin(self, mask: Bools, seeds: Sequence[int | None], options: dict[str, Any]) -> dict[str, Any]:
         """Begin the masked episodes; returns what began."""
@@ -208,7 +213,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         self._in_soil = any(each is not None and bool(each.scenario.material) for each in starts)
 
     def _truth(self) -> Truth:
-        return Truth(self._present[1].copy(), self._pilots, self._in_soil)
+        return Truth(self._present[1].copy(), self._pilots.copy(), self._in_soil)
 
 
 def _side_by_side(
