@@ -62,7 +62,7 @@ class Moves:
     Attributes:
         ticks: length of the horizon.
         count: variables: an axis and block each, block by block.
-        first: tick at which a run branches off whose variable alone differs, shape (count + 1,), that of the base first.
+        first: tick at which a run branches off whose variable alone differs, the base first, shape (count + 1,).
     """
 
     def __init__(self, blocks: tuple[int, ...]) -> None:
