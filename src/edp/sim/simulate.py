@@ -10,13 +10,10 @@ from numpy.typing import NDArray
 
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
-from edp.sim.episodes.episodes import Episodes, EpisodeStart
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import known_mass
-from edp.sim.machine.parameters import pack
-from edp.sim.physics import pose, valve
 from edp.sim.physics.jit import rehearsal
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.snapshot import Snapshot, capture, restored
@@ -196,27 +193,11 @@ def _recording(
 
 
 def rehearse() -> None:
-    """Compile everything that this part of EDP has compiled, once for each cache folder."""
+    """Compile everything that a simulation runs, once for each cache folder."""
     rehearsal.once(_play)
 
 
 def _play() -> None:
     """Call all compiled code: in free air and in soil, open and closed loops, light and full sensors."""
     simulate(Scenario(excitation="combined", duration_s=0.5))
-    digging = Scenario(machine="C14", excitation="dig", material="clay", duration_s=0.5)
-    simulate(digging)
-    columns = np.arange(len(TABLE_A1))
-    episodes = Episodes(1, columns)
-    out = episodes.new_out()
-    episodes.begin(0, EpisodeStart(digging, digging.load()), out)
-    episodes.step(np.zeros((1, at.AXES)), out)
-    kinematics = pose.Kinematics(*pack(digging.load()))
-    kinematics.strokes(kinematics.poses(np.ones(at.AXES)))
-    valve.fill_pilots(
-        np.zeros((1, at.AXES)),
-        1.0,
-        kinematics.axes,
-        kinematics.plant,
-        np.empty(at.SPOOLS),
-        np.empty((1, 2 * at.SPOOLS)),
-    )
+    simulate(Scenario(machine="C14", excitation="dig", material="clay", duration_s=0.5))

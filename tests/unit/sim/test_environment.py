@@ -2,8 +2,11 @@
 
 import copy
 import importlib
+import re
 import subprocess
 import sys
+from dataclasses import fields
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -324,3 +327,20 @@ def test_a_missing_gymnasium_is_one_error(monkeypatch):
 def test_the_simulator_needs_no_gymnasium():
     code = "import sys; sys.modules['gymnasium'] = None; import edp, edp.sim; edp.sim.Simulation(edp.sim.Scenario())"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_page_runs_as_it_stands():
+    page = (Path(__file__).parents[3] / "docs" / "environment.md").read_text(encoding="utf-8")
+    blocks_of_page = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks_of_page) == 4
+    namespace: dict[str, object] = {}
+    for number, block in enumerate(blocks_of_page):
+        exec(compile(block, f"environment.md, block {number}", "exec"), namespace)
+
+
+def test_the_page_lists_every_setting_with_its_default():
+    page = (Path(__file__).parents[3] / "docs" / "environment.md").read_text(encoding="utf-8")
+    table = dict(re.findall(r"^\| `(\w+)` \| (.+?) \|", page, re.MULTILINE))
+    assert set(table) == {entry.name for entry in fields(EnvironmentSpec)}
+    for name in ("duration_s", "rate_hz", "step_s", "loop_latency", "lost_frames"):
+        assert float(table[name]) == getattr(EnvironmentSpec(), name)

@@ -36,15 +36,18 @@ pasted = Compiler("sim", fingerprinted, {**OPTIONS, "inline": "always"}, facts=s
 
 
 class WarmUp:
-    """Compiles everything once for each cache folder, in one process, in one order.
+    """Compiles everything of a part once for each cache folder, in one process, in one order.
 
     What a caller's machine code looks like depends on whether the functions it calls were compiled in the same process
     or loaded. Processes that fill an empty cache side by side would each run their own variant, and the last bits of
     their results would differ.
+
+    Args:
+        part: name of the file that marks the cache of this part as filled.
     """
 
-    def __init__(self) -> None:
-        self._begun = False
+    def __init__(self, part: str) -> None:
+        self.part, self._begun = part, False
 
     def once(self, play: Callable[[], None]) -> None:
         """Run `play`, which calls all compiled code, where this cache was not filled before; others wait for it."""
@@ -55,7 +58,7 @@ class WarmUp:
         if folder is None:
             play()
             return
-        complete = folder / "complete"
+        complete = folder / self.part
         if complete.exists():
             return
         with (folder / "lock").open("w") as lock:
@@ -67,4 +70,6 @@ class WarmUp:
                 complete.touch()
 
 
-rehearsal = WarmUp()
+rehearsal = WarmUp("complete")
+episode_rehearsal = WarmUp("episodes")
+"""Apart, and after the first: who only simulates shall not wait for it."""
