@@ -76,8 +76,8 @@ def test_one_of_them_is_reset_alone_and_moments_pass_between_forms():
     np.testing.assert_array_equal(infos["_seed"], mask)
 
     single = ExcavatorEnv(SPECS[1])
-    single.restore(moment)
-    vector.restore(3, moment)
+    np.testing.assert_array_equal(single.restore(moment), before[1])
+    np.testing.assert_array_equal(vector.restore(3, moment), before[1])
     for levers in levers_of(2, 20):
         levers[3] = levers[1]
         np.testing.assert_array_equal(vector.step(levers)[0][3], single.step(levers[1])[0])

@@ -132,14 +132,21 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         return self._episodes.moment(0)
 
-    def restore(self, snapshot: Moment) -> None:
+    def restore(self, snapshot: Moment) -> Observation:
         """Go to a moment, of this environment or of another: what follows gives the same bits as it gave then.
+
+        Returns:
+            The observation of that moment.
 
         Raises:
             ConfigError: the snapshot is of an environment that shows other channels.
         """
         self._episodes.go_to(0, snapshot)
         self._enter(snapshot.start)
+        out = self._episodes.new_out()
+        self._episodes.show(0, out)
+        observation: Observation = out[0][0]
+        return observation
 
     def branch(self, seed: int) -> None:
         """Give sensors and soil fresh randomness from here on; the present stays as it is.

@@ -149,15 +149,20 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         """
         return self._episodes.moment(index)
 
-    def restore(self, index: int, snapshot: Moment) -> None:
+    def restore(self, index: int, snapshot: Moment) -> NDArray[np.float32]:
         """Make one machine what it was at a moment, of this environment or of another.
+
+        Returns:
+            Its observation of that moment, shape (channel,).
 
         Raises:
             ConfigError: the snapshot is of an environment that shows other channels.
         """
         self._episodes.go_to(index, snapshot)
-        self._present[2][index] = self._episodes.ended(index)
+        self._episodes.show(index, self._present)
         self._enter(index)
+        observation: NDArray[np.float32] = self._present[0][index].copy()
+        return observation
 
     def _begin(self, mask: Bools, seeds: Sequence[int | None], options: dict[str, Any]) -> dict[str, Any]:
         """Begin the masked episodes; returns what began."""
@@ -208,7 +213,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         self._in_soil = any(each is not None and bool(each.scenario.material) for each in starts)
 
     def _truth(self) -> Truth:
-        return Truth(self._present[1].copy(), self._pilots, self._in_soil)
+        return Truth(self._present[1].copy(), self._pilots.copy(), self._in_soil)
 
 
 def _side_by_side(

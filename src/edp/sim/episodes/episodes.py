@@ -100,11 +100,11 @@ class Episodes:
         if start is None:
             raise ConfigError(f"episode {failed} has not begun; reset it first")
         raise SimulationError(
-            f"episode {failed} diverged at t = {self.tick(failed) / start.scenario.rate_hz:.2f} s (machine "
+            f"episode {failed} diverged at t = {self.ticks(failed) / start.scenario.rate_hz:.2f} s (machine "
             f"{start.machine.name}, seed {start.scenario.seed}); choose a smaller step_s than {start.scenario.step_s}"
         )
 
-    def tick(self, index: int) -> int:
+    def ticks(self, index: int) -> int:
         """Ticks done since an episode began."""
         return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
 
@@ -112,11 +112,6 @@ class Episodes:
         """Whether an episode has all its ticks behind it."""
         first = blocks.BLOCKS * blocks.ENTRY
         return bool(self.memory[index, first + blocks.TICK] >= self.memory[index, first + blocks.SAMPLES] - 1.0)
-
-    def measured(self, index: int) -> Array:
-        """A copy of the 24 signals of Table A.1 as sensors show them at this tick."""
-        signals: Array = blocks.view(blocks.MEASURED, self.memory[index], self.drawn[index])[0].copy()
-        return signals
 
     def moment(self, index: int) -> Moment:
         """This instant of an episode."""
@@ -139,13 +134,21 @@ class Episodes:
             )
         self._put(index, moment.start, moment.memory.copy(), moment.drawn)
 
+    def show(self, index: int, out: tick.Out) -> None:
+        """What was seen of an episode last, into `out`."""
+        observations, rows, ended = out
+        observations[index] = blocks.view(blocks.SHOWN, self.memory[index], self.drawn[index])[-1]
+        row = blocks.view(blocks.ROW, self.memory[index], self.drawn[index])[0]
+        rows[index], rows[index, : len(row)] = np.nan, row
+        ended[index] = self.ended(index)
+
     def redraw(self, index: int, seed: np.random.SeedSequence) -> None:
         """Fresh randomness of sensors and soil from here on; what was shown and what the edge is in now stays."""
         start = self.starts[index]
         if start is None:
             raise ConfigError(f"episode {index} has not begun; reset it first")
         noise, lost, course = seed.spawn(3)
-        drawn, done = self.drawn[index].copy(), self.tick(index) + 1
+        drawn, done = self.drawn[index].copy(), self.ticks(index) + 1
         present = blocks.view(blocks.SENSOR_DRAWS, self.memory[index], drawn)
         if start.scenario.sensor_noise:
             fresh = draws.draw(start.machine, len(present), start.scenario.rate_hz, np.random.default_rng(noise))

@@ -68,10 +68,13 @@ def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     frame_s = own.can_period or 1.0 / rate_hz
     drift, noise = rng.spawn(2)
     # Files state the walk per root of a minute.
-    bias = transducers.random_walk(shape, frame_s, np.deg2rad(own.joint_bias_walk_deg) / np.sqrt(60.0), drift)
-    error = noise.normal(0.0, np.deg2rad(own.joint_rate_deg), shape)
-    drawn[:, chain.RATE_BIAS : chain.RATE_BIAS + 3] = bias[joints.seen]
-    drawn[:, chain.RATE_ERROR : chain.RATE_ERROR + 3] = error[joints.seen]
+    # Generators of their own: what has no size need not be drawn.
+    if own.joint_bias_walk_deg > 0.0:
+        bias = transducers.random_walk(shape, frame_s, np.deg2rad(own.joint_bias_walk_deg) / np.sqrt(60.0), drift)
+        drawn[:, chain.RATE_BIAS : chain.RATE_BIAS + 3] = bias[joints.seen]
+    if own.joint_rate_deg > 0.0:
+        error = noise.normal(0.0, np.deg2rad(own.joint_rate_deg), shape)
+        drawn[:, chain.RATE_ERROR : chain.RATE_ERROR + 3] = error[joints.seen]
     drawn[:, chain.VELOCITY_ERROR : chain.VELOCITY_ERROR + 3] = rng.normal(0.0, own.velocity, shape)[joints.seen]
     pressure_error = rng.normal(0.0, own.pressure, (len(transmitters.positions), 6))
     drawn[:, chain.PRESSURE_ERROR :] = pressure_error[transmitters.seen]
