@@ -16,7 +16,7 @@ from edp.control.plants import plant_of
 from edp.control.tasks import TASKS, draw_task
 from edp.control.valve_map import ValveMap
 from edp.sim.excitation.levers import speed_table
-from edp.testing.control import sample_twin
+from edp.testing.control import sample_excavator_twin
 
 SHORT = {
     "grade": {"length_m": (0.4, 0.5)},
@@ -35,7 +35,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def models(env):
-    twin = sample_twin()
+    twin = sample_excavator_twin()
     return ControlModels(ValveMap(*speed_table(env.machine)), twin)
 
 

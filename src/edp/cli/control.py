@@ -14,7 +14,7 @@ TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, 
 MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
 ControllerOption = Annotated[str, typer.Option("--controller", help="What moves the levers, such as pi or inversion.")]
 SeedsOption = Annotated[
-    int, typer.Option("--seeds", min=0, help="Number of loops, each along a reference of its own; 0: as set (6).")
+    int | None, typer.Option("--seeds", min=1, help="Number of loops, each along a reference of its own; default: 6.")
 ]
 PlantOption = Annotated[Path | None, typer.Option("--plant", help="Run folder of a twin that is the plant instead.")]
 TwinOption = Annotated[Path | None, typer.Option("--twin", help="Run folder of a twin that the controller uses.")]
@@ -30,7 +30,7 @@ def control(
     task: TaskOption = "",
     machine: MachineOption = "",
     controller: ControllerOption = "",
-    seeds: SeedsOption = 0,
+    seeds: SeedsOption = None,
     plant: PlantOption = None,
     twin: TwinOption = None,
     predictor: PredictorOption = None,
@@ -66,7 +66,7 @@ def tune(
     task: TaskOption = "",
     machine: MachineOption = "",
     controller: ControllerOption = "",
-    seeds: SeedsOption = 0,
+    seeds: SeedsOption = None,
     on: Annotated[Path | None, typer.Option("--on", help="Run folder of a twin on which to tune.")] = None,
     plant: PlantOption = None,
     twin: TwinOption = None,
@@ -105,10 +105,10 @@ def tune(
     emit(as_json, {"run": str(folder), "settings": str(folder / TUNED), **tuning.content}, show)
 
 
-def _options(task: str, machine: str, controller: str, seeds: int) -> dict[str, Any]:
+def _options(task: str, machine: str, controller: str, seeds: int | None) -> dict[str, Any]:
     """Settings of the options that were given."""
     options: dict[str, Any] = {"machine": machine} if machine else {}
-    options |= {"loops": seeds} if seeds else {}
+    options |= {} if seeds is None else {"loops": seeds}
     options |= {"task": {"kind": task}} if task else {}
     return options | ({"controller": {"kind": controller}} if controller else {})
 

@@ -18,7 +18,7 @@ from edp.control.plant import VELOCITIES as VELOCITIES
 from edp.control.plant import PlantInterface as PlantInterface
 from edp.control.plant import interface_of as interface_of
 from edp.control.reference import TipReference
-from edp.errors import ConfigError
+from edp.errors import ConfigError, EdpError
 from edp.registry import Registry
 
 Array = NDArray[np.float64]
@@ -153,7 +153,7 @@ class Controller(ABC):
             return neutral, f"{self.reads[int(np.argmin(finite))]} is missing: spools to neutral"
         try:
             levers = np.asarray(self.levers(measured, tick), float)
-        except (ControlFault, ArithmeticError, np.linalg.LinAlgError) as error:
+        except (ControlFault, EdpError, ArithmeticError, np.linalg.LinAlgError) as error:
             return neutral, f"no answer ({error}): spools to neutral"
         if levers.shape != (AXES,) or not np.isfinite(levers).all():
             return neutral, "the levers are not finite: spools to neutral"

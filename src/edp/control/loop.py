@@ -17,7 +17,7 @@ from edp.control.score import LoopScore, LoopTrace, scored
 from edp.control.tasks.base import ControlTask
 from edp.errors import ConfigError
 from edp.recording import Recording
-from edp.signals import VOCABULARY, Channel, Kind
+from edp.signals import GROUND_CHANNELS, VOCABULARY, Channel, Kind
 
 Array = NDArray[np.float64]
 TRUE = "_true"
@@ -36,7 +36,8 @@ class LoopResult:
     """A loop that was run.
 
     Attributes:
-        recording: a row a tick: observations, true values under names that end in `TRUE`, reference, levers.
+        recording: a row a tick: observations, true values under names that end in `TRUE`, heights of the ground where
+            there is one, reference, levers.
         score: over the judged ticks.
         events: what the controller logged.
         solve_s: time of each step of the controller, shape (ticks,), s.
@@ -88,7 +89,7 @@ def run_loop(
             f"{len(controller.plant.channels)}; make it for this plant"
         )
     controller.reset(np.asarray(observation, float), reference)
-    names = tuple(name for name in (*STROKES, *TIP, *PUMPS, *OTHERS) if name in info["truth"])
+    names = tuple(name for name in (*STROKES, *TIP, *PUMPS, *OTHERS, *GROUND_CHANNELS) if name in info["truth"])
     rows, infos = _driven(env, controller, reference.ticks, names, (observation, info))
     trace = _trace(rows, names, geometry, controller)
     score = scored(trace, reference, task.limits, sum(event.ticks for event in controller.events))
@@ -144,8 +145,11 @@ def _trace(rows: _Rows, names: tuple[str, ...], geometry: TipGeometry, controlle
 
 def _recorded(rows: _Rows, names: tuple[str, ...], task: ControlTask, controller: Controller) -> Recording:
     reference, plant = task.reference, controller.plant
+    # The ground has no sensor, so that its heights need no other name; side views look for them.
     true = tuple(
-        replace(VOCABULARY[name], name=f"{name}{TRUE}", description=f"{VOCABULARY[name].description} (true)")
+        VOCABULARY[name]
+        if name in GROUND_CHANNELS
+        else replace(VOCABULARY[name], name=f"{name}{TRUE}", description=f"{VOCABULARY[name].description} (true)")
         for name in names
     )
     ticks = len(rows.levers)

@@ -17,7 +17,7 @@ WAYS = ("combined", "isolated", "end_stops")
 SECONDS = 40.0
 
 
-def sample_twin(machine: str = "M22", kind: str = "static") -> Twin:
+def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:
     """A twin of one of the floors, fitted to two minutes of a simulated machine in free air.
 
     Args:

@@ -7,7 +7,7 @@ import pytest
 from edp.config.control import load_control_experiment
 from edp.logs import read_recording
 from edp.networks.twin import TWINS
-from edp.testing.control import sample_twin
+from edp.testing.control import sample_excavator_twin
 from edp.training.twin_bundle import TwinBundle, save_twin
 
 pytestmark = pytest.mark.training
@@ -17,7 +17,7 @@ LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2", "--set",
 @pytest.fixture(scope="module")
 def twin_run(tmp_path_factory):
     run = tmp_path_factory.mktemp("twins") / "run"
-    save_twin(TwinBundle(TWINS["static"](), sample_twin()), run / "twin")
+    save_twin(TwinBundle(TWINS["static"](), sample_excavator_twin()), run / "twin")
     return run
 
 

@@ -11,7 +11,7 @@ from edp.control.models import ControlModels
 from edp.control.plant import PILOTS, STROKES, PlantInterface
 from edp.control.reference import reference_of_strokes
 from edp.control.valve_map import map_of_speeds
-from edp.errors import ConfigError
+from edp.errors import ConfigError, DataError
 from edp.signals import TABLE_A1, VOCABULARY
 from edp.sim.machine.machine_files import load_machine
 
@@ -78,6 +78,7 @@ def test_levers_keep_range_and_slew_whatever_is_asked(plant, reference):
         (np.ones(3), np.inf, "CylStroke_2 is missing"),
         (ControlFault("no step of the solver"), None, "no answer (no step of the solver)"),
         (ZeroDivisionError("division"), None, "no answer (division)"),
+        (DataError("a command is missing"), None, "no answer (a command is missing)"),
         (np.linalg.LinAlgError("singular"), None, "no answer (singular)"),
         (np.array([0.0, np.nan, 0.0]), None, "not finite"),
         (np.zeros(2), None, "not finite"),

@@ -17,7 +17,7 @@ from edp.errors import ConfigError
 from edp.signals import VOCABULARY, Kind
 from edp.sim.excitation.levers import speed_table
 from edp.sim.machine.machine_files import load_machine
-from edp.testing.control import sample_twin
+from edp.testing.control import sample_excavator_twin
 
 SHORT = {"length_m": (0.4, 0.5), "hold_s": 0.3, "lead_s": 0.2}
 
@@ -40,7 +40,7 @@ def task(env):
 
 @pytest.fixture(scope="module")
 def twin():
-    return sample_twin()
+    return sample_excavator_twin()
 
 
 class Still(Controller):

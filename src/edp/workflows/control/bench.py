@@ -38,7 +38,7 @@ class ControlSources:
 
 
 class ControlBench:
-    """See above.
+    """One plant, and the tasks of an experiment's seeds on it.
 
     Args:
         experiment: machine, task, seeds and controller.
