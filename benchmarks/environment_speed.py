@@ -174,7 +174,7 @@ def judged(middle: dict[str, float], errors: dict[str, list[float]], quick: bool
     verdicts = []
     for step_s in STEPS_S:
         name = f"M22, {1e3 * step_s:g} ms"
-        many, one, rival, _ = (
+        many, one, rival, alone = (
             middle[f"{form}, {name}"] for form in ("side by side", "one by one", "naive loop", "plant alone by samples")
         )
         verdicts += [

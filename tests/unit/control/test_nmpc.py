@@ -25,14 +25,14 @@ from edp.control.valve_map import ValveMap
 from edp.errors import ConfigError
 from edp.sim.excitation.levers import speed_table
 from edp.sim.machine.machine_files import load_machine
-from edp.testing.control import sample_twin
+from edp.testing.control import sample_excavator_twin
 
 pytest.importorskip("daqp", reason="the solver is an optional package")
 
 
 @pytest.fixture(scope="module")
 def twin():
-    return sample_twin()
+    return sample_excavator_twin()
 
 
 @pytest.fixture(scope="module")
