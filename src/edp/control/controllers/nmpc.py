@@ -213,9 +213,9 @@ class NmpcController(Controller):
         tips, jacobians = self._table.poses(strokes[0])
         now = min(tick + 1, len(self._ahead) - 1)
         rows = slice(now, now + self._moves.ticks)
-        directions, wanted = self._directions[rows], self._tips[rows]
+        directions, goals = self._directions[rows], self._tips[rows]
         normal = np.empty((self._moves.count, self._moves.count + 1))
-        fill_normal(strokes, steps, tips, jacobians, directions, wanted, normal)
+        fill_normal(strokes, steps, tips, jacobians, directions, goals, normal)
         return normal
 
     def _limits(self, strokes: Array, pressures: Array, steps: Array) -> tuple[Array, Array, Array]:

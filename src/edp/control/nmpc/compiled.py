@@ -103,7 +103,7 @@ def fill_poses(strokes: Array, angles: Array, full: Array, lengths: Array, tips:
 
 @compiler.compiled
 def fill_normal(
-    strokes: Array, steps: Array, tips: Array, jacobians: Array, directions: Array, wanted: Array, normal: Array
+    strokes: Array, steps: Array, tips: Array, jacobians: Array, directions: Array, goals: Array, normal: Array
 ) -> None:
     """Normal equations of the weighted tip errors over a horizon.
 
@@ -113,7 +113,7 @@ def fill_normal(
         tips: of the base, shape (tick, 3).
         jacobians: of the tips by the strokes, shape (tick, 3, axis).
         directions: rows that weight a tip error, shape (tick, 3, 3).
-        wanted: tips of the reference, shape (tick, 3).
+        goals: tips of the reference, shape (tick, 3).
         normal: written, shape (variable, variable + 1): derivatives' products, then those with the errors.
     """
     ticks, count, axes = len(tips), len(steps), strokes.shape[2]
@@ -122,7 +122,7 @@ def fill_normal(
     error = np.empty(3)
     for t in range(ticks):
         for i in range(3):
-            error[i] = tips[t, i] - wanted[t, i]
+            error[i] = tips[t, i] - goals[t, i]
         error[2] = (error[2] + math.pi) % (2.0 * math.pi) - math.pi
         for i in range(3):
             row, weighted = 3 * t + i, 0.0

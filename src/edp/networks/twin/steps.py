@@ -174,11 +174,11 @@ def run_branches(
     commands, mapped = inputs
     input_weight, bias, h_weight, inner_bias, out_weight, out_bias, pull, offset, width = weights
     _, low, high, trapezoid = bounds
-    ticks, lanes, told = commands.shape
+    ticks, lanes, commanded = commands.shape
     units, count = out_weight.shape
-    read = np.empty((lanes, told + count), np.float32)
+    read = np.empty((lanes, commanded + count), np.float32)
     fed = np.empty((lanes, count), np.float32)
-    free, change, said = np.empty_like(fed), np.empty_like(fed), np.empty_like(fed)
+    free, change, answer = np.empty_like(fed), np.empty_like(fed), np.empty_like(fed)
     into = np.empty((lanes, 3 * units), np.float32)
     up, gates = np.empty_like(into), np.empty_like(into)
     h = np.empty((lanes, units), np.float32)
@@ -190,10 +190,10 @@ def run_branches(
             fed[running], h[running] = fed[0], h[0]
             running += 1
         for row in range(running):
-            for j in range(told):
+            for j in range(commanded):
                 read[row, j] = commands[t, row, j]
             for j in range(count):
-                read[row, told + j] = fed[row, j]
+                read[row, commanded + j] = fed[row, j]
         # The first rows: contiguous, as the products want them.
         np.dot(read[:running], input_weight, into[:running])
         np.dot(h[:running], h_weight, up[:running])
@@ -207,11 +207,11 @@ def run_branches(
                 change[row, j] += out_bias[j]
             for j in range(len(pull)):
                 change[row, j] += pull[j] * (mapped[t, row, j] - fed[row, j])
-        _answer(fed[:running], change, low, high, trapezoid, velocities, said, free)
+        _answer(fed[:running], change, low, high, trapezoid, velocities, answer, free)
         for row in range(running):
             for j in range(count):
-                fed[row, j] = said[row, j]
-                answers[row, t, j] = said[row, j] * width[j] + offset[j]
+                fed[row, j] = answer[row, j]
+                answers[row, t, j] = answer[row, j] * width[j] + offset[j]
             for i in range(units):
                 h[row, i] = next_h[row, i]
         for row in range(running, lanes):
