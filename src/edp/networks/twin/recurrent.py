@@ -220,7 +220,7 @@ class RecurrentTwin(Twin):
         network, solved = self.network, solved_columns(self.channels)
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
         read = build.join("read", commands, fed)
-        h = build.join("memories", *(self._lowered(build, read, rows) for rows in self._member_rows()))
+        h = build.join("memories", *(self._lowered(build, read, rows) for rows in self.member_rows()))
         unit = self.bounds.change[solved]
         weight, bias = unit[:, None] * arrays["out_weight"].T[solved], unit * arrays["out_bias"][solved]
         change = build.add(Dense, "change", h, weight=weight, bias=bias)
@@ -253,7 +253,7 @@ class RecurrentTwin(Twin):
             bias_h=np.concatenate([np.zeros(2 * len(own), np.float32), own]),
         )
 
-    def _member_rows(self) -> list[slice]:
+    def member_rows(self) -> list[slice]:
         """Rows of h of each member; all of them as one where members read one another, as after a further training."""
         units, weight = self.network.units, self.network.h_weight.detach().numpy()
         width = units // self.members
