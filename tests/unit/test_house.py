@@ -26,8 +26,9 @@ def house(benchmark):
 
 def test_rooms_are_few_and_imports_go_down(house):
     assert len(house.siblings) <= 22, house.siblings
-    # 130 before the room of closed loops, which imports eight and is imported by three; testing simulates for it.
-    assert house.arrows <= 142
+    # 130 before the room of closed loops, which imports eight and is imported by three; testing simulates for it; and
+    # it keeps compiled code in storage.
+    assert house.arrows <= 143
     assert house.circles == []
 
 

@@ -23,6 +23,9 @@ def twin(
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.kind=recurrent.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    start: Annotated[
+        Path | None, typer.Option("--from", help="Run folder of a recurrent twin that goes on with these recordings.")
+    ] = None,
     workers: Annotated[int, typer.Option(min=0, help="Parallel trainings; 0: one for each core.")] = 0,
     as_json: JsonFlag = False,
 ) -> None:
@@ -31,6 +34,9 @@ def twin(
     Without settings, several formulations are fitted, and free runs that the fits had not seen choose; twin.kind names
     one. Judged on held-out recordings beside a static valve map and ARX. Ends with exit code 4 where the training
     diverged.
+
+    With --from a recurrent twin goes on, such as with minutes of another machine's logs; free runs of the validation
+    part say for how long, or that it is better as it is.
 
     Example: `edp twin data/m22 --out runs/twin`
     """
@@ -43,7 +49,7 @@ def twin(
     with progress(as_json) as shown:
         display = FitDisplay(shown, as_json)
         source = source_of(data, signal_map, repair)
-        trained = train_twin(source, experiment, folder, display.on_event, display.on_step, workers)
+        trained = train_twin(source, experiment, folder, display.on_event, display.on_step, workers, start)
     seconds = trained.bundle.provenance["seconds"]
     beaten = twin_beaten_by(trained.scores)
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}

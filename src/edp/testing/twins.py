@@ -161,9 +161,15 @@ def _branches(twin: Twin, commands: Array, measured: Array, state: TwinState, wh
     fed[:, 0] = row
     whole, _ = twin.rollout(runs, {key: np.repeat(values, len(first), 0) for key, values in start.items()}, fed)
     before = {key: values.copy() for key, values in start.items()}
-    branched = twin.branches(runs, start, row, first)
+    runner = twin.runner()
+    branched, again = twin.branches(runs, start, row, first), runner.branches(runs, start, row, first)
     scale = twin.scales.answer_width
     expect_near(branched / scale, whole / scale, f"{where}: a branch differs from a run of its own", 0.0, 1e-3)
+    expect_near(again / scale, branched / scale, f"{where}: branches of its runner are others", 0.0, 1e-3)
+    _, stepped = twin.step(runs[:1, 0], start, row[None])
+    ready = runner.step(runs[0, 0], start, row)
+    one, other = (twin.rollout(runs[:1, 1:], state)[0] for state in (stepped, ready))
+    expect_near(other / scale, one / scale, f"{where}: a step of its runner leads elsewhere", 0.0, 1e-3)
     same = all(np.array_equal(start[key], before[key]) for key in before)
     expect(same, f"{where}: branches change the state that they start from")
 

@@ -212,6 +212,7 @@ def fit_free_runs(
     spec: FreeRunSpec,
     on_event: Callable[[FreeRunProgress], None] | None = None,
     run: KeyedRun | None = None,
+    trained: bool = False,
 ) -> FittedTwin:
     """Train on free runs, choose by free runs of the validation part.
 
@@ -222,6 +223,7 @@ def fit_free_runs(
         spec: how to train.
         on_event: called with progress, after each validation.
         run: folder and key of the run; where given, a checkpoint after each validation makes it resumable.
+        trained: whether the twin was trained before: its weights as they are take part in the choice.
 
     Raises:
         DataError: stretches that are too short.
@@ -230,7 +232,7 @@ def fit_free_runs(
     """
     torch.set_num_threads(1)  # the products of a tick are too small to share
     with one_blas_thread():
-        return _fitted(twin, train, validation, spec, on_event, run)
+        return _fitted(twin, train, validation, spec, on_event, run, trained)
 
 
 def _fitted(
@@ -240,6 +242,7 @@ def _fitted(
     spec: FreeRunSpec,
     on_event: Callable[[FreeRunProgress], None] | None,
     run: KeyedRun | None,
+    trained: bool,
 ) -> FittedTwin:
     rate, network = twin.channels.rate_hz, twin.network
     lengths = [max(1, round(length * rate)) for length in spec.lengths_s]
@@ -252,6 +255,8 @@ def _fitted(
     rates = [group["lr"] for group in optimizer.param_groups]
     weight = torch.from_numpy(answer_weights(twin, spec))
     progress, chosen = _resumed(run, network, optimizer)
+    if trained and not progress.updates:
+        progress.best_score = judge.error()
     before, began = progress.seconds, time.process_time()
     while progress.updates < len(ticks) and not _waited_out(progress, spec, len(ticks)):
         share = _rate(progress.updates / len(ticks), spec.warmup)

@@ -26,6 +26,7 @@ class MemberTraining:
         validation: those that choose among its weights.
         training: how, with its own seed.
         folder: where its checkpoints stand, with the key of the run; None: it cannot go on after a stop.
+        trained: whether the twin was trained before, so that its weights as they are may be the best.
     """
 
     label: str
@@ -34,6 +35,7 @@ class MemberTraining:
     validation: Sequence[Series]
     training: FreeRunSpec
     folder: tuple[Path, str] | None
+    trained: bool = False
 
 
 def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], None] | None = None) -> FittedTwin:
@@ -44,9 +46,9 @@ def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], No
     """
     what = (job.twin, job.train, job.validation, job.training, on_event)
     if job.folder is None:
-        return fit_free_runs(*what)
+        return fit_free_runs(*what, trained=job.trained)
     with RunFolder(job.folder[0]) as folder:
-        return fit_free_runs(*what, KeyedRun(folder, job.folder[1]))
+        return fit_free_runs(*what, KeyedRun(folder, job.folder[1]), job.trained)
 
 
 def one_by_one(

@@ -97,6 +97,27 @@ def holds_twin(folder: str | Path) -> bool:
     return os.path.lexists(path / HEADER) or os.path.lexists(path / "twin" / HEADER)
 
 
+def twin_hash(folder: str | Path) -> str:
+    """Hash of the header of a twin, which holds those of its numbers.
+
+    Args:
+        folder: the twin's own, or the run folder around it.
+
+    Raises:
+        BundleError: the header was damaged or changed.
+    """
+    path = _twin_folder(folder)
+    with as_damage(path):
+        header = object_with(read_json(path / HEADER), (HASH,), f"'{path / HEADER}'")
+        check_hash(header, path / HEADER)
+        return str(header[HASH])
+
+
+def _twin_folder(folder: str | Path) -> Path:
+    path = Path(folder)
+    return path / "twin" if os.path.lexists(path / "twin" / HEADER) else path
+
+
 def load_twin(folder: str | Path) -> TwinBundle:
     """Read a twin; schema, hashes, shapes and ranges are checked before it is built.
 
@@ -106,8 +127,7 @@ def load_twin(folder: str | Path) -> TwinBundle:
     Raises:
         BundleError: not a twin, another schema, damaged numbers, or a formulation that this version does not know.
     """
-    path = Path(folder)
-    path = path / "twin" if os.path.lexists(path / "twin" / HEADER) else path
+    path = _twin_folder(folder)
     if not os.path.lexists(path / HEADER):
         raise BundleError(f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote")
     with as_damage(path):

@@ -139,6 +139,59 @@ def test_the_disturbance_is_the_speed_that_the_twin_does_not_know_of(env, twin):
     assert strokes[0, -1, 0] - drifted[stroke] == pytest.approx(0.1 * 0.01, abs=2e-4)
 
 
+def test_the_compiled_normal_equations_are_those_of_the_weighted_tip_errors(env, models):
+    plant = interface_of(env)
+    controller = CONTROLLERS["nmpc"](blocks=(2, 3), along=0.3).build(plant, LoopLimits(), models)
+    rng = np.random.default_rng(2)
+    shares = np.linspace(0.3, 0.6, 30)[:, None] + rng.uniform(-0.05, 0.05, 3)
+    reference = reference_of_strokes("way", shares * plant.geometry.full_m, plant.geometry, plant.rate_hz)
+    controller.begin(np.zeros(len(controller.reads)) + 0.5, reference)
+    for tick in (4, 27, 60):  # inside, near the end, and behind it
+        strokes = reference.strokes[reference.rows(tick + 1, 5)] + rng.uniform(-0.02, 0.02, (7, 5, 3))
+        steps = rng.choice([-0.01, 0.01], 6)
+        rows = reference.rows(tick + 1, 5)
+        tips, jacobians = TipTable(plant.geometry).poses(strokes[0])
+        error = tips - reference.tip[rows]
+        error[:, 2] = (error[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        weights = module._directions(reference, controller.spec)[rows]
+        slopes = (strokes[1:] - strokes[0]) / steps[:, None, None]
+        derivatives = np.einsum("tij,tjk,vtk->tiv", weights, jacobians, slopes).reshape(-1, 6)
+        weighted = np.einsum("tij,tj->ti", weights, error).ravel()
+        normal = controller._normal(strokes, steps, tick)
+        assert normal[:, :-1] == pytest.approx(derivatives.T @ derivatives, rel=1e-9, abs=1e-12)
+        assert normal[:, -1] == pytest.approx(derivatives.T @ weighted, rel=1e-9, abs=1e-12)
+
+
+def test_compiled_rows_of_limits_are_those_of_values_near_one(env, models):
+    plant = interface_of(env)
+    limits = LoopLimits(stroke_margin=0.05, pressure_pa=20e6)
+    controller = CONTROLLERS["nmpc"](blocks=(2, 3)).build(plant, limits, models)
+    rng, full = np.random.default_rng(3), plant.geometry.full_m
+    strokes = rng.uniform(0.0, 1.0, (7, 5, 3)) * full
+    pressures = rng.uniform(0.0, 22e6, (7, 5, controller.model.pressures))
+    steps = rng.choice([-0.01, 0.01], 6)
+    rows, low, high = controller._limits(strokes, pressures, steps)
+    values = np.concatenate([strokes / full, pressures / 20e6], axis=2)[:, [1, 4]]
+    base, slopes = values[0].ravel(), ((values[1:] - values[0]) / steps[:, None, None]).reshape(6, -1).T
+    least = np.tile([0.05] * 3 + [-1e30] * controller.model.pressures, 2)
+    most = np.tile([0.95] * 3 + [1.0] * controller.model.pressures, 2)
+    near = (base < least + module.NEAR_LIMIT) | (base > most - module.NEAR_LIMIT)
+    assert 0 < near.sum() < len(near)
+    assert rows == pytest.approx(slopes[near])
+    assert low == pytest.approx((least - base)[near])
+    assert high == pytest.approx((most - base)[near])
+
+
+def test_compiled_levers_are_the_interpolated_map(valves):
+    inverse = SpeedToLever(valves, LoopLimits())
+    speeds = np.random.default_rng(4).uniform(-0.7, 0.7, (5, 40, 3))
+    speeds[0, :6, 0] = (0.0, REST_M_S, -REST_M_S, REST_M_S / 2, 9.0, -9.0)
+    levers = inverse.levers(speeds)
+    for axis, (extend, retract) in enumerate(inverse._tables):
+        out, back = np.interp(speeds[..., axis], *extend), np.interp(-speeds[..., axis], *retract)
+        assert levers[..., axis] == pytest.approx(np.where(speeds[..., axis] >= 0.0, out, -back), abs=1e-14)
+
+
 def test_a_step_of_the_plan_is_the_solution_of_the_bounded_least_squares(env, models):
     plant = interface_of(env)
     controller = CONTROLLERS["nmpc"](blocks=(3, 5), trust_m_s=100.0).build(plant, LoopLimits(), models)

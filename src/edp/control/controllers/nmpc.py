@@ -8,6 +8,7 @@ and pressure limits are soft, so that it always has a solution.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -20,6 +21,7 @@ from edp.control.controllers.pi import PiController, ProportionalIntegral
 from edp.control.geometry import AXES
 from edp.control.limits import LoopLimits
 from edp.control.models import ControlModels
+from edp.control.nmpc.compiled import fill_limits, fill_normal
 from edp.control.nmpc.model import TwinModel
 from edp.control.nmpc.moves import Moves, SpeedToLever
 from edp.control.nmpc.tip import TipTable
@@ -122,9 +124,18 @@ class NmpcController(Controller):
         self._moves, self._table = Moves(spec.blocks), TipTable(model.plant.geometry)
         self._stroke_columns = np.array([self.reads.index(name) for name in STROKES])
         self._slew = np.array(limits.slew_per_s) / model.plant.rate_hz
-        self._reference: TipReference | None = None
-        self._directions = np.zeros((0, 3, 3))
-        self._speeds = np.zeros((self._moves.blocks, AXES))
+        self._directions, self._tips, self._ahead = np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 0))
+        count, blocks = self._moves.count, self._moves.blocks
+        turn = self._moves.difference.T @ self._moves.difference
+        self._smooth = spec.change * turn + spec.feedforward * np.eye(count)
+        self._fastest, self._slowest = np.tile(valves.fastest, blocks), np.tile(valves.slowest, blocks)
+        pressures, margin = model.pressures, limits.stroke_margin
+        self._unit = np.concatenate((model.plant.geometry.full_m, np.full(pressures, limits.pressure_pa)))
+        least = np.concatenate((np.full(AXES, margin), np.full(pressures, NO_LIMIT)))
+        self._ends = (least, np.concatenate((np.full(AXES, 1.0 - margin), np.ones(pressures))), NEAR_LIMIT)
+        most = blocks * (AXES + pressures)
+        self._room, self._near = (np.empty((most, count)), np.empty(most), np.empty(most)), 0
+        self._speeds = np.zeros((blocks, AXES))
         self._latest = np.zeros(AXES)
         self._row: Array | None = None
         self._tick = -1
@@ -132,7 +143,11 @@ class NmpcController(Controller):
     def begin(self, measured: Array, reference: TipReference) -> None:
         """Form the twin's memory at rest; forget plan and disturbance."""
         self.model.begin(measured)
-        self._reference, self._directions = reference, _directions(reference, self.spec)
+        # Behind its last row a reference stays, for as long as a horizon.
+        rows = reference.rows(0, reference.ticks + self._moves.ticks)
+        self._directions = np.ascontiguousarray(_directions(reference, self.spec)[rows])
+        self._tips = np.ascontiguousarray(reference.tip[rows])
+        self._ahead = _speeds_ahead(reference, self._moves)
         self._speeds[:], self._latest[:], self._row, self._tick = 0.0, 0.0, None, -1
         if self._fallback is not None:
             self._fallback.begin(measured[self._stroke_columns], reference)
@@ -166,62 +181,59 @@ class NmpcController(Controller):
 
     def _improve(self, measured: Array, tick: int) -> None:
         """One Gauss-Newton step on the plan, and its first speeds as those that are asked for."""
-        moves, spec = self._moves, self.spec
+        moves, speeds = self._moves, self._speeds
         # Away from the fastest speed, beyond which a lever has no more to give and a step would show no effect.
-        steps = np.where(self._speeds + STEP_M_S > self._valves.fastest, -STEP_M_S, STEP_M_S)
-        levers = moves.levers(self._valves.levers(moves.runs(self._speeds, steps)), self.before, self._slew)
+        steps = np.where(speeds + STEP_M_S > self._valves.fastest, -STEP_M_S, STEP_M_S)
+        levers = moves.levers(self._valves.levers(moves.runs(speeds, steps)), self.before, self._slew)
         strokes, pressures = self.model.predicted(levers, measured, moves.first)
-        by_stroke, by_pressure = (_slopes(values, steps) for values in (strokes, pressures))
-        error, by_speeds = self._errors(strokes[0], by_stroke, tick)
-        turn = moves.difference.T @ moves.difference * spec.change
-        begin = np.diff(np.concatenate((self._latest[None], self._speeds)), axis=0).ravel()
-        hessian = by_speeds.T @ by_speeds + turn + spec.feedforward * np.eye(moves.count)
-        gradient = by_speeds.T @ error + spec.change * moves.difference.T @ begin
-        gradient += spec.feedforward * (self._speeds - self._ahead(tick)).ravel()
-        rows, low, high = self._limits((strokes[0], pressures[0]), (by_stroke, by_pressure))
-        solution, iterations = self._solved(hessian, gradient, rows, low, high)
-        self._speeds += solution.reshape(self._speeds.shape)
+        normal = self._normal(strokes, steps.ravel(), tick)
+        hessian = normal[:, :-1] + self._smooth
+        gradient = normal[:, -1] + self._smooth @ speeds.ravel()
+        gradient -= self.spec.feedforward * self._ahead[min(tick, len(self._ahead) - 1)]
+        # The first change is from what was asked for last.
+        gradient[:AXES] -= self.spec.change * self._latest
+        solution, iterations = self._solved(hessian, gradient, *self._limits(strokes, pressures, steps.ravel()))
+        self._speeds += solution.reshape(speeds.shape)
         self._latest = self._speeds[0].copy()
-        self.info = {"iterations": float(iterations), "constraints": float(len(rows))}
-        self.info |= {f"disturbance_{i + 1}": float(v) for i, v in enumerate(self.model.disturbance)}
+        first, second, third = self.model.disturbance.tolist()
+        self.info = {"iterations": float(iterations), "constraints": float(self._near)}
+        self.info |= {"disturbance_1": first, "disturbance_2": second, "disturbance_3": third}
 
-    def _ahead(self, tick: int) -> Array:
-        """Mean speeds of the reference's strokes in each block, m/s, shape (block, 3)."""
-        assert self._reference is not None  # noqa: S101  for the type checker: `begin` comes first
-        strokes, ends = self._reference.strokes, tick + 1 + self._moves.last_ticks
-        last = self._reference.ticks - 1
-        begins = np.concatenate(([tick], ends[:-1]))
-        moved = strokes[np.minimum(ends, last)] - strokes[np.minimum(begins, last)]
-        return np.asarray(moved * self.plant.rate_hz / (ends - begins)[:, None])
+    def _normal(self, strokes: Array, steps: Array, tick: int) -> Array:
+        """Products of the derivatives of weighted tip errors by the variables, and of these with the errors.
 
-    def _errors(self, strokes: Array, by_speed: Array, tick: int) -> tuple[Array, Array]:
-        """Weighted tip errors of the base, shape (3 ticks,), and their derivatives by the variables."""
-        assert self._reference is not None  # noqa: S101  for the type checker: `begin` comes first
-        rows = self._reference.rows(tick + 1, self._moves.ticks)
-        tips, jacobians = self._table.poses(strokes)
-        error = tips - self._reference.tip[rows]
-        error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-        by_strokes = self._directions[rows] @ jacobians
-        derivatives = np.einsum("tij,vtj->tiv", by_strokes, by_speed)
-        weighted = np.einsum("tij,tj->ti", self._directions[rows], error)
-        return weighted.ravel(), derivatives.reshape(-1, self._moves.count)
+        Args:
+            strokes: of all runs, the base first, m, shape (variable + 1, tick, 3).
+            steps: by which each variable differs in its run, m/s, shape (variable,).
+            tick: now.
 
-    def _limits(self, values: tuple[Array, Array], by_speed: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        Returns:
+            Shape (variable, variable + 1), errors last.
+        """
+        tips, jacobians = self._table.poses(strokes[0])
+        now = min(tick + 1, len(self._ahead) - 1)
+        rows = slice(now, now + self._moves.ticks)
+        directions, goals = self._directions[rows], self._tips[rows]
+        normal = np.empty((self._moves.count, self._moves.count + 1))
+        fill_normal(strokes, steps, tips, jacobians, directions, goals, normal)
+        return normal
+
+    def _limits(self, strokes: Array, pressures: Array, steps: Array) -> tuple[Array, Array, Array]:
         """Soft rows of the program at the ends of the blocks: strokes and pressures that come near a limit.
 
         Args:
-            values: strokes (m) and pressures (Pa) of the base, shape (tick, number).
-            by_speed: their derivatives by the variables, shape (variable, tick, number).
+            strokes: of all runs, the base first, m, shape (variable + 1, tick, 3).
+            pressures: likewise, Pa, shape (variable + 1, tick, number).
+            steps: by which each variable differs in its run, m/s, shape (variable,).
+
+        Returns:
+            Slopes by the variables, shape (row, variable), least and largest change, shape (row,) each.
         """
-        ends, full = self._moves.last_ticks, self.plant.geometry.full_m
-        pressures, margin = values[1].shape[1], self.limits.stroke_margin
-        unit = np.concatenate((full, np.full(pressures, self.limits.pressure_pa)))
-        base = (np.concatenate([part[ends] for part in values], axis=1) / unit).ravel()
-        slopes = np.concatenate([part[:, ends] for part in by_speed], axis=2) / unit
-        least = np.tile(np.concatenate((np.full(AXES, margin), np.full(pressures, NO_LIMIT))), len(ends))
-        largest = np.tile(np.concatenate((np.full(AXES, 1.0 - margin), np.ones(pressures))), len(ends))
-        near = (base < least + NEAR_LIMIT) | (base > largest - NEAR_LIMIT)
-        return slopes.reshape(self._moves.count, -1)[:, near].T, (least - base)[near], (largest - base)[near]
+        ends = self._moves.last_ticks
+        values = np.concatenate((strokes[:, ends], pressures[:, ends]), axis=2)
+        self._near = rows = fill_limits(values, steps, self._unit, self._ends, self._room)
+        slopes, low, high = self._room
+        return slopes[:rows], low[:rows], high[:rows]
 
     def _solved(self, hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> tuple[Array, int]:
         """The step of the plan, within the speeds that the levers' ranges give.
@@ -229,11 +241,11 @@ class NmpcController(Controller):
         Raises:
             ControlFault: the program has no solution, or a number in it is not finite.
         """
-        now, blocks = self._speeds.ravel(), self._moves.blocks
-        reach = self.spec.trust_m_s
-        upper = np.concatenate((np.minimum(np.tile(self._valves.fastest, blocks) - now, reach), high))
-        lower = np.concatenate((np.maximum(np.tile(self._valves.slowest, blocks) - now, -reach), low))
-        if not (np.isfinite(hessian).all() and np.isfinite(gradient).all() and np.isfinite(rows).all()):
+        now, reach = self._speeds.ravel(), self.spec.trust_m_s
+        upper = np.concatenate((np.minimum(self._fastest - now, reach), high))
+        lower = np.concatenate((np.maximum(self._slowest - now, -reach), low))
+        # Whatever is not finite makes a sum that is not.
+        if not math.isfinite(float(hessian.sum() + gradient.sum() + rows.sum())):
             raise ControlFault("the model's predictions are not finite")
         sense = np.zeros(len(upper), np.int32)
         sense[self._moves.count :] = SOFT
@@ -244,9 +256,14 @@ class NmpcController(Controller):
         return np.asarray(solution), int(info["iterations"])
 
 
-def _slopes(values: Array, steps: Array) -> Array:
-    """Derivatives by the variables, shape (variable, tick, number), from runs that differ by steps in one each."""
-    return np.asarray((values[1:] - values[0]) / steps.reshape(-1, 1, 1))
+def _speeds_ahead(reference: TipReference, moves: Moves) -> Array:
+    """Mean speeds of the reference's strokes in each block, for a plan from each tick, m/s, shape (tick, variable)."""
+    strokes, last = reference.strokes, reference.ticks - 1
+    now = np.arange(reference.ticks)[:, None]
+    ends = now + 1 + moves.last_ticks
+    begins = np.concatenate((now, ends[:, :-1]), axis=1)
+    moved = strokes[np.minimum(ends, last)] - strokes[np.minimum(begins, last)]
+    return np.asarray(moved * reference.rate_hz / (ends - begins)[..., None]).reshape(len(now), moves.count)
 
 
 def _directions(reference: TipReference, spec: PredictiveControl) -> Array:

@@ -31,6 +31,7 @@ class TwinModel:
 
     Attributes:
         reads: channels of the plant that it reads, in the order of the twin's answers.
+        pressures: number of cylinder pressures that it predicts.
         disturbance: speeds (m/s), shape (3,), that the twin does not know of.
 
     Raises:
@@ -43,14 +44,18 @@ class TwinModel:
         _check(twin, plant, answers, commands)
         measured = {channel.name for channel in plant.channels}
         self.twin, self.plant, self.window, self.smoothing = twin, plant, window, smoothing
+        self._runner = twin.runner()
         self.reads = tuple(name for name in answers if name in measured)
         self._ports = np.array([answers.index(name) for name in self.reads])
         self._pilots = np.array([PILOTS.index(name) for name in commands])
-        self._strokes = np.array([answers.index(name) for name in STROKES])
-        self._pressures = np.array([n for n, name in enumerate(answers) if name.startswith("CylPressures_")])
+        self._strokes = _columns([answers.index(name) for name in STROKES])
+        self._pressures = _columns([n for n, name in enumerate(answers) if name.startswith("CylPressures_")])
+        self.pressures = sum(name.startswith("CylPressures_") for name in answers)
+        self._free = np.full(len(answers), np.nan, np.float32)
         self.disturbance = np.zeros(AXES)
         self._state: TwinState = {}
         self._past: deque[tuple[TwinState, NDArray[np.float32], NDArray[np.float32]]] = deque(maxlen=window)
+        self._alone = np.zeros(1, np.int64)
 
     def begin(self, measured: Array) -> None:
         """Form the memory as if the machine had rested with this row of `reads` and neutral levers."""
@@ -66,7 +71,7 @@ class TwinModel:
 
     def row(self, measured: Array) -> NDArray[np.float32]:
         """A row of the twin's answers from one of `reads`, NaN where the plant measures nothing."""
-        row = np.full(len(self.twin.channels.answers), np.nan, np.float32)
+        row = self._free.copy()
         row[self._ports] = measured
         return row
 
@@ -76,7 +81,7 @@ class TwinModel:
             return
         state, row, _ = self._past[0]
         commands = np.array([command for _, _, command in self._past])
-        answers = self.twin.branches(commands[None], state, row, np.zeros(1, np.int64))
+        answers = self._runner.branches(commands[None], state, row, self._alone)
         missed = self.row(measured)[self._strokes] - answers[0, -1, self._strokes]
         speed = missed * self.plant.rate_hz / self.window
         self.disturbance = self.disturbance + self.smoothing * (speed - self.disturbance)
@@ -93,17 +98,24 @@ class TwinModel:
             Strokes (m) after each tick, shape (run, tick, 3), and cylinder pressures (Pa), shape (run, tick, pressure).
         """
         commands = np.asarray(self.plant.commands(levers)[..., self._pilots], np.float32)
-        answers = self.twin.branches(commands, self._state, self.row(measured), first)
-        seconds = np.arange(1, levers.shape[1] + 1)[:, None] / self.plant.rate_hz
-        strokes = answers[..., self._strokes].astype(float) + seconds * self.disturbance
+        answers = self._runner.branches(commands, self._state, self.row(measured), first)
+        ticks = np.arange(1, levers.shape[1] + 1)[:, None]
+        strokes = answers[..., self._strokes] + ticks * (self.disturbance / self.plant.rate_hz)
         return strokes, answers[..., self._pressures].astype(float)
 
     def advance(self, measured: Array | None, levers: Array) -> None:
         """Let a tick pass with these levers; `measured` is None where nothing came, and all ports ran free."""
-        row = np.full(len(self.twin.channels.answers), np.nan, np.float32) if measured is None else self.row(measured)
+        row = self._free if measured is None else self.row(measured)
         command = np.asarray(self.plant.commands(levers)[self._pilots], np.float32)
         self._past.append((self._state, row, command))
-        _, self._state = self.twin.step(command[None], self._state, row[None])
+        self._state = self._runner.step(command, self._state, row)
+
+
+def _columns(indices: list[int]) -> slice | NDArray[np.int64]:
+    """Columns as a slice where they lie side by side: what it takes is no copy."""
+    if indices and indices == list(range(indices[0], indices[-1] + 1)):
+        return slice(indices[0], indices[-1] + 1)
+    return np.array(indices, np.int64)
 
 
 def _check(twin: Twin, plant: PlantInterface, answers: list[str], commands: list[str]) -> None:

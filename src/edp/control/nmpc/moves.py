@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from edp.control.geometry import AXES
 from edp.control.limits import LoopLimits
+from edp.control.nmpc.compiled import fill_levers, fill_ways
 from edp.control.valve_map import SIDES, ValveMap
 
 Array = NDArray[np.float64]
@@ -41,16 +42,25 @@ class SpeedToLever:
                 sides.append(table)
                 ends[side, axis] = SIDES[side] * float(np.interp(abs(end), table[1], table[0]))
             self._tables.append(sides)
+        self._packed = _packed(self._tables)
         self.fastest, self.slowest = ends
 
     def levers(self, speeds: Array) -> Array:
         """Levers for speeds (m/s), shape (..., 3) both."""
-        levers = np.empty_like(speeds)
-        for axis, (extend, retract) in enumerate(self._tables):
-            wanted_speed = speeds[..., axis]
-            out, back = np.interp(wanted_speed, *extend), np.interp(-wanted_speed, *retract)
-            levers[..., axis] = np.where(wanted_speed >= 0.0, out, -back)
+        levers = np.empty(speeds.shape)
+        rows = np.ascontiguousarray(speeds).reshape(-1, AXES)
+        fill_levers(rows, *self._packed, levers.reshape(-1, AXES))
         return levers
+
+
+def _packed(tables: list[list[tuple[Array, Array]]]) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Speeds, levers ``(axis, side, point)``, and the points in use, of tables of different lengths."""
+    counts = np.array([[len(speeds) for speeds, _ in sides] for sides in tables], np.int64)
+    arrays = np.zeros((2, *counts.shape, counts.max()))
+    for axis, sides in enumerate(tables):
+        for side, table in enumerate(sides):
+            arrays[:, axis, side, : counts[axis, side]] = table
+    return arrays[0], arrays[1], counts
 
 
 class Moves:
@@ -69,8 +79,6 @@ class Moves:
         self.blocks, self.ticks = len(blocks), sum(blocks)
         self.count = AXES * self.blocks
         starts = np.cumsum(blocks) - blocks
-        self._slices = [slice(int(start), int(start) + ticks) for start, ticks in zip(starts, blocks, strict=True)]
-        self._counts = np.concatenate([np.arange(1, ticks + 1) for ticks in blocks])
         self.first = np.concatenate(([0], np.repeat(starts, AXES))).astype(np.int64)
         self.last_ticks = np.cumsum(blocks) - 1
         # Differences from block to block, the first from what was asked for last.
@@ -103,11 +111,5 @@ class Moves:
             Shape (run, tick, 3).
         """
         levers = np.empty((len(targets), self.ticks, AXES))
-        start = np.broadcast_to(before, targets[:, 0].shape)
-        for block, ticks in enumerate(self._slices):
-            # Within a block the target stays, so that a lever has moved by the smaller of way and time.
-            farthest = self._counts[ticks, None] * step
-            way = (targets[:, block] - start)[:, None]
-            levers[:, ticks] = start[:, None] + np.minimum(np.maximum(way, -farthest), farthest)
-            start = levers[:, ticks.stop - 1]
+        fill_ways(targets, before, step, self.last_ticks, levers)
         return levers

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.control.geometry import AXES, TipGeometry
+from edp.control.nmpc.compiled import fill_poses
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import pose
@@ -30,7 +31,7 @@ class TipTable:
         axes, plant = pack(machine)
         kinematics = pose.Kinematics(axes, plant)
         shares = np.linspace(0.0, 1.0, NODES)
-        self.full_m = geometry.full_m
+        self.full_m: Array = np.array(geometry.full_m, float)
         self._angles: Array = np.array([kinematics.angles_at(np.full(AXES, share)) for share in shares])
         self._lengths = np.array(machine.bodies.length, float)
 
@@ -44,15 +45,8 @@ class TipTable:
             Tip x, y (m) and attitude (rad), shape (..., 3), and their derivatives by the strokes (m/m, m/m, rad/m),
             shape (..., 3, 3).
         """
-        nodes = np.clip(strokes / self.full_m, 0.0, 1.0) * (NODES - 1)
-        low = np.minimum(nodes.astype(np.int64), NODES - 2)
-        axis = np.arange(AXES)
-        first, second = self._angles[low, axis], self._angles[low + 1, axis]
-        turned = np.cumsum(first + (nodes - low) * (second - first), axis=-1)
-        slope = (second - first) * (NODES - 1) / self.full_m
-        along, up = self._lengths * np.cos(turned), self._lengths * np.sin(turned)
-        tips = np.stack([along.sum(-1), up.sum(-1), turned[..., 2]], axis=-1)
-        # A joint turns all links behind it.
-        by_x, by_y = -np.cumsum(up[..., ::-1], -1)[..., ::-1], np.cumsum(along[..., ::-1], -1)[..., ::-1]
-        jacobians = np.stack([by_x * slope, by_y * slope, slope], axis=-2)
-        return tips, jacobians
+        rows = np.ascontiguousarray(strokes, dtype=float).reshape(-1, AXES)
+        tips, jacobians = np.empty((len(rows), 3)), np.empty((len(rows), 3, AXES))
+        fill_poses(rows, self._angles, self.full_m, self._lengths, tips, jacobians)
+        shape = strokes.shape[:-1]
+        return tips.reshape(*shape, 3), jacobians.reshape(*shape, 3, AXES)

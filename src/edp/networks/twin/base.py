@@ -166,6 +166,10 @@ class Twin(ABC):
         fed[:, 0] = measured
         return self.rollout(commands, {name: np.repeat(rows, len(commands), 0) for name, rows in state.items()}, fed)[0]
 
+    def runner(self) -> TwinRunner:
+        """The twin as it is now, ready for one machine tick by tick."""
+        return TwinRunner(self)
+
     def scaled(self, answers: Array) -> Array:
         """Answers in SI units as a network reads them."""
         return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)
@@ -236,6 +240,33 @@ class Twin(ABC):
         ends = slice(count, count + strokes)
         low, high = self.scales.low[ends], self.scales.high[ends]
         return np.asarray(np.maximum(low - start[:, ends], start[:, ends] - high) / (high - low), dtype=np.float32)
+
+
+class TwinRunner:
+    """A twin with its numbers as they were, for one machine tick by tick: what can be prepared once is.
+
+    Values are those of the twin's own methods but for rounding. A controller asks so a hundred times a second.
+
+    Args:
+        twin: that runs; later changes of its numbers may or may not show.
+    """
+
+    def __init__(self, twin: Twin) -> None:
+        self.twin = twin
+
+    def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
+        """See `Twin.branches`."""
+        return self.twin.branches(commands, state, measured, first)
+
+    def step(self, command: Array, state: TwinState, measured: Array) -> TwinState:
+        """State after one tick.
+
+        Args:
+            command: ``(command,)``, finite.
+            state: before it, a batch of one; it stays as it is.
+            measured: ``(answer,)``, NaN where a port is free.
+        """
+        return self.twin.step(command[None], state, measured[None])[1]
 
 
 class TwinSpec(Protocol):

@@ -16,7 +16,7 @@ from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, Dense, ScaleShift
 from edp.ir.memory import Gru
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState, solved_columns
 from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork, buffers
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.static_map import StaticMap, StaticTwin
@@ -191,20 +191,23 @@ class RecurrentTwin(Twin):
         return np.asarray(answers, dtype=np.float32), after
 
     def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
-        network, bounds = self.network, self.bounds
-        weights = tuple(weight.detach().numpy() for weight in (*network.looped, network.pulls(bounds)))
-        command_weight, bias = network.command_weight.detach().numpy(), network.bias.detach().numpy()
-        rows = self.scaled_commands(np.asarray(commands, np.float32)).swapaxes(0, 1)
-        mapped = np.zeros((0, 0, 0), np.float32)
-        if self.static is not None:
-            solved, _ = self.static.mapped(commands, np.repeat(state["commands"], len(commands), axis=0))
-            mapped = np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1))
-        read = self.scaled(measured)
-        start = (np.where(np.isfinite(read), read, state["answer"][0]), state["h"][0])
-        answers = np.empty((*rows.shape[:2], len(measured)), np.float32)
-        inputs = (np.ascontiguousarray(rows @ command_weight.T + bias), mapped)
-        run_branches(inputs, weights, bounds.arrays, bounds.velocities, start, first, answers)
-        return np.asarray((answers * self.scales.answer_width + self.scales.answer_offset).swapaxes(0, 1), np.float32)
+        return self.runner().branches(commands, state, measured, first)
+
+    def runner(self) -> RecurrentRunner:
+        return RecurrentRunner(self)
+
+    def map_along(self, commands: Array, state: TwinState) -> tuple[Array, Array]:
+        """What the static map says of commands ``(tick, lane, command)``, scaled and tick first; and its memory after.
+
+        Args:
+            commands: SI units.
+            state: of one machine, that of all lanes.
+        """
+        if self.static is None:
+            return np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32)
+        lanes = np.ascontiguousarray(commands.swapaxes(0, 1))
+        solved, memory = self.static.mapped(lanes, np.repeat(state["commands"], len(lanes), axis=0))
+        return np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1)), memory[:1]
 
     def _scaled_map(self, solved: Array) -> Array:
         """Scaled answers ``(..., answer)`` of what the map says ``(..., all but strokes)``, zero for strokes."""
@@ -217,7 +220,7 @@ class RecurrentTwin(Twin):
         network, solved = self.network, solved_columns(self.channels)
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
         read = build.join("read", commands, fed)
-        h = build.join("memories", *(self._lowered(build, read, rows) for rows in self._member_rows()))
+        h = build.join("memories", *(self._lowered(build, read, rows) for rows in self.member_rows()))
         unit = self.bounds.change[solved]
         weight, bias = unit[:, None] * arrays["out_weight"].T[solved], unit * arrays["out_bias"][solved]
         change = build.add(Dense, "change", h, weight=weight, bias=bias)
@@ -250,7 +253,7 @@ class RecurrentTwin(Twin):
             bias_h=np.concatenate([np.zeros(2 * len(own), np.float32), own]),
         )
 
-    def _member_rows(self) -> list[slice]:
+    def member_rows(self) -> list[slice]:
         """Rows of h of each member; all of them as one where members read one another, as after a further training."""
         units, weight = self.network.units, self.network.h_weight.detach().numpy()
         width = units // self.members
@@ -264,6 +267,51 @@ class RecurrentTwin(Twin):
         weights = {name: weight.detach().numpy().copy() for name, weight in self.network.named_parameters()}
         numbers = {} if self.static is None else self.static.numbers
         return self.scales.arrays() | weights | {MAP + name: values for name, values in numbers.items()}
+
+
+class RecurrentRunner(TwinRunner):
+    """See `TwinRunner`: weights that read commands in SI units and answer in scaled ones, side by side in memory."""
+
+    def __init__(self, twin: RecurrentTwin) -> None:
+        super().__init__(twin)
+        self._twin, scales, bounds, count = twin, twin.scales, twin.bounds, len(twin.channels.commands)
+        weights = {name: weight.detach().numpy() for name, weight in twin.network.named_parameters()}
+        # In double precision, since an offset may be many widths from zero.
+        by_command = weights["command_weight"].astype(np.float64) / scales.command_width
+        arrays = (
+            np.concatenate([by_command.T, weights["feedback_weight"]]),
+            weights["bias"] - by_command @ scales.command_offset.astype(np.float64),
+            weights["h_weight"],
+            weights["inner_bias"],
+            weights["out_weight"] * bounds.change,
+            weights["out_bias"] * bounds.change,
+            twin.network.pulls(bounds).detach().numpy(),
+            scales.answer_offset,
+            scales.answer_width,
+        )
+        self._weights = tuple(np.array(array, dtype=np.float32, order="C") for array in arrays)
+        self._sizes = (count, len(scales.low), twin.network.units)
+
+    def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
+        rows = np.ascontiguousarray(np.asarray(commands, np.float32).swapaxes(0, 1))
+        return self._run(rows, state, measured, first)[0]
+
+    def step(self, command: Array, state: TwinState, measured: Array) -> TwinState:
+        rows = np.ascontiguousarray(command, dtype=np.float32).reshape(1, 1, -1)
+        _, after = self._run(rows, state, measured, np.zeros(1, np.int64))
+        return after
+
+    def _run(self, rows: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> tuple[Array, TwinState]:
+        """Answers ``(lane, tick, answer)`` to commands ``(tick, lane, command)``; the state of lane 0 after them."""
+        twin, (_, count, units) = self._twin, self._sizes
+        mapped, memory = twin.map_along(rows, state)
+        read = twin.scaled(measured)
+        start = (np.where(np.isfinite(read), read, state["answer"][0]), state["h"][0])
+        answers, h = np.empty((rows.shape[1], len(rows), count), np.float32), np.empty(units, np.float32)
+        bounds = twin.bounds
+        run_branches((rows, mapped), self._weights, bounds.arrays, bounds.velocities, start, first, answers, h)
+        after = {"answer": twin.scaled(answers[0, -1])[None], "h": h[None]}
+        return answers, after if twin.static is None else after | {"commands": memory}
 
 
 def member_seed(seed: int, which: int) -> int:

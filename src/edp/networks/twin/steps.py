@@ -154,26 +154,33 @@ def run_branches(
     start: tuple[Array, Array],
     first: NDArray[np.int64],
     answers: Array,
+    last_h: Array,
 ) -> None:
     """Run lanes free that are one lane up to the tick at which each branches off: what is alike is computed once.
 
     Args:
-        inputs: the commands' part of the gates ``(time, lane, 3 units)``, biases included, and what the static map says
-            ``(time, lane, answer)``, empty without one.
-        weights: as in `run_forward`; `bounds` and `velocities` likewise.
+        inputs: commands in SI units ``(time, lane, command)``, and what the static map says ``(time, lane, answer)``,
+            empty without one.
+        weights: of commands in SI units and feedback ``(command + answer, 3 units)`` and bias of the gates
+            ``(3 units,)``; of h, bias of n's inner sum, of the answers, their bias, and p as in `run_forward`, those of
+            the answers already scaled; offset and width of the answers ``(answer,)``.
         bounds: of the answers.
         velocities: number of them.
         start: what the ports read at the first tick ``(answer,)``, and h ``(units,)``, of all lanes.
         first: tick at which each lane branches off lane 0 ``(lane,)``, ascending, that of lane 0 zero.
-        answers: written ``(time, lane, answer)``; before a lane branches off, those of lane 0.
+        answers: written, SI units ``(lane, time, answer)``; before a lane branches off, those of lane 0.
+        last_h: written: h of lane 0 after the last tick ``(units,)``.
     """
-    projected, mapped = inputs
-    feedback_weight, h_weight, inner_bias, out_weight, out_bias, pull = weights
-    scale, low, high, trapezoid = bounds
-    ticks, lanes, width = answers.shape
-    units = h_weight.shape[0]
-    fed, free, change = np.empty_like(answers[0]), np.empty_like(answers[0]), np.empty_like(answers[0])
-    into, up, gates = np.empty_like(projected[0]), np.empty_like(projected[0]), np.empty_like(projected[0])
+    commands, mapped = inputs
+    input_weight, bias, h_weight, inner_bias, out_weight, out_bias, pull, offset, width = weights
+    _, low, high, trapezoid = bounds
+    ticks, lanes, commanded = commands.shape
+    units, count = out_weight.shape
+    read = np.empty((lanes, commanded + count), np.float32)
+    fed = np.empty((lanes, count), np.float32)
+    free, change, answer = np.empty_like(fed), np.empty_like(fed), np.empty_like(fed)
+    into = np.empty((lanes, 3 * units), np.float32)
+    up, gates = np.empty_like(into), np.empty_like(into)
     h = np.empty((lanes, units), np.float32)
     next_h, inner = np.empty_like(h), np.empty_like(h)
     fed[0], h[0] = start[0], start[1]
@@ -182,28 +189,35 @@ def run_branches(
         while running < lanes and first[running] <= t:
             fed[running], h[running] = fed[0], h[0]
             running += 1
+        for row in range(running):
+            for j in range(commanded):
+                read[row, j] = commands[t, row, j]
+            for j in range(count):
+                read[row, commanded + j] = fed[row, j]
         # The first rows: contiguous, as the products want them.
-        np.dot(fed[:running], feedback_weight, into[:running])
+        np.dot(read[:running], input_weight, into[:running])
         np.dot(h[:running], h_weight, up[:running])
         for row in range(running):
             for i in range(3 * units):
-                into[row, i] += projected[t, row, i]
+                into[row, i] += bias[i]
         gates_of(into, up, inner_bias, h[:running], gates, inner, next_h)
         np.dot(next_h[:running], out_weight, change[:running])
         for row in range(running):
-            for j in range(width):
-                change[row, j] = scale[j] * (change[row, j] + out_bias[j])
+            for j in range(count):
+                change[row, j] += out_bias[j]
             for j in range(len(pull)):
                 change[row, j] += pull[j] * (mapped[t, row, j] - fed[row, j])
-        _answer(fed[:running], change, low, high, trapezoid, velocities, answers[t], free)
+        _answer(fed[:running], change, low, high, trapezoid, velocities, answer, free)
         for row in range(running):
-            for j in range(width):
-                fed[row, j] = answers[t, row, j]
+            for j in range(count):
+                fed[row, j] = answer[row, j]
+                answers[row, t, j] = answer[row, j] * width[j] + offset[j]
             for i in range(units):
                 h[row, i] = next_h[row, i]
         for row in range(running, lanes):
-            for j in range(width):
-                answers[t, row, j] = answers[t, 0, j]
+            for j in range(count):
+                answers[row, t, j] = answers[0, t, j]
+    last_h[:] = h[0]
 
 
 @compiler.compiled

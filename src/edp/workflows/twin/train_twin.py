@@ -26,6 +26,7 @@ from edp.training.blas import one_blas_thread
 from edp.training.free_run import FittedTwin, FreeRunProgress
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
+from edp.workflows.twin.continue_twin import ContinuedTwin, TwinStart
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
 from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
@@ -58,10 +59,10 @@ def train_twin(
     on_event: Callable[[FreeRunProgress], None] | None = None,
     on_step: Callable[[str], None] | None = None,
     workers: int = 1,
+    start: str | Path | None = None,
 ) -> TrainedTwin:
-    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``, and where the
-    formulation was left open ``candidates.json``. A finished one is read,
-    a stopped one goes on.
+    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``, and where there was a
+    choice ``candidates.json``. A finished one is read, a stopped one goes on.
 
     Args:
         source: where the recordings are.
@@ -71,23 +72,30 @@ def train_twin(
         on_step: called with what begins.
         workers: processes that train the networks of an average side by side; 0 for one a core. The twin has the same
             bits with any number.
+        start: run folder of a recurrent twin that goes on with these recordings; None: a new one.
 
     Raises:
         EdpError: the recordings, settings or folder cannot be used; what was on disk stays.
     """
     tell = on_step or (lambda text: None)
     tell("reading recordings")
+    base = None if start is None else TwinStart.of(start)
+    if base is not None:
+        experiment = base.settled(experiment)
     recordings = source.read()
     channels, data = prepared_twin(recordings, experiment)
-    labels = driving_labels(recordings)
-    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)}, data.digest)
+    labels, begun = driving_labels(recordings), {}
+    if base is not None:
+        base.check(channels, data.train)
+        begun = {"from": base.digest}
+    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)} | begun, data.digest)
     with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
         run.write_status("running")
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell, helpers)
-        result = _chosen(fit, KeyedRun(run, key))
+        result = _chosen(fit, KeyedRun(run, key), base)
         fitted = result.fitted
         run.write_history(fitted.history)
         if result.datasheet:
@@ -110,9 +118,13 @@ def _helpers(workers: int) -> int:
     return min(workers or os.cpu_count() or 1, MOST_MEMBERS)
 
 
-def _chosen(fit: TwinFit, run: KeyedRun) -> FittedFormulation:
-    """The twin that the settings ask for; where they leave the formulation open, ``candidates.json`` has the choice."""
+def _chosen(fit: TwinFit, run: KeyedRun, base: TwinStart | None) -> FittedFormulation:
+    """The twin that the settings ask for, or the one that goes on; a choice is kept in ``candidates.json``."""
     spec = fit.experiment.twin
+    if base is not None:
+        result, tried = ContinuedTwin(fit, base, run).best()
+        write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
+        return result
     if not isinstance(spec, AutoTwin):
         result = fit.fitted(spec, run)
         return result if result.fitted.history else fit.refitted(result)

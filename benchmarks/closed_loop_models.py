@@ -1,0 +1,177 @@
+"""Recordings and models of the closed-loop benchmark: a twin of M22, its rivals, and twins that go on with C14."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import table
+from edp.config.experiment import load_experiment
+from edp.config.twin import load_twin_experiment
+from edp.evaluation.ahead import look_ahead
+from edp.logs.source import DataSource
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.training.twin_bundle import load_twin
+from edp.workflows.train_evaluate import train
+from edp.workflows.twin import train_twin
+from edp.workflows.twin.prepare_twin import prepare_twin
+
+MIX: Mapping[str, float] = {
+    "isolated": 0.15,
+    "combined": 0.21,
+    "grading": 0.28,
+    "dig": 0.12,
+    "aprbs": 0.12,
+    "end_stops": 0.05,
+    "reversals": 0.07,
+}
+SOILS: Mapping[str, float] = {"air": 0.5, "dry_sand": 0.15, "sandy_loam": 0.2, "clay": 0.15}
+"""Of the recordings that work the ground; all others move in free air."""
+JUDGED = (
+    *("judge.seconds=20", "judge.at_s=[1.0,5.0,10.0]", "judge.covered_at_s=[0.1,1.0,10.0]", "judge.floors=[]"),
+    *("judge.ahead_ticks=20", "training.patience=0"),
+)
+LEAD_TICKS = 20
+AHEAD = (1, 5, 10, 20, 50)
+"""Ticks ahead of measured ports at which the twin is judged, told the commands."""
+GROUND = ("dry_sand", "sandy_loam", "clay")
+
+
+ONE_STEP = (
+    *("twin.kind=recurrent", "twin.units=64", "training.lengths_s=[0.1]", "training.updates=[2000]"),
+    *("training.measured_share=0.99", "training.mixed_share=0.0"),
+)
+"""A network that is trained on measured feedback all but alone."""
+
+
+@dataclass(frozen=True)
+class ModelSize:
+    """How much is simulated and trained.
+
+    Attributes:
+        minutes: of M22.
+        recordings: of M22.
+        twin: settings of its twin.
+        one_step: settings of the network that is trained on measured feedback alone.
+        predictor: settings of the look-ahead predictor.
+        other: minutes of C14 from which a twin goes on; the first for the controllers, all for tuning.
+    """
+
+    minutes: float
+    recordings: int
+    twin: tuple[str, ...]
+    one_step: tuple[str, ...]
+    predictor: tuple[str, ...]
+    other: tuple[int, ...]
+
+
+FULL = ModelSize(
+    *(180.0, 60, ("twin.kind=recurrent", "twin.units=96")),
+    ONE_STEP,
+    ("training.epochs=8", "training.updates=150"),
+    (20, 5, 45),
+)
+QUICK = ModelSize(
+    *(20.0, 20, ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1,0.3]", "training.updates=[20,20]")),
+    ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1]", "training.updates=[10]"),
+    *(("training.epochs=1", "training.updates=20"), (5,)),
+)
+
+
+class Models:
+    """Run folders below a folder; what is there already is read.
+
+    Args:
+        folder: where recordings and runs lie.
+        size: how much is simulated and trained.
+        seed: of the recordings and trainings.
+    """
+
+    def __init__(self, folder: Path, size: ModelSize, seed: int) -> None:
+        self.folder, self.size, self.seed = folder, size, seed
+
+    def recordings(self) -> DataSource:
+        """Of M22, in free air and in soil."""
+        order = SimulationOrder(
+            minutes=self.size.minutes,
+            recordings=self.size.recordings,
+            seed=self.seed + 11,
+            mix=MIX,
+            materials=SOILS,
+        )
+        return self._simulated("recordings", order)
+
+    def twin(self) -> Path:
+        """The twin of M22."""
+        return self._twin(self.recordings(), "good_twin", self.size.twin)
+
+    def beside(self, name: str) -> Path:
+        """A model that stands beside it: ``static``, ``arx`` or ``one_step``."""
+        settings = self.size.one_step if name == "one_step" else (f"twin.kind={name}",)
+        return self._twin(self.recordings(), name, settings)
+
+    def predictor(self) -> Path:
+        """A look-ahead predictor of M22."""
+        changes = (f"task.horizons=[{LEAD_TICKS}]", "training.threads=1", *self.size.predictor)
+        train(self.recordings(), load_experiment(None, "quick", changes), self.folder / "good_predictor")
+        return self.folder / "good_predictor"
+
+    def other_twin(self, minutes: int) -> Path:
+        """The twin of M22 gone on with minutes of C14."""
+        order = SimulationOrder(
+            machine="C14",
+            minutes=float(minutes),
+            recordings=max(5, minutes // 2),
+            seed=self.seed + 21,
+            mix=MIX,
+            materials=SOILS,
+        )
+        source = self._simulated(f"c14_{minutes}", order)
+        return self._twin(source, f"c14_{minutes}_twin", tuple(_training(self.size.twin)), self.twin())
+
+    def _simulated(self, name: str, order: SimulationOrder) -> DataSource:
+        simulate_data_set(self.folder / name, order, workers=1)
+        return DataSource.of(self.folder / name)
+
+    def _twin(self, source: DataSource, name: str, settings: Sequence[str], start: Path | None = None) -> Path:
+        experiment = load_twin_experiment(None, (*settings, *JUDGED))
+        train_twin(source, experiment, self.folder / name, workers=1, start=start)
+        return self.folder / name
+
+
+def _training(settings: Sequence[str]) -> list[str]:
+    """Settings without those of the formulation."""
+    return [change for change in settings if not change.startswith("twin.")]
+
+
+def ahead_errors(models: Models, run: Path) -> dict[str, Any]:
+    """Errors of the velocities, mm/s, ahead of measured ports on held-out recordings, told the commands."""
+    experiment = load_twin_experiment(run / "config.toml")
+    _, data = prepare_twin(models.recordings(), experiment)
+    twin = load_twin(run).twin
+    parts = {
+        "all": data.test,
+        "free air": [series for series in data.test if not series.name.endswith(GROUND)],
+        "free air, no jumps of the levers": [
+            series for series in data.test if series.name.split("_", 2)[2] in ("isolated", "combined", "grading")
+        ],
+    }
+    rows: dict[str, Any] = {}
+    for part, series in parts.items():
+        if series:
+            rows[part] = {str(ticks): _velocity_error(look_ahead(twin, series, ticks)) for ticks in AHEAD}
+    table(
+        ["velocities ahead, mm/s", *(f"{n} ticks" for n in AHEAD)],
+        [[name, *row.values()] for name, row in rows.items()],
+    )
+    return rows
+
+
+def _velocity_error(ahead: Any) -> float:
+    """Mean absolute error over actuators and moments, mm/s."""
+    count = len(ahead.channels.velocities)
+    return 1e3 * float(np.abs(ahead.answers[:, :count] - ahead.truth[:, :count]).mean())

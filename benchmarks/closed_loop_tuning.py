@@ -1,0 +1,120 @@
+"""Part o4 of the closed-loop benchmark: are gains that are better on a model better on the plant?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from closed_loop_models import Models
+from common import Verdict, table, verdict
+from edp.config.control import ControlExperiment
+from edp.control.controllers import CONTROLLERS, ControllerSpec
+from edp.control.models import ControlModels
+from edp.control.tasks import TASKS
+from edp.workflows.control import ControlBench, ControlSources
+from edp.workflows.control.transfer_of_tuning import TransferSpec, TuningTransfer, costs_of, drawn_settings
+
+SEED, OTHER_SEED = 500_000, 600_000
+"""First seeds of the lines, which neither judge a controller nor tune one; the others ask how far lines differ."""
+MACHINE, OTHER, SOIL = "M22", "C14", "sandy_loam"
+
+
+@dataclass(frozen=True)
+class TuningSize:
+    """How many settings, and lines for each of them."""
+
+    settings: int
+    lines: int
+
+
+FULL, QUICK = TuningSize(80, 3), TuningSize(3, 1)
+
+
+def tuning(models: Models, size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
+    """M22 in free air: all models know the valve map that was measured on the plant."""
+    experiment = ControlExperiment(
+        task=TASKS["grade"](), controller=CONTROLLERS["pi"](), machine=MACHINE, loops=size.lines, seed=SEED
+    )
+    plant = ControlBench(experiment, ControlSources())
+    settings = drawn_settings(experiment.controller, TransferSpec(size.settings, seed))
+    on_plant = costs_of(plant, settings)
+    other = costs_of(ControlBench(replace(experiment, seed=OTHER_SEED), ControlSources(), plant.models), settings)
+    rows: dict[str, dict[str, Any]] = {}
+    runs = {"twin": models.twin(), **{name: models.beside(name) for name in ("one_step", "static", "arx")}}
+    for name, run in runs.items():
+        rows[name] = _row(costs_on(run, experiment, plant.models, settings), on_plant)
+    rows["the plant, along other lines"] = _row(other, on_plant)
+    show("gains of pi, M22 in free air", rows)
+    return rows
+
+
+def tuning_other(models: Models, size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
+    """C14 in soil, on twins of M22 that went on with minutes of its logs; they know no soil but that of their logs."""
+    experiment = ControlExperiment(
+        task=TASKS["grade"](material=SOIL), controller=CONTROLLERS["pi"](), machine=OTHER, loops=size.lines, seed=SEED
+    )
+    plant = ControlBench(experiment, ControlSources())
+    settings = drawn_settings(experiment.controller, TransferSpec(size.settings, seed))
+    on_plant = costs_of(plant, settings)
+    air = without_soil(ControlBench(experiment, ControlSources(), plant.models))
+    rows = {"the plant, in free air": _row(costs_of(air, settings), on_plant)}
+    for minutes in sorted(models.size.other):
+        run = models.other_twin(minutes)
+        bench = without_soil(ControlBench(experiment, ControlSources(plant=run), plant.models))
+        rows[f"twin after {minutes} min"] = _row(costs_of(bench, settings), on_plant)
+    show("gains of pi, C14 in loam", rows)
+    return rows
+
+
+def without_soil(bench: ControlBench) -> ControlBench:
+    """A bench with the same lines at the surface of the ground, and no ground: a twin has none to be told of."""
+    bench.tasks = [replace(task, material="") for task in bench.tasks]
+    return bench
+
+
+def costs_on(run: Path, experiment: ControlExperiment, known: ControlModels, settings: list[ControllerSpec]) -> Any:
+    """Costs on a twin as the plant."""
+    return costs_of(ControlBench(experiment, ControlSources(plant=run), known), settings)
+
+
+def _row(on_model: Any, on_plant: Any) -> dict[str, Any]:
+    transfer = TuningTransfer(on_model, on_plant)
+    calm = on_plant <= np.median(on_plant)
+    better = on_model[calm], on_plant[calm]
+    return {
+        "rank_correlation": transfer.rank_correlation,
+        "better_half": float(spearmanr(*better).statistic) if np.ptp(better[0]) and np.ptp(better[1]) else 0.0,
+        "regret": transfer.regret,
+        "on_model_mm": on_model.tolist(),
+        "on_plant_mm": on_plant.tolist(),
+    }
+
+
+def show(title: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
+    heads = [title, "rank correlation", "in the better half", "cost of its best over the best", "least cost, mm"]
+    shown = [
+        [name, row["rank_correlation"], row["better_half"], row["regret"], min(row["on_model_mm"])]
+        for name, row in rows.items()
+    ]
+    table(heads, shown)
+    on_plant = next(iter(rows.values()))["on_plant_mm"]
+    print(
+        f"cost on the plant: least {min(on_plant):.1f}, median {np.median(on_plant):.1f}, most {max(on_plant):.1f} mm"
+    )
+
+
+def tuning_verdicts(rows: Mapping[str, Mapping[str, Any]], quick: bool) -> list[Verdict]:
+    ours = rows["twin"]
+    best = max(row["rank_correlation"] for name, row in rows.items() if name in ("static", "arx", "one_step"))
+    name = "o4: cost on the plant of the gains that the twin calls best, over the least cost"
+    return [
+        verdict("o4: rank correlation of costs on the twin", ours["rank_correlation"], 1.0, ">= 0.9", "1", quick),
+        verdict(name, ours["regret"], 1.0, "<= 1.15", "1", quick),
+        verdict("o4: rank correlation against the best of static, arx, one step", ours["rank_correlation"], best,
+                ">= 1", "1", quick),
+    ]  # fmt: skip

@@ -1,0 +1,96 @@
+"""A recurrent twin taken apart into its members, and set up anew for the recordings of another machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from edp.data.series import Series
+from edp.networks.twin.recurrent import RecurrentTwin
+from edp.networks.twin.recurrent_cell import TwinNetwork
+from edp.networks.twin.scales import TwinScales
+from edp.networks.twin.static_map import StaticTwin
+
+AT_STOP = 0.002
+"""Share of a stroke within which visits to its end are visits to the same place: a few millimetres, as sensors show."""
+APART_S = 1.0
+"""Time away from an end after which the next visit is another one."""
+VISITS = 2
+"""Visits to the same outermost place that make it an end stop: turns on the way hardly come to the same place."""
+
+
+def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> TwinScales:
+    """Scales of a twin that goes on with other recordings: its numbers keep their meaning, its bounds follow these.
+
+    A stroke ends where these recordings come to the same outermost place at least twice; an end that they do not show
+    so is the farther one of theirs and the twin's. Velocities and pressures have the wider bounds of both.
+
+    Args:
+        twin: trained before.
+        own: fitted to these recordings.
+        train: stretches of these recordings.
+    """
+    before, count = twin.scales, len(twin.channels.velocities)
+    low, high = np.minimum(before.low, own.low), np.maximum(before.high, own.high)
+    for which in range(count, count + len(twin.channels.strokes)):
+        values = [series.targets[:, which] for series in train]
+        near = AT_STOP * float(high[which] - low[which])
+        apart = round(APART_S * twin.channels.rate_hz)
+        if sum(_visits(stretch <= own.low[which] + near, apart) for stretch in values) >= VISITS:
+            low[which] = own.low[which]
+        if sum(_visits(stretch >= own.high[which] - near, apart) for stretch in values) >= VISITS:
+            high[which] = own.high[which]
+    return replace(before, low=low, high=high)
+
+
+def _visits(there: np.ndarray, apart: int) -> int:
+    """Visits to a place, of a stretch that says tick by tick whether it is there."""
+    ticks = np.flatnonzero(there)
+    return int(len(ticks) > 0) + int((np.diff(ticks) > apart).sum())
+
+
+def with_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
+    """The same twin within other bounds, with weights of its own."""
+    network = _copied(twin.network)
+    static = twin.static and StaticTwin(twin.channels, scales, twin.prefix_ticks, twin.static.numbers)
+    return RecurrentTwin(twin.channels, scales, twin.prefix_ticks, network, static, twin.members)
+
+
+def separated(twin: RecurrentTwin) -> list[RecurrentTwin]:
+    """The members of an average, which is their average again; the twin itself where they are one network.
+
+    What the average keeps of all members alone (constants of the answers, pulls, the map) each of them has.
+    """
+    if len(twin.member_rows()) < twin.members or twin.members == 1:
+        return [with_scales(twin, twin.scales)]
+    return [_member(twin, rows) for rows in twin.member_rows()]
+
+
+def _member(twin: RecurrentTwin, rows: slice) -> RecurrentTwin:
+    whole, units = twin.network, rows.stop - rows.start
+    pulled = 0 if whole.pull is None else len(whole.pull)
+    network = TwinNetwork(len(twin.channels.commands), len(twin.channels.answers), units, pulled)
+    gates = torch.cat([torch.arange(rows.start, rows.stop) + gate * whole.units for gate in range(3)])
+    with torch.no_grad():
+        network.command_weight.copy_(whole.command_weight[gates])
+        network.bias.copy_(whole.bias[gates])
+        network.feedback_weight.copy_(whole.feedback_weight[:, gates])
+        network.h_weight.copy_(whole.h_weight[rows][:, gates])
+        network.inner_bias.copy_(whole.inner_bias[rows])
+        network.out_weight.copy_(whole.out_weight[rows] * twin.members)
+        network.out_bias.copy_(whole.out_bias)
+        if network.pull is not None and whole.pull is not None:
+            network.pull.copy_(whole.pull)
+    static = twin.static and StaticTwin(twin.channels, twin.scales, twin.prefix_ticks, twin.static.numbers)
+    return RecurrentTwin(twin.channels, twin.scales, twin.prefix_ticks, network, static)
+
+
+def _copied(network: TwinNetwork) -> TwinNetwork:
+    """A network with the same weights in memory of its own."""
+    pulled = 0 if network.pull is None else len(network.pull)
+    answers = network.out_bias.shape[0]
+    copy = TwinNetwork(network.command_weight.shape[1], answers, network.units, pulled)
+    copy.load_state_dict(network.state_dict())
+    return copy

@@ -1,0 +1,213 @@
+"""A trained twin goes on with other recordings, such as minutes of another machine's logs (fine-tuning)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edp.config.twin import TwinExperiment
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels, TwinChannelSettings
+from edp.errors import ConfigError, DataError
+from edp.evaluation.free_run import free_run_scores, free_runs
+from edp.evaluation.guard import free_run_error
+from edp.networks.twin import TWINS, Twin
+from edp.networks.twin.kinds import AutoTwin
+from edp.networks.twin.recurrent import RecurrentTwin, averaged, member_seed
+from edp.networks.twin.recurrent_members import scales_for, separated, with_scales
+from edp.networks.twin.static_map import StaticMap, StaticTwin
+from edp.storage.runs import PARTS, KeyedRun
+from edp.training.free_run import FittedTwin
+from edp.training.free_run_members import MemberTraining
+from edp.training.twin_bundle import TwinBundle, load_twin, twin_hash
+from edp.workflows.twin.choose_twin import AT, LENGTHENED, TwinCandidate, shortened
+from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
+
+SHARES = (0.05, 0.15, 0.45)
+"""Shares of the updates of `[training]` that are tried in turn: minutes of logs hold less than the hours before."""
+UNLIKE = 30.0
+"""Times by which the largest value of a part may differ between machines: 10 and 50 t differ by less, units by more."""
+
+
+@dataclass(frozen=True, eq=False)
+class TwinStart:
+    """A trained twin to begin with.
+
+    Attributes:
+        folder: of its run.
+        bundle: the twin.
+        digest: hash of its header, which holds those of its numbers.
+    """
+
+    folder: Path
+    bundle: TwinBundle
+    digest: str
+
+    @staticmethod
+    def of(folder: str | Path) -> TwinStart:
+        """The twin of a run folder.
+
+        Raises:
+            EdpError: not a twin, or one that no training can go on with.
+        """
+        bundle = load_twin(folder)
+        if not isinstance(bundle.twin, RecurrentTwin):
+            kind = TWINS.name_of(bundle.spec)
+            raise ConfigError(
+                f"--from {folder}: the twin is of kind '{kind}', which has no training that could go on; begin with a "
+                "recurrent one, or fit this kind to the recordings anew, without --from"
+            )
+        return TwinStart(Path(folder), bundle, twin_hash(folder))
+
+    @property
+    def twin(self) -> RecurrentTwin:
+        """The twin."""
+        assert isinstance(self.bundle.twin, RecurrentTwin)  # noqa: S101  for the type checker: `of` refuses others
+        return self.bundle.twin
+
+    def settled(self, experiment: TwinExperiment) -> TwinExperiment:
+        """Settings with the formulation and the channels of this twin.
+
+        Raises:
+            ConfigError: they name others.
+        """
+        channels = self.twin.channels
+        parts = ("commands", "velocities", "strokes", "pressures")
+        names = TwinChannelSettings(**{part: tuple(c.name for c in getattr(channels, part)) for part in parts})
+        if experiment.twin not in (AutoTwin(), self.bundle.spec):
+            raise ConfigError(
+                f"[twin] with --from {self.folder}: the formulation is that of the twin there; leave out its settings"
+            )
+        if experiment.channels not in (TwinChannelSettings(), names):
+            raise ConfigError(
+                f"[channels] with --from {self.folder}: the channels are those of the twin there; leave them out, or "
+                "rename those of the recordings by a signal map"
+            )
+        return replace(experiment, twin=self.bundle.spec, channels=names)
+
+    def check(self, channels: TwinChannels, train: Sequence[Series]) -> None:
+        """Refuse recordings that mean something else by the numbers of this twin.
+
+        Raises:
+            DataError: another rate or kind of a channel, or values of another order of magnitude.
+        """
+        before = self.twin.channels
+        if channels.rate_hz != before.rate_hz:
+            raise DataError(
+                f"the recordings have {channels.rate_hz:g} Hz, the twin of --from {self.folder} {before.rate_hz:g} Hz; "
+                "its memory counts ticks: record at that rate, or train a twin anew"
+            )
+        for ours, theirs in zip((*channels.commands, *channels.answers), (*before.commands, *before.answers)):
+            if ours.kind is not theirs.kind:
+                raise DataError(
+                    f"'{ours.name}' is of kind {ours.kind} in the recordings, {theirs.kind} in the twin of --from "
+                    f"{self.folder}; correct the signal map"
+                )
+        self._check_sizes(channels, train)
+
+    def _check_sizes(self, channels: TwinChannels, train: Sequence[Series]) -> None:
+        """Refuse values of another order of magnitude."""
+        scales = self.twin.scales
+        commands = np.max([np.abs(series.inputs).max(axis=0) for series in train], axis=0)
+        answers = np.max([np.abs(series.targets).max(axis=0) for series in train], axis=0)
+        largest = np.maximum(np.abs(scales.low), np.abs(scales.high))
+        usual = np.abs(scales.command_offset) + 2.0 * scales.command_width
+        parts = {"commands": (commands, usual)}
+        parts |= {part: (answers[columns], largest[columns]) for part, columns in channels.parts.items()}
+        for part, (now, before) in parts.items():
+            # The largest of a part: a lever that nobody touched is no other unit.
+            ratio = float(now.max() / before.max()) if len(now) and before.max() > 0.0 else 1.0
+            if not 1.0 / UNLIKE < ratio < UNLIKE:
+                name = getattr(channels, part)[int(np.argmax(now))].name
+                raise DataError(
+                    f"{part} of the recordings (largest: '{name}') are {ratio:.3g} times those that the twin of --from "
+                    f"{self.folder} knows; {1.0 / UNLIKE:.2g} to {UNLIKE:g} must hold: check units and scales in the "
+                    "signal map"
+                )
+
+    def provenance(self) -> dict[str, Any]:
+        """What the provenance of the new twin says of this one."""
+        data = dict(self.bundle.provenance.get("data") or {})
+        return {"from": {"run": str(self.folder), "hash": self.digest, "data": data.get("digest")}}
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuedTwin:
+    """A twin that goes on, by as many updates as free runs of the validation part say; or as it is.
+
+    Attributes:
+        fit: what every fit of the run needs.
+        start: the twin to begin with.
+        run: folder and key; trainings that were stopped go on.
+    """
+
+    fit: TwinFit
+    start: TwinStart
+    run: KeyedRun
+
+    def best(self) -> tuple[FittedFormulation, list[TwinCandidate]]:
+        """The best of the twin as it is and of trainings of several lengths, and all of them."""
+        start = self.start.twin
+        scales = scales_for(start, self.fit.scales, self.fit.data.train)
+        # End stops are the machine's: the twin as it is has those of these recordings, too.
+        as_it_is = with_scales(start, scales)
+        fits = [FittedTwin(as_it_is, [], 0.0)]
+        tried = [TwinCandidate("the twin as it is", 0.0, error=self._error(as_it_is))]
+        for share in SHARES:
+            fit = self._trained(as_it_is, share)
+            label = f"{round(share * sum(self.fit.experiment.training.updates)):,} further updates"
+            fits.append(fit)
+            tried.append(TwinCandidate(label, fit.seconds, error=self._error(fit.twin)))
+            before, now = tried[-2].error, tried[-1].error
+            if before is None or now is None or now > (1.0 - LENGTHENED) * before:
+                break
+        best = min(range(len(tried)), key=lambda i: tried[i].error or math.inf)
+        tried[best] = replace(tried[best], chosen=True)
+        fitted = replace(fits[best], seconds=sum(one.seconds for one in tried))
+        return FittedFormulation(self.start.bundle.spec, fitted, facts=self.start.provenance()), tried
+
+    def _trained(self, start: RecurrentTwin, share: float) -> FittedTwin:
+        """The members, each trained on from where it was, averaged again."""
+        training = shortened(self.fit.experiment.training, share)
+        train, validation = self.fit.data.train, self.fit.data.validation
+        label = f"{sum(training.updates):,} further updates"
+        self.fit.tell(label)
+        jobs = []
+        for which, member in enumerate(separated(start)):
+            own = member.static and member.static.refitted(train)
+            twin = RecurrentTwin(member.channels, member.scales, member.prefix_ticks, member.network, own)
+            seeded = replace(training, seed=member_seed(training.seed, which))
+            folder = self.run.folder.path / PARTS / f"further_{sum(training.updates)}_{which}"
+            jobs.append(MemberTraining(label, twin, train, validation, seeded, (folder, self.run.key), True))
+        fits = list(self.fit.train_members(jobs, self.fit.on_event))
+        twins = [fit.twin for fit in fits if isinstance(fit.twin, RecurrentTwin)]
+        # One network of members that read one another stays the average that it was said to be.
+        joined = averaged(twins) if len(twins) > 1 else _with_members(twins[0], start.members)
+        several = len(fits) > 1
+        history = [row | ({"member": n} if several else {}) for n, fit in enumerate(fits) for row in fit.history]
+        return FittedTwin(joined, history, sum(fit.seconds for fit in fits))
+
+    def _error(self, twin: Twin) -> float:
+        """Error of free runs of the validation part over the static map's there."""
+        training, validation = self.fit.experiment.training, self.fit.data.validation
+        seconds = training.validation_s
+        judge = replace(self.fit.experiment.judge, seconds=seconds, at_s=tuple(sorted({a * seconds for a in AT})))
+        ours, theirs = (
+            free_run_scores(free_runs(one, validation, seconds, training.lanes), judge)
+            for one in (twin, self._static_map(twin))
+        )
+        return free_run_error(ours, theirs)
+
+    def _static_map(self, twin: Twin) -> StaticTwin:
+        spec = StaticMap(prefix_ticks=twin.prefix_ticks)
+        return spec.start(twin.channels, twin.scales, self.fit.data.train, 0)
+
+
+def _with_members(twin: RecurrentTwin, members: int) -> RecurrentTwin:
+    parts = (twin.channels, twin.scales, twin.prefix_ticks, twin.network, twin.static)
+    return twin if twin.members == members else RecurrentTwin(*parts, members)
