@@ -43,6 +43,11 @@ class SpeedToLever:
             self._tables.append(sides)
         self.fastest, self.slowest = ends
 
+    @property
+    def tables(self) -> list[list[tuple[Array, Array]]]:
+        """Speeds (m/s) and levers of each polygon: by axis, then extending and retracting."""
+        return self._tables
+
     def levers(self, speeds: Array) -> Array:
         """Levers for speeds (m/s), shape (..., 3) both."""
         levers = np.empty_like(speeds)
