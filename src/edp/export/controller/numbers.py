@@ -15,6 +15,8 @@ from edp.export.escape import Code
 from edp.export.hashes import little_endian
 
 SIDES = ("out", "back")
+ROUNDED = 2.0**-23
+"""Last place of a lever in single precision."""
 
 
 @dataclass
@@ -71,7 +73,9 @@ def constants_of_controller(parts: ControllerParts) -> ConstantTables:
     tables.floats("front_angles", parts.angles)
     full, lengths = (_braced(values) for values in (parts.full_m, parts.lengths_m))
     tables.text(f"static const edp_front front = {{{len(parts.angles)}u, front_angles, {full}, {lengths}}};")
-    limits = ", ".join(_braced(values) for values in (parts.lever_low, parts.lever_high, parts.slew))
+    # A rounding below: levers are sums in single precision, and a limit is one.
+    slew = np.maximum(np.asarray(parts.slew) - ROUNDED, 0.5 * np.asarray(parts.slew))
+    limits = ", ".join(_braced(values) for values in (parts.lever_low, parts.lever_high, slew))
     tables.text(f"static const edp_lever_limits limits = {{{limits}}};")
     if parts.plan is None or parts.plan.fallback:
         _set_sides(tables, "loop", parts.sides)
