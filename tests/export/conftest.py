@@ -208,3 +208,22 @@ def matlab_folder_of(bundle_of, tmp_path_factory) -> Callable[..., Path]:
         return made[structure, whole]
 
     return make
+
+
+@pytest.fixture(scope="session")
+def exported_plan(c, tmp_path_factory):
+    """A predictive controller that was run, exported and compiled: see `exported_run`."""
+    pytest.importorskip("daqp", reason="the solver is an optional package")
+    c.need("gcc")
+    from exported_controllers import exported_run
+
+    return exported_run(c, tmp_path_factory.mktemp("plan"), "nmpc")
+
+
+@pytest.fixture(scope="session")
+def exported_loop(c, tmp_path_factory):
+    """A PI loop, in the same way."""
+    c.need("gcc")
+    from exported_controllers import exported_run
+
+    return exported_run(c, tmp_path_factory.mktemp("loop"), "pi")

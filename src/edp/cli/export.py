@@ -11,6 +11,9 @@ from edp.cli.console import JsonFlag, emit, out
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.errors import ConfigError
 
+CONTROLLER, CONTROLLER_NAME = "controller", "machine"
+"""The form of a run of edp control, and the name of what it holds unless one is given."""
+
 
 def _list_forms(listing_asked: bool) -> None:
     """Every registered target, with the first line of what is said about it."""
@@ -19,14 +22,19 @@ def _list_forms(listing_asked: bool) -> None:
 
         for name, target in TARGETS.items():
             out.print(f"{name}: {(target.__doc__ or '').strip().splitlines()[0]}", soft_wrap=True)
+        out.print(
+            f"{CONTROLLER}: C99, float32: the controller of a run of edp control, with model and solver", soft_wrap=True
+        )
         raise typer.Exit
 
 
 def export(
-    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train or edp twin.")],
+    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp twin or edp control.")],
     to: Annotated[str, typer.Option(help="Form, such as c (C99 for controllers); --forms lists all.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an existing export is replaced.")],
-    name: Annotated[str, typer.Option(help="Name of the network in the exported files.")] = "predictor",
+    name: Annotated[
+        str, typer.Option(help="Name in the exported files; default: predictor, of a controller machine.")
+    ] = "",
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
     ] = None,
@@ -47,13 +55,22 @@ def export(
     """
     from edp.workflows.deployment import export_bundle, unheld_adaptation
 
-    source = None if w8a16 is None else source_of(w8a16, signal_map, repair)
-    files = export_bundle(bundle, to, folder, name, dict(map(_option, changes or [])), source)
+    name = name or (CONTROLLER_NAME if to == CONTROLLER else "predictor")
+    options = dict(map(_option, changes or []))
+    if to == CONTROLLER:
+        if w8a16 is not None:
+            raise ConfigError("--w8a16: a controller computes in single precision; leave it out")
+        from edp.workflows.control import export_controller
+
+        files = export_controller(bundle, folder, name, options)
+    else:
+        source = None if w8a16 is None else source_of(w8a16, signal_map, repair)
+        files = export_bundle(bundle, to, folder, name, options, source)
 
     def show() -> None:
         for file in files:
             out.print(str(file))
-        if unheld_adaptation(bundle, to):
+        if to != CONTROLLER and unheld_adaptation(bundle, to):
             out.print(f"note: the form '{to}' holds the network alone; its adaptation is held by c")
         out.print(f"written: {files[0].parent.resolve()}; read {files[0].name} first")
         if (files[0].parent / "CMakeLists.txt").is_file():

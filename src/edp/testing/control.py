@@ -5,16 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from edp.control.plant import STROKES
-from edp.data.twin_channels import twin_channels
-from edp.networks.twin import TWINS, Twin, fit_scales
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels, twin_channels
+from edp.networks.twin import TWINS, Twin, TwinScales, fit_scales
+from edp.networks.twin.recurrent import Recurrent
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.scenario import Scenario
 from edp.sim.simulate import simulate
+from edp.training.twin_bundle import TwinBundle
 
 WAYS = ("combined", "isolated", "end_stops")
 SECONDS = 40.0
+PULL, CALM = 0.3, 0.2
+"""Of a recurrent twin that nobody trained: share of the way to its map in a tick, and what its memory adds."""
 
 
 def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:
@@ -24,6 +30,25 @@ def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:
         machine: name or file of the machine.
         kind: of `edp.networks.twin.TWINS`, one that needs no training.
     """
+    channels, scales, series = _sample(machine)
+    twin: Twin = TWINS[kind]().start(channels, scales, series, 0)
+    return twin
+
+
+def sample_recurrent_twin(units: int, machine: str = "M22") -> TwinBundle:
+    """A recurrent twin that is pulled to a static map of two minutes; its memory is as drawn, and adds little."""
+    channels, scales, series = _sample(machine)
+    spec = Recurrent(units=units, valve_map=True)
+    twin = spec.start(channels, scales, series, 0)
+    with torch.no_grad():
+        twin.network.out_weight.mul_(CALM)
+        if twin.network.pull is not None:
+            twin.network.pull.fill_(PULL)
+    return TwinBundle(spec, twin)
+
+
+def _sample(machine: str) -> tuple[TwinChannels, TwinScales, list[Series]]:
+    """Channels, scales and series of two minutes of a simulated machine."""
     recordings = [
         simulate(Scenario(machine=machine, excitation=way, duration_s=SECONDS, seed=seed))
         for seed, way in enumerate(WAYS)
@@ -36,5 +61,4 @@ def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:
     names = [channel.name for channel in channels.answers]
     for name, full in zip(STROKES, load_machine(machine).cylinders.stroke, strict=True):
         low[names.index(name)], high[names.index(name)] = 0.0, np.float32(full)
-    twin: Twin = TWINS[kind]().start(channels, replace(scales, low=low, high=high), series, 0)
-    return twin
+    return channels, replace(scales, low=low, high=high), series

@@ -170,6 +170,12 @@ class NmpcController(Controller):
             return spare
         return self._valves.levers(self._latest)
 
+    @property
+    def memory(self) -> Array:
+        """Speeds of the plan (m/s), block by block, those asked for last, sums of the PI loop, disturbance."""
+        sums = np.zeros(AXES) if self._fallback is None else self._fallback.memory
+        return np.concatenate((self._speeds.ravel(), self._latest, sums, self.model.disturbance))
+
     def missed(self, tick: int) -> None:
         """Where no row came, the ports of the twin run free."""
         super().missed(tick)

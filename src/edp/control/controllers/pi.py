@@ -80,6 +80,11 @@ class PiController(Controller):
         """Forget the integrals."""
         self._strokes, self._speeds, self._sum = reference.strokes, reference.speeds(), np.zeros(AXES)
 
+    @property
+    def memory(self) -> Array:
+        """Sums of the integrals, m/s, shape (3,)."""
+        return self._sum
+
     def levers(self, measured: Array, tick: int) -> Array:
         """Inverse map of the speed that the reference has ahead, corrected by the error now."""
         last = len(self._strokes) - 1

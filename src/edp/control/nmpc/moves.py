@@ -45,6 +45,11 @@ class SpeedToLever:
         self._packed = _packed(self._tables)
         self.fastest, self.slowest = ends
 
+    @property
+    def tables(self) -> list[list[tuple[Array, Array]]]:
+        """Speeds (m/s) and levers of each polygon: by axis, then extending and retracting."""
+        return self._tables
+
     def levers(self, speeds: Array) -> Array:
         """Levers for speeds (m/s), shape (..., 3) both."""
         levers = np.empty(speeds.shape)

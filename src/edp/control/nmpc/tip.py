@@ -35,6 +35,11 @@ class TipTable:
         self._angles: Array = np.array([kinematics.angles_at(np.full(AXES, share)) for share in shares])
         self._lengths = np.array(machine.bodies.length, float)
 
+    @property
+    def angles(self) -> Array:
+        """Joint angles (rad) at the nodes, each relative to the link before, shape (nodes, 3)."""
+        return self._angles
+
     def poses(self, strokes: Array) -> tuple[Array, Array]:
         """Poses and Jacobians.
 

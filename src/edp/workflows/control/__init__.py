@@ -1,7 +1,17 @@
 """Closed loops: a controller on a plant along tasks, with a page; gains tuned on one plant and judged on another."""
 
 from edp.workflows.control.bench import ControlBench, ControlSources
+from edp.workflows.control.export_controller import export_controller
 from edp.workflows.control.run_control import ControlRun, control_loops
 from edp.workflows.control.tune_gains import Tuning, TuningSpec, tune_gains
 
-__all__ = ["ControlBench", "ControlRun", "ControlSources", "Tuning", "TuningSpec", "control_loops", "tune_gains"]
+__all__ = [
+    "ControlBench",
+    "ControlRun",
+    "ControlSources",
+    "Tuning",
+    "TuningSpec",
+    "control_loops",
+    "export_controller",
+    "tune_gains",
+]

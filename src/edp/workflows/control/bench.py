@@ -49,6 +49,7 @@ class ControlBench:
     Attributes:
         tasks: of the seeds, in their order.
         models: what controllers know.
+        plant: what controllers see of the plant.
 
     Raises:
         EdpError: settings or models cannot be used.
@@ -70,14 +71,14 @@ class ControlBench:
         # A loop steps the plant after its last row, too.
         longest = (max(task.reference.ticks for task in self.tasks) + 1) / rate
         self._env = plant_of(experiment.machine, longest, rate, sources.plant)
-        self._interface = interface_of(self._env)
+        self.plant = interface_of(self._env)
         self.models = models or self._commissioned(probe, sources)
 
     def _commissioned(self, probe: Any, sources: ControlSources) -> ControlModels:
         """Models of the sources, and a valve map where one is needed: measured before the loops, on the plant."""
         valve_map: ValveMap | None = None
         if "valve_map" in self.experiment.controller.needs:
-            valve_map = measure_valve_map(probe, self._interface, self.experiment.seed)
+            valve_map = measure_valve_map(probe, self.plant, self.experiment.seed)
         twin = None if sources.twin is None else load_twin(sources.twin).twin
         predictor = None if sources.predictor is None else load_bundle(_bundle_of(sources.predictor))
         return ControlModels(valve_map, twin, predictor)
@@ -99,7 +100,7 @@ class ControlBench:
         for number, task in enumerate(self.tasks):
             if on_loop is not None:
                 on_loop(f"{task.name} {task.seed}", number, len(self.tasks))
-            controller = chosen.build(self._interface, task.limits, self.models)
+            controller = chosen.build(self.plant, task.limits, self.models)
             results.append(run_loop(self._env, controller, task, task.seed, self._options))
         return results
 

@@ -21,6 +21,7 @@ from edp.report.animation.page import scene_of
 from edp.storage import make_folder, write_json
 from edp.storage.runs import RunFolder, command_line, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources
+from edp.workflows.control.kept import keep_controller
 
 RESULTS, PAGE, LOOPS = "results.json", "control.html", "loops"
 
@@ -46,7 +47,7 @@ def control_loops(
     sources: ControlSources | None = None,
     on_loop: Callable[[str, int, int], None] | None = None,
 ) -> ControlRun:
-    """Run loops and write a run folder: ``results.json``, ``loops/NAME.parquet``, ``control.html``.
+    """Run loops and write a run folder: ``results.json``, ``loops/NAME.parquet``, ``control.html``, ``controller``.
 
     Args:
         experiment: the settings.
@@ -66,6 +67,7 @@ def control_loops(
         folder = make_folder(run.file(LOOPS))
         for result in results:
             write_recording(result.recording, folder / f"{result.recording.name}.parquet")
+        keep_controller(run.path, bench.plant, bench.models, chosen.twin, (bench.tasks[0], results[0]))
         content = _content(experiment, bench.tasks, results)
         write_json(run.file(RESULTS), content)
         page = write_control_page(_facts(run.path.name, content, results, chosen), run.file(PAGE))

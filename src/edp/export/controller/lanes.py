@@ -1,0 +1,172 @@
+"""A twin as C that runs several lanes side by side: each layer for all lanes, so that weights are read once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+
+from edp import __version__
+from edp.errors import ExportError
+from edp.export.c.calls import Calls, constant, describe, slot
+from edp.export.c.model import Model, crc, make_model, remembered
+from edp.export.c.text import call, filled, identifier, indented, number
+from edp.export.escape import Code, c_comment, fill
+from edp.export.hashes import model_hash, scale_hash
+from edp.ir import Layer, layers, memory
+from edp.ir.base import INPUT, Number
+from edp.ir.hydraulics import HydraulicTick
+from edp.networks.input_range import input_limits
+from edp.networks.twin import TwinPlant
+from edp.training.bundle import Bundle
+
+RUNTIME = ("edp_lanes.h", "edp_lanes.c")
+
+
+@dataclass(frozen=True, eq=False)
+class LaneModel:
+    """What the templates of a model with lanes are filled with.
+
+    Attributes:
+        name: C prefix.
+        model: layers and the plan of their values.
+        plant: the twin.
+    """
+
+    name: str
+    model: Model
+    plant: TwinPlant
+
+    @property
+    def work(self) -> int:
+        """Scratch numbers of a lane."""
+        return self.model.plan.sizes[Number.FLOAT]
+
+    @property
+    def memory_bytes(self) -> int:
+        """What a lane remembers, but for what compilers put between its parts."""
+        rings = sum(line.startswith("edp_ring ") for line in remembered(self.model.graph)[0])
+        slots = (max(1, part.size) for _, part in self.model.graph.slots() if part.name != "age")
+        return 4 * sum(slots) + 8 * rings
+
+    def files(self) -> dict[str, str]:
+        """Model and runtime by file name."""
+        texts = {f"{self.name}.{end}": self._filled(f"plant.{end}.in") for end in ("h", "c")}
+        texts[f"{self.name}_weights.h"] = self.model.weights()
+        for file in self.model.runtime:
+            texts[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
+        for file in RUNTIME:
+            texts[file] = resources.files("edp.export.controller").joinpath(f"runtime/{file}").read_text()
+        return texts
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """C files that a program with this model compiles."""
+        return (f"{self.name}.c", *(name for name in (*self.model.runtime, *RUNTIME) if name.endswith(".c")))
+
+    def _filled(self, template: str) -> Code:
+        text = resources.files("edp.export.controller").joinpath(f"templates/{template}").read_text()
+        graph, twin = self.model.graph, self.plant.twin
+        fields, cleared = remembered(graph)
+        low, high = input_limits(self.plant)
+        at = self.model.plan.values[graph.results["prediction"]]
+        values = {
+            "name": self.name,
+            "NAME": self.name.upper(),
+            "title": c_comment(self.plant.title),
+            "version": __version__,
+            "model_hash": model_hash(graph),
+            "scale_hash": scale_hash(self.plant),
+            "crc": crc(graph),
+            "commands": self.plant.sizes[0],
+            "answers": self.plant.sizes[1],
+            "inputs": graph.inputs,
+            "work": self.work,
+            "prefix": max(1, twin.prefix_ticks),
+            # C has no struct without members: a map of the commands alone remembers nothing.
+            "fields": indented(fields or ["float none[1];"]),
+            "forget": indented(cleared or ["s->none[0] = 0.0f;"]),
+            "low": filled(map(number, low)),
+            "high": filled(map(number, high)),
+            "mean": filled(map(number, np.asarray(twin.scales.answer_offset))),
+            "compute": indented(self._computed()),
+            "result": Code(f" + {at}" if at else ""),
+        }
+        return fill(text, values)
+
+    def _computed(self) -> Iterator[str]:
+        """Statements of a tick; neighbouring layers without products share one loop over the lanes."""
+        calls, together = Calls(self.model.graph, self.model.plan), list[str]()
+        for layer in self.model.graph.layers:
+            whole = self._whole(calls, layer)
+            if whole is None:
+                together += [describe(layer), *calls.of(layer)]
+                continue
+            yield from _loop(self.name, together)
+            yield from (describe(layer), whole)
+            together = []
+        yield from _loop(self.name, together)
+
+    def _whole(self, calls: Calls, layer: Layer) -> str | None:
+        """The call that computes a layer for all lanes; None where there is none."""
+        if any(source == INPUT for source in layer.inputs):
+            return None
+        if isinstance(layer, layers.Dense) and layer.rows == 1:
+            source, stride = _first(calls.value(layer.inputs[0])), self.work
+            weights = (constant(layer, "weight"), constant(layer, "bias"))
+            rest = (*layer.weight.shape, _first(calls.value(layer.name)), stride, "count")
+            return call("edp_dense_lanes", source, stride, *weights, *rest)
+        if isinstance(layer, memory.Gru):
+            h = f"lanes[0].{slot(layer, 'h').removeprefix('s->')}"
+            sizes = (layer.weight_x.shape[1], layer.width, h, "STRIDE")
+            places = (_first(calls.scratch(layer)), _first(calls.value(layer.name)), self.work, "count")
+            source = _first(calls.value(layer.inputs[0]))
+            return call("edp_gru_lanes", source, f"&{identifier(layer.name)}_weights", *sizes, *places)
+        return None
+
+
+def _first(place: str) -> str:
+    """A place in the work memory of the first lane."""
+    return place.replace("work", "works[0]", 1)
+
+
+def _loop(name: str, statements: list[str]) -> Iterator[str]:
+    """Statements of a lane within a loop over all of them."""
+    if not statements:
+        return
+    text = " ".join(statements)
+    yield "for (uint32_t k = 0; k < count; k++) {"
+    # Compilers warn of names that are not used.
+    if "s->" in text:
+        yield f"    {name}_memory *const s = &lanes[k];"
+    if "(in," in text or "(in " in text:
+        yield "    const float *const in = rows[k];"
+    yield "    float *const work = works[k];"
+    yield from (f"    {line}" for line in statements)
+    yield "}"
+
+
+def lane_model(name: str, bundle: Bundle) -> LaneModel:
+    """A twin ready to be written with lanes.
+
+    Args:
+        name: C prefix of the model.
+        bundle: of a `TwinPlant`.
+
+    Raises:
+        ExportError: no twin, one in integer arithmetic, or one whose equations are solved by iterations: a tick of a
+            controller must take as long whatever comes in.
+    """
+    plant = bundle.predictor
+    if not isinstance(plant, TwinPlant):
+        raise ExportError("the model of a controller is a twin; export a run of edp control whose twin is one")
+    model = make_model(name, bundle)
+    if model.integer or any(isinstance(layer, HydraulicTick) for layer in model.graph.layers):
+        what = "computes in integer arithmetic" if model.integer else "solves its equations by iterations"
+        raise ExportError(
+            f"the twin of the controller {what}, so that a tick of the plan has no bounded time in C; run edp control "
+            "with a recurrent twin"
+        )
+    return LaneModel(name, model, plant)

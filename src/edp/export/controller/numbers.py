@@ -1,0 +1,147 @@
+"""The constants of an exported controller as C, and their checksum."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edp.export.c.text import array, filled, number
+from edp.export.controller.parts import AXES, ControllerParts, PlanParts, Side
+from edp.export.escape import Code
+from edp.export.hashes import little_endian
+
+SIDES = ("out", "back")
+ROUNDED = 2.0**-23
+"""Last place of a lever in single precision."""
+
+
+@dataclass
+class ConstantTables:
+    """Definitions of constants, and what the checksum at start-up reads.
+
+    Attributes:
+        lines: of C.
+        entries: of the table of arrays.
+        crc: CRC-32 of all arrays so far.
+        bytes: of them.
+    """
+
+    lines: list[str] = field(default_factory=list)
+    entries: list[str] = field(default_factory=list)
+    crc: int = 0
+    bytes: int = 0
+
+    def floats(self, name: str, values: ArrayLike) -> None:
+        """A float array; two dimensions become an array of rows."""
+        numbers = np.asarray(values, dtype=np.float32)
+        if numbers.ndim == 2:
+            rows = ",\n".join(f"    {{{', '.join(map(number, row))}}}" for row in numbers)
+            self.lines.append(f"static const float {name}[{len(numbers)}][{numbers.shape[1]}] = {{\n{rows}\n}};")
+        else:
+            self.lines.append(array("float", name, map(number, numbers)))
+        self._check(name, numbers)
+
+    def small(self, name: str, values: Iterable[int]) -> None:
+        """An array of 16-bit counts or places."""
+        numbers = np.asarray(list(values), dtype=np.uint16)
+        self.lines.append(array("uint16_t", name, (f"{value}u" for value in numbers)))
+        self._check(name, numbers)
+
+    def text(self, line: str) -> None:
+        """A definition that the checksum leaves out, since it holds pointers or is a struct."""
+        self.lines.append(line)
+
+    def _check(self, name: str, values: np.ndarray) -> None:
+        self.entries.append(f"{{{name}, {values.size}u, {values.itemsize}u}}")
+        self.crc = zlib.crc32(little_endian(values), self.crc)
+        self.bytes += values.nbytes
+
+    def finished(self) -> Code:
+        """All of it as the text of a header."""
+        return Code("\n".join([*self.lines, array("edp_table", "tables", self.entries)]) + "\n")
+
+
+def constants_of_controller(parts: ControllerParts) -> ConstantTables:
+    """Everything that is not the model's."""
+    tables = ConstantTables()
+    tables.floats("input_low", parts.limits_low)
+    tables.floats("input_high", parts.limits_high)
+    tables.floats("front_angles", parts.angles)
+    full, lengths = (_braced(values) for values in (parts.full_m, parts.lengths_m))
+    tables.text(f"static const edp_front front = {{{len(parts.angles)}u, front_angles, {full}, {lengths}}};")
+    # A rounding below: levers are sums in single precision, and a limit is one.
+    slew = np.maximum(np.asarray(parts.slew) - ROUNDED, 0.5 * np.asarray(parts.slew))
+    limits = ", ".join(_braced(values) for values in (parts.lever_low, parts.lever_high, slew))
+    tables.text(f"static const edp_lever_limits limits = {{{limits}}};")
+    if parts.plan is None or parts.plan.fallback:
+        _set_sides(tables, "loop", parts.sides)
+        gains = ", ".join(map(number, (*parts.gains, parts.rate_hz)))
+        tables.text(f"static const edp_pi_gains gains = {{{gains}, {parts.lead}u}};")
+    if parts.plan is not None:
+        _set_plan(tables, parts, parts.plan)
+    return tables
+
+
+def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts) -> None:
+    _set_sides(tables, "plan", plan.sides)
+    tables.floats("slowest", plan.slowest)
+    tables.floats("fastest", plan.fastest)
+    tables.small("blocks", plan.blocks)
+    tables.small("ports", plan.ports)
+    tables.small("stroke_reads", parts.stroke_inputs)
+    tables.small("stroke_answers", plan.strokes)
+    if plan.pressures:
+        tables.small("pressure_answers", plan.pressures)
+    tables.text(f"static const edp_lever_shape lever_shape = {_braced(plan.lever_shape)};")
+    pilots = ",\n".join(
+        f"    {{{pilot.axis}u, {_truth(pilot.second)}, {_truth(pilot.extend)}, {number(pilot.share)}}}"
+        for pilot in plan.pilots
+    )
+    tables.text(f"static const edp_pilot pilots[{len(plan.pilots)}] = {{\n{pilots}\n}};")
+    names = ("along", "attitude", "change", "feedforward", "trust", "smoothing")
+    scalars = dict(zip(names, plan.weights, strict=True)) | {"STEP": plan.step_m_s, "margin": plan.margin}
+    scalars |= {"most_pressure": plan.pressure_pa} if plan.pressures else {}
+    for name, value in scalars.items():
+        tables.text(f"static const float {name} = {number(value)};")
+
+
+def _set_sides(tables: ConstantTables, name: str, sides: Iterable[tuple[Side, Side]]) -> None:
+    """Polygons of levers by speed, by axis, extending and retracting."""
+    rows = []
+    for axis, pair in enumerate(sides):
+        entries = []
+        for label, (speeds, levers) in zip(SIDES, pair, strict=True):
+            own = f"{name}_{label}_{axis}"
+            tables.floats(f"{own}_speeds", _rising(speeds))
+            tables.floats(f"{own}_levers", levers)
+            entries.append(f"{{{len(speeds)}u, {own}_speeds, {own}_levers}}")
+        rows.append(f"    {{{', '.join(entries)}}}")
+    body = ",\n".join(rows)
+    tables.text(f"static const edp_valve_side {name}_sides[{AXES}][2] = {{\n{body}\n}};")
+
+
+def _rising(speeds: ArrayLike) -> np.ndarray:
+    """Single-precision nodes that rise strictly: what double precision tells apart may be equal, and is divided by."""
+    nodes = np.asarray(speeds, dtype=np.float32).copy()
+    for i in range(1, len(nodes)):
+        nodes[i] = max(nodes[i], np.nextafter(nodes[i - 1], np.float32(np.inf)))
+    return nodes
+
+
+def _braced(values: Iterable[float]) -> Code:
+    return Code(f"{{{', '.join(map(number, values))}}}")
+
+
+def _truth(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def golden_rows(name: str, kind: str, rows: ArrayLike) -> Code:
+    """A two-dimensional array of a self-test."""
+    numbers = np.asarray(rows, dtype=np.float32)
+    body = ",\n".join("    {\n" + filled(map(number, row), "     ") + "}" for row in numbers)
+    return Code(f"static const {kind} {name}[{len(numbers)}][{numbers.shape[1]}] = {{\n{body}\n}};\n")

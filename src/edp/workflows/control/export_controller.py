@@ -1,0 +1,245 @@
+"""``edp export RUN --to controller``: a controller that was run, as C99 without heap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.config.control import ControlExperiment
+from edp.control.controllers import CONTROLLERS
+from edp.control.controllers.nmpc import STEP_M_S, NmpcController, PredictiveControl
+from edp.control.controllers.pi import MOST_SUM, PiController, ProportionalIntegral
+from edp.control.geometry import AXES
+from edp.control.limits import LoopLimits
+from edp.control.models import ControlModels
+from edp.control.nmpc.moves import SpeedToLever
+from edp.control.nmpc.tip import TipTable
+from edp.control.plant import PILOTS, STROKES, PlantInterface
+from edp.control.reference import TipReference
+from edp.control.valve_map import SIDES, ValveMap
+from edp.errors import ConfigError, ExportError
+from edp.export.controller import ControllerParts, GoldenLoop, PilotCommand, PlanParts, write_controller
+from edp.networks.input_range import input_limits
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import pack
+from edp.training.twin_bundle import TwinBundle, plant_bundle
+from edp.workflows.control.kept import KeptController, load_kept
+
+ITERATIONS = 100
+"""Of the solver, a tick: 5 to 20 were seen in loops."""
+MOST_ITERATIONS = 100_000
+FARTHEST_M = 100.0
+"""Beyond it a stroke counts as missing: no cylinder is as long."""
+Array = NDArray[np.float64]
+
+
+def export_controller(
+    run: str | Path, folder: str | Path, name: str, options: Mapping[str, str] | None = None
+) -> list[Path]:
+    """Write the controller of a run of edp control as C99.
+
+    Args:
+        run: its run folder.
+        folder: where to.
+        name: prefix of its C functions and files.
+        options: ``iterations``, the solver's most a tick.
+
+    Returns:
+        The files, the one to read first in front.
+
+    Raises:
+        EdpError: not such a run, a controller or twin without a form in C, a name or an option that cannot be.
+    """
+    iterations = _iterations(options or {})
+    kept = load_kept(run)
+    parts = parts_of(kept.experiment, kept.plant, kept.models, kept.twin, iterations)
+    return write_controller(replace(parts, golden=_golden(parts, kept)), name, Path(folder))
+
+
+def parts_of(
+    experiment: ControlExperiment,
+    plant: PlantInterface,
+    models: ControlModels,
+    twin: TwinBundle | None,
+    iterations: int = ITERATIONS,
+) -> ControllerParts:
+    """The numbers of a controller, without a self-test.
+
+    Args:
+        experiment: its settings.
+        plant: that it is for.
+        models: valve map, and the twin of a plan.
+        twin: the same twin with its spec.
+        iterations: most of the solver, a tick.
+
+    Raises:
+        ExportError: a controller without a form in C.
+        ConfigError: a model is missing.
+    """
+    spec, limits = experiment.controller, experiment.task.limits
+    if not isinstance(spec, ProportionalIntegral | PredictiveControl):
+        raise ExportError(
+            f"controller '{CONTROLLERS.name_of(spec)}' has no form in C; these have: pi, nmpc. Run edp control with "
+            "one of them"
+        )
+    valves = models.needed_map(CONTROLLERS.name_of(spec))
+    loop = spec if isinstance(spec, ProportionalIntegral) else ProportionalIntegral()
+    plan, reads = None, STROKES
+    low, high = np.full(AXES, -FARTHEST_M), np.full(AXES, FARTHEST_M)
+    if isinstance(spec, PredictiveControl):
+        if twin is None:
+            raise ConfigError("controller 'nmpc' needs a twin; the run has none")
+        # The controller's own checks of twin and plant, and the channels that it reads.
+        controller = spec.build(plant, limits, models)
+        reads = controller.reads
+        plan = _plan(spec, plant, limits, valves, twin, (reads, iterations))
+        ends = input_limits(plan.plant.predictor)
+        low, high = (values[[plan.plant.predictor.sizes[0] + port for port in plan.ports]] for values in ends)
+    channels = {channel.name: channel for channel in plant.channels}
+    table = TipTable(plant.geometry)
+    return ControllerParts(
+        title=f"controller '{CONTROLLERS.name_of(spec)}' of a run of edp control",
+        machine=plant.geometry.machine.name,
+        inputs=tuple(channels[name] for name in reads),
+        limits_low=low,
+        limits_high=high,
+        stroke_inputs=tuple(reads.index(name) for name in STROKES),
+        rate_hz=plant.rate_hz,
+        angles=table.angles,
+        full_m=plant.geometry.full_m,
+        lengths_m=np.array(plant.geometry.machine.bodies.length, float),
+        lever_low=np.array(limits.lever_low),
+        lever_high=np.array(limits.lever_high),
+        slew=np.array(limits.slew_per_s) / plant.rate_hz,
+        sides=[_sides(valves, axis) for axis in range(AXES)],
+        gains=(loop.proportional, loop.integral, loop.rest_m_s, MOST_SUM),
+        lead=round(loop.lead_s * plant.rate_hz),
+        plan=plan,
+        golden=None,
+    )
+
+
+def _plan(
+    spec: PredictiveControl,
+    plant: PlantInterface,
+    limits: LoopLimits,
+    valves: ValveMap,
+    twin: TwinBundle,
+    reads: tuple[tuple[str, ...], int],
+) -> PlanParts:
+    names, iterations = reads
+    channels = twin.twin.channels
+    answers = [channel.name for channel in channels.answers]
+    inverse = SpeedToLever(valves, limits)
+    plan = PlanParts(
+        plant=plant_bundle(twin),
+        blocks=spec.blocks,
+        pilots=_pilots(plant.geometry.machine, tuple(channel.name for channel in channels.commands)),
+        lever_shape=_lever_shape(plant.geometry.machine),
+        ports=tuple(answers.index(name) for name in names),
+        strokes=tuple(answers.index(name) for name in STROKES),
+        pressures=tuple(n for n, name in enumerate(answers) if name.startswith("CylPressures_")),
+        sides=[(sides[0], sides[1]) for sides in inverse.tables],
+        slowest=inverse.slowest,
+        fastest=inverse.fastest,
+        step_m_s=STEP_M_S,
+        window=max(1, round(spec.window_s * plant.rate_hz)),
+        weights=(spec.along, spec.attitude_m, spec.change, spec.feedforward, spec.trust_m_s, spec.smoothing),
+        margin=limits.stroke_margin,
+        pressure_pa=limits.pressure_pa,
+        fallback=spec.fallback,
+        iterations=iterations,
+    )
+    _check_pilots(plan, plant)
+    return plan
+
+
+def _sides(valves: ValveMap, axis: int) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    extend, retract = ((valves.speeds[axis, side], valves.levers[axis, side]) for side in range(len(SIDES)))
+    return extend, retract
+
+
+def _lever_shape(machine: Machine) -> tuple[float, float, float]:
+    _, plant = pack(machine)
+    return machine.valves.pilot_pressure, float(plant[at.LEVER_DEAD_ZONE]), float(plant[at.CONFLUX_START])
+
+
+def _pilots(machine: Machine, names: tuple[str, ...]) -> tuple[PilotCommand, ...]:
+    """How each command of a twin follows from the levers: two of a spool, primary spools before those of conflux."""
+    axes, _ = pack(machine)
+    pilots = []
+    for name in names:
+        spool, way = divmod(PILOTS.index(name), 2)
+        axis, second = spool % AXES, spool >= AXES
+        share = axes[axis, at.CONFLUX_SHARE_RETRACT if way else at.CONFLUX_SHARE_EXTEND] if second else 1.0
+        pilots.append(PilotCommand(axis, second, way == 0, float(share)))
+    return tuple(pilots)
+
+
+def _check_pilots(plan: PlanParts, plant: PlantInterface) -> None:
+    """Refuse a plant whose levers become other pressures than those of its machine.
+
+    Raises:
+        ExportError: it is one.
+    """
+    levers = np.random.default_rng(0).uniform(-1.0, 1.0, (50, AXES))
+    full, zone, start = plan.lever_shape
+    expected = plant.commands(levers)
+    names = [channel.name for channel in plan.plant.inputs[: len(plan.pilots)]]
+    for pilot, name in zip(plan.pilots, names, strict=True):
+        lever = levers[:, pilot.axis]
+        demand = np.clip((np.abs(lever) - zone) / (1.0 - zone), 0.0, 1.0)
+        if pilot.second:
+            demand = pilot.share * np.clip((demand - start) / (1.0 - start), 0.0, 1.0)
+        pressure = np.where((lever >= 0.0) == pilot.extend, full * demand, 0.0)
+        if np.abs(pressure - expected[:, PILOTS.index(name)]).max() > 1e-3 * full:
+            raise ExportError(
+                f"{plant.source} makes other pilot pressures '{name}' of levers than machine "
+                f"'{plant.geometry.machine.name}' does; a controller in C follows the machine: use its own"
+            )
+
+
+def _golden(parts: ControllerParts, kept: KeptController) -> GoldenLoop | None:
+    """The kept stretch up to the first tick at which an input was missing; None where that is the first."""
+    columns = kept.plant.columns(tuple(channel.name for channel in parts.inputs))
+    measured = kept.observed[:, columns]
+    good = np.isfinite(measured).all(axis=1)
+    ticks = len(good) if good.all() else int(np.argmin(good))
+    if not ticks:
+        return None
+    ahead = parts.lead if parts.plan is None else max(parts.lead, sum(parts.plan.blocks))
+    # Two more rows: slopes are central.
+    rows = slice(0, ticks + ahead + 2)
+    before, levers = _replayed(kept, ticks)
+    return GoldenLoop(measured[:ticks], before, levers, kept.strokes[rows], kept.tip[rows])
+
+
+def _replayed(kept: KeptController, ticks: int) -> tuple[Array, Array]:
+    """Memory before each tick and levers of the controller, told the observations that were kept."""
+    experiment = kept.experiment
+    controller = experiment.controller.build(kept.plant, experiment.task.limits, kept.models)
+    if not isinstance(controller, PiController | NmpcController):
+        raise ExportError("the controller has no form in C; these have: pi, nmpc")
+    judged = np.ones(len(kept.strokes), dtype=bool)
+    controller.reset(kept.observed[0], TipReference(kept.plant.rate_hz, kept.strokes, kept.tip, judged))
+    before, levers = [], []
+    for tick in range(ticks):
+        before.append(np.concatenate((controller.before, controller.memory)))
+        levers.append(controller.step(kept.observed[tick], tick))
+    return np.array(before), np.array(levers)
+
+
+def _iterations(options: Mapping[str, Any]) -> int:
+    for option in options:
+        if option != "iterations":
+            raise ConfigError(f"--set {option}: a controller has no such option (it has iterations); leave it out")
+    text = str(options.get("iterations", ITERATIONS))
+    if not text.isdecimal() or not 2 <= int(text) <= MOST_ITERATIONS:
+        raise ConfigError(f"--set iterations={text}: an integer from 2 to {MOST_ITERATIONS:,} must hold")
+    return int(text)
