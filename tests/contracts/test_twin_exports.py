@@ -32,7 +32,8 @@ SENSORS = {
 
 def in_layers(name: str) -> bool:
     """Whether a formulation says what its layers are."""
-    return type(sample_twin(SPECS.get(name) or TWINS[name]())[0]).lower is not Twin.lower
+    kind = type(sample_twin(SPECS.get(name) or TWINS[name]())[0])
+    return kind.lower is not Twin.lower or kind.lower_answers is not Twin.lower_answers
 
 
 LOWERED = [ON_A_MAP, *(name for name in TWINS if in_layers(name))]

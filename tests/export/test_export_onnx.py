@@ -227,4 +227,4 @@ def test_the_page_lists_the_operators(bundle_of):
             assert write is window_model or not kinds & {"Conv", "GRU", "LSTM", "Transpose"}
             assert all(len(v.type.tensor_type.shape.dim) == 2 for v in (*model.graph.input, *model.graph.output))
             used |= kinds
-    assert used == ALLOWED
+    assert used == ALLOWED - {"Log"}  # of the tanks of a twin: see test_export_elements.py

@@ -68,11 +68,12 @@ def number_table(result: Identified) -> None:
     """Print a row a number: the guess, what was identified and its interval, or that the logs do not tell it."""
     rows = []
     for row in result.rows:
-        interval = f"{row.low:.3g} to {row.high:.3g}" if row.excited else "kept: not told by the logs"
+        interval = row.interval("kept: not told by the logs")
         rows.append([row.label, row.unit, f"{row.base:.4g}", f"{row.value:.4g}", interval])
-    excited = sum(row.excited for row in result.rows)
+    told_count = sum(row.is_told for row in result.rows)
+    rough = sum(row.excited for row in result.rows) - told_count
     table(
-        f"{excited} of {len(rows)} numbers are told by the logs",
+        f"{told_count} of {len(rows)} numbers are told by the logs, {rough} roughly",
         ["", "unit", "guess", "identified", "about 95 %"],
         rows,
     )

@@ -27,6 +27,10 @@ def twin(
         Path | None, typer.Option("--from", help="Run folder of a recurrent twin that goes on with these recordings.")
     ] = None,
     workers: Annotated[int, typer.Option(min=0, help="Parallel trainings; 0: one for each core.")] = 0,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="Of a choice without twin.kind: processor time of its networks at most; default: no bound."),
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Train a plant model that runs on commands alone: velocities, strokes and pressures over a minute.
@@ -40,12 +44,14 @@ def twin(
 
     Example: `edp twin data/m22 --out runs/twin`
     """
-    from edp.config.twin import load_twin_experiment
+    from edp.config.twin import load_twin_experiment, with_budget
     from edp.evaluation.guard import twin_beaten_by
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
 
     experiment = load_twin_experiment(config, changes)
+    if minutes is not None:
+        experiment = with_budget(experiment, minutes)
     with progress(as_json) as shown:
         display = FitDisplay(shown, as_json)
         source = source_of(data, signal_map, repair)
@@ -145,13 +151,15 @@ def score_table(models: dict[str, Any]) -> None:
         actuator_tables(models)
         return
     velocity, strokes = first["velocity_mae"], first["stroke_error"]
-    heads = [_with_unit("velocity", velocity), *(_with_unit(f"{row['at_s']:g} s", row) for row in strokes)]
-    rows = []
-    for name, scores in models.items():
-        cells = [_number(scores["velocity_mae"]["mean"]), *(_number(row["mean"]) for row in scores["stroke_error"])]
-        rows.append([name, *cells, _number(scores["pressure_nrmse"]["mean"]), f"{scores['diverged']:.1%}"])
+    rows = [[_with_unit("velocity", velocity), *(_number(one["velocity_mae"]["mean"]) for one in models.values())]]
+    for k, row in enumerate(strokes):
+        name = _with_unit(f"stroke after {row['at_s']:g} s", row)
+        rows.append([name, *(_number(one["stroke_error"][k]["mean"]) for one in models.values())])
+    rows.append(["pressure, deviations", *(_number(one["pressure_nrmse"]["mean"]) for one in models.values())])
+    rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in models.values())])
     out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over actuators and runs:")
-    table("MAE of velocities, stroke error by time, NRMSE of pressures", ["", *heads, "pressure", "diverged"], rows)
+    # A column a model: with a column a time it would be too wide for a terminal of 80.
+    table("MAE of velocities, stroke error by time, NRMSE of pressures", ["", *models], rows)
 
 
 def actuator_tables(models: dict[str, Any]) -> None:
@@ -162,13 +170,13 @@ def actuator_tables(models: dict[str, Any]) -> None:
     places = zip(first["velocity_mae"]["by_channel"], strokes[0]["by_channel"], strict=True)
     for velocity, stroke in places:
         unit, length = first["velocity_mae"]["units"][velocity], strokes[0].get("units", {}).get(stroke, "")
-        heads = ["", f"velocity, {unit}", *(f"{row['at_s']:g} s, {length}" for row in strokes), "diverged"]
-        rows = []
-        for name, scores in models.items():
-            errors = [scores["velocity_mae"]["by_channel"][velocity]]
-            errors += [row["by_channel"][stroke] for row in scores["stroke_error"]]
-            rows.append([name, *map(_number, errors), f"{scores['diverged']:.1%}"])
-        table(f"{velocity}: its MAE, and the error of {stroke} by time", heads, rows)
+        every = models.values()
+        rows = [[f"velocity, {unit}", *(_number(one["velocity_mae"]["by_channel"][velocity]) for one in every)]]
+        for k, row in enumerate(strokes):
+            errors = (one["stroke_error"][k]["by_channel"][stroke] for one in every)
+            rows.append([f"after {row['at_s']:g} s, {length}", *map(_number, errors)])
+        rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in every)])
+        table(f"{velocity}: its MAE, and the error of {stroke} by time", ["", *models], rows)
     if first["pressure_nrmse"]["mean"] is not None:
         listed = ", ".join(f"{name} {_number(one['pressure_nrmse']['mean'])}" for name, one in models.items())
         out.print(f"NRMSE of pressures: {listed}")

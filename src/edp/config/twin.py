@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import tomli_w
@@ -62,6 +62,20 @@ def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str
         table = merged(table, override(text))
     where = "of a twin" if path is None else f"'{path}'"
     return TWIN_SETTINGS.build(TwinExperiment, table, where + (" with --set" if overrides else ""))
+
+
+def with_budget(experiment: TwinExperiment, minutes: float) -> TwinExperiment:
+    """The settings with a bound on the counted processor time of a choice.
+
+    Raises:
+        ConfigError: they name a formulation, or the bound is no number of minutes.
+    """
+    if not isinstance(experiment.twin, AutoTwin):
+        raise ConfigError(
+            f"--minutes came with twin.kind = '{KINDS.name_of(experiment.twin)}'; only a choice among formulations has "
+            "a budget: leave it out, or twin.kind"
+        )
+    return replace(experiment, twin=replace(experiment.twin, minutes=minutes))
 
 
 def twin_toml(experiment: TwinExperiment) -> str:

@@ -14,6 +14,9 @@ import numpy as np
 
 from edp.ir.base import Array, Indices, Layer
 
+LEAST = float(np.finfo(np.float32).tiny)
+"""The least normal number of single precision."""
+
 
 class Function(StrEnum):
     """Element-wise functions."""
@@ -27,6 +30,8 @@ class Function(StrEnum):
     SQRT = "sqrt"
     SINE = "sine"
     COSINE = "cosine"
+    LOG = "log"
+    """Natural, of what is above 0; anything below the least normal number of single precision counts as that."""
     POSITIVE = "positive"
     """1 where a number is above 0, else 0."""
 

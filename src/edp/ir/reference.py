@@ -124,6 +124,7 @@ FUNCTIONS: Mapping[plain.Function, Callable[[Values], Values]] = {
     plain.Function.SQRT: np.sqrt,
     plain.Function.SINE: np.sin,
     plain.Function.COSINE: np.cos,
+    plain.Function.LOG: lambda x: np.log(np.maximum(x, x.dtype.type(plain.LEAST))),
     plain.Function.POSITIVE: lambda x: np.asarray(x > 0, dtype=x.dtype),
 }
 

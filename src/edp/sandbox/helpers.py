@@ -6,7 +6,7 @@ import multiprocessing
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
 from typing import Protocol, TypeVar
@@ -24,6 +24,8 @@ class Labelled(Protocol):
         ...
 
 
+POLL_S = 0.5
+"""Between two looks at jobs that are at work."""
 Job = TypeVar("Job", bound=Labelled)
 Result = TypeVar("Result")
 
@@ -54,8 +56,15 @@ class Helpers:
                 child.terminate()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def ordered(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
+    def ordered(
+        self, function: Callable[[Job], Result], jobs: Sequence[Job], waiting: Callable[[], None] | None = None
+    ) -> Iterator[Result]:
         """`function` of each job, in the order of the jobs.
+
+        Args:
+            function: that a process can import.
+            jobs: what it is called with.
+            waiting: called now and then while a process is at work.
 
         Raises:
             EdpError: a process died, see `died`.
@@ -68,9 +77,9 @@ class Helpers:
             running.append((job, self._started().submit(function, job)))
             # At most two a worker: finished results must not pile up in memory while an early one is late.
             if len(running) >= 2 * self.workers:
-                yield self._result(*running.popleft())
+                yield self._result(*running.popleft(), waiting)
         while running:
-            yield self._result(*running.popleft())
+            yield self._result(*running.popleft(), waiting)
 
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
@@ -79,7 +88,9 @@ class Helpers:
             self._pool = ProcessPoolExecutor(self.workers, context, begin_helper, (os.getpid(),))
         return self._pool
 
-    def _result(self, job: Job, future: Future[Result]) -> Result:
+    def _result(self, job: Job, future: Future[Result], waiting: Callable[[], None] | None) -> Result:
+        while waiting is not None and not wait([future], POLL_S).done:
+            waiting()
         try:
             return future.result()
         except BrokenProcessPool as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -112,6 +113,11 @@ class RunFolder:
         """Where the run stands; empty where nothing was written yet."""
         status_file = self.file("status.json")
         return read_object(status_file, ("status", "time")) if status_file.exists() else {}
+
+    def remove_parts(self) -> None:
+        """Delete the folders of its single trainings, which only an unfinished run reads."""
+        # Not through a link: what it points to is not ours.
+        shutil.rmtree(self.path / PARTS, ignore_errors=True)
 
     def write_history(self, rows: list[dict[str, Any]]) -> None:
         """Write all epochs so far, a JSON line each."""

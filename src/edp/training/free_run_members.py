@@ -8,11 +8,16 @@ from pathlib import Path
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.errors import EdpError
 from edp.networks.twin import TwinScales
 from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, member_seed
 from edp.networks.twin.static_map import StaticTwin
+from edp.storage import read_object, write_json
 from edp.storage.runs import PARTS, KeyedRun, RunFolder
 from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
+
+NOTE = "progress.json"
+"""How far a training in another process is, in the folder of its checkpoints."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,52 @@ def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], No
         return fit_free_runs(*what, trained=job.trained)
     with RunFolder(job.folder[0]) as folder:
         return fit_free_runs(*what, KeyedRun(folder, job.folder[1]), job.trained)
+
+
+def noting_member(job: MemberTraining) -> FittedTwin:
+    """`trained_member` in another process, which notes in the folder of the job how far it is.
+
+    Raises:
+        EdpError: see `fit_free_runs`.
+    """
+    if job.folder is None:
+        return trained_member(job)
+    note = job.folder[0] / NOTE
+    return trained_member(job, lambda event: write_json(note, dict(vars(event))))
+
+
+def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
+    """Trainings side by side as one, from what each noted last; None where none has noted anything."""
+    noted = [_noted(job) for job in jobs]
+    events = [event for event in noted if event is not None]
+    if not events:
+        return None
+    waiting = len(jobs) - len(events)
+    errors = [event.validation for event in events if event.validation is not None]
+    longest = max(event.seconds_left for event in events)
+    return FreeRunProgress(
+        sum(event.update for event in events),
+        sum(sum(job.training.updates) for job in jobs),
+        max(event.length_s for event in events),
+        # One that has not begun takes about as long as the slowest has yet to go.
+        sum(event.seconds_left for event in events) + waiting * longest,
+        sum(errors) / len(errors) if errors else None,
+        any(event.best for event in events),
+    )
+
+
+def _noted(job: MemberTraining) -> FreeRunProgress | None:
+    if job.folder is None or not (note := job.folder[0] / NOTE).is_file():
+        return None
+    try:
+        row = read_object(note, ("update", "updates", "length_s", "seconds_left", "validation", "best"))
+        error = row["validation"]
+        return FreeRunProgress(
+            int(row["update"]), int(row["updates"]), float(row["length_s"]), float(row["seconds_left"]),
+            None if error is None else float(error), bool(row["best"]),
+        )  # fmt: skip
+    except (EdpError, TypeError, ValueError):
+        return None  # a note is for readers: what cannot be read now is read at the next look
 
 
 def one_by_one(

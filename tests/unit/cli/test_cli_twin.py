@@ -91,7 +91,14 @@ def test_a_stopped_training_goes_on(edp, logs, trained, tmp_path, monkeypatch):
 def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs, tmp_path):
     run, page = tmp_path / "run", tmp_path / "page.html"
     words = ["--set", "twin.candidates=['static','n4sid','recurrent']", *WORDS[4:]]
-    shown = " ".join(edp("twin", logs, "--out", run, *words, "--workers", "1").out.split())
+    printed = edp("twin", logs, "--out", run, *words, "--workers", "1").out
+    shown = " ".join(printed.split())
+    assert not (run / "parts").exists()
+    prose = ("chosen: ", "was left out: ")
+    lines = [line for line in printed.splitlines() if not any(words in line for words in prose)]
+    tables = [line for line in lines if "recurrent (" in line or line.startswith(("velocity", "stroke"))]
+    assert len(tables) > 3
+    assert max(len(line.rstrip()) for line in tables) <= 80
     assert "chosen: " in shown
     ended = edp("twin", logs, "--out", run, *words, "--json").json
     rows = ended["candidates"]
@@ -111,6 +118,17 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
     assert (run / "candidates.json").read_text() == before
     (run / "candidates.json").write_text(before.replace('"chosen": true', '"chosen": "yes"'))
     assert "chosen is 'yes'; true or false must hold" in " ".join(edp("report", run).err.split())
+
+
+def test_a_budget_is_that_of_a_choice(edp, logs, tmp_path):
+    assert "only a choice among formulations has a budget" in " ".join(
+        edp("twin", logs, "--out", tmp_path / "run", *WORDS, "--minutes", 1).err.split()
+    )
+    assert "minutes = -1" in " ".join(edp("twin", logs, "--out", tmp_path / "run", "--minutes", -1).err.split())
+    words = ["--set", "twin.candidates=['static','recurrent']", *WORDS[4:], "--minutes", 1e-6]
+    ended = edp("twin", logs, "--out", tmp_path / "run", *words, "--json").json
+    assert [row["label"] for row in ended["candidates"] if row["chosen"]] == ["static"]
+    assert "counted time" in ended["candidates"][1]["why"]
 
 
 def test_any_number_of_workers_trains_the_same_twin(edp, logs, tmp_path):

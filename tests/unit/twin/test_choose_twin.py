@@ -19,10 +19,10 @@ from edp.networks.twin.static_map import StaticMap
 from edp.storage.runs import KeyedRun, RunFolder
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
 from edp.training import free_run_members
-from edp.training.free_run import FreeRunDiverged, FreeRunSpec
-from edp.training.free_run_members import fit_members
+from edp.training.free_run import FreeRunDiverged, FreeRunProgress, FreeRunSpec
+from edp.training.free_run_members import MemberTraining, fit_members, noted_progress, noting_member
 from edp.training.optimizers import AdamW
-from edp.workflows.twin import choose_twin
+from edp.workflows.twin import choose_twin, fit_twin, training_cost
 from edp.workflows.twin.choose_twin import TwinChoice, shortened
 from edp.workflows.twin.fit_twin import TwinFit
 
@@ -102,7 +102,7 @@ def test_trainings_get_longer_as_long_as_that_helps_and_the_twin_is_the_average_
     assert trained == [key for key in errors for _ in range(5)]
     assert [one.error for one in tried] == list(errors.values())
     assert result.spec == Recurrent(units=160, members=5, prefix_ticks=20)
-    assert [one.label for one in tried if one.chosen] == ["recurrent (5 members, 160 units), 9 updates"]
+    assert [one.label for one in tried if one.chosen] == ["recurrent (5 x 32 units), 9 updates"]
     assert {row["member"] for row in result.fitted.history} == {0, 1, 2, 3, 4}
     assert result.fitted.twin.network.units == 160
     assert len(result.unseen) == 5
@@ -118,8 +118,8 @@ def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, mon
     assert trained == [(True, 1)] * 5 + [(False, 1)] * 2 + [(True, 3)] * 2 + [(False, 3)] * 2
     assert [one.error for one in tried] == [0.9, None, None, None]
     assert tried[1].why == (
-        "given up after 2 of 5 folds, with 1.60 times the error of recurrent (5 members, 160 units, on the static "
-        "map), 1 updates there"
+        "given up after 2 of 5 folds, with 1.60 times the error of recurrent (5 x 32 units, on the map), 1 updates "
+        "there"
     )
     assert result.spec.valve_map
     monkeypatch.setattr(choose_twin, "FAR_BEHIND", 1.7)
@@ -129,6 +129,34 @@ def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, mon
     # Of a longer training yet, two folds without a gain are enough.
     assert [one.error for one in tried] == [0.9, 0.95, 0.95, 0.8, None]
     assert "given up after 2 of 5 folds" in tried[-1].why
+
+
+@pytest.mark.training
+def test_trainings_that_a_budget_has_no_time_for_are_left_out(run, monkeypatch):
+    errors = {(True, 1): 0.9, (False, 1): 0.8, (True, 3): 0.85, (False, 3): 0.6}
+    trained = judged_by(monkeypatch, errors)
+    # A minute of counted time an update: 1, 1 and 3 fit into six minutes, one more of 3 does not.
+    monkeypatch.setattr(choose_twin, "training_seconds", lambda *parts: 60.0 * sum(parts[2].updates))
+    _, tried = choice(run, candidates=("recurrent",), minutes=6.0).best()
+    assert trained == [key for key in [*errors][:3] for _ in range(5)]
+    assert [one.error for one in tried] == [0.9, 0.8, 0.85, None]
+    assert tried[-1].why == "about 8 min of counted time with those before it, of minutes = 6"
+    with RunFolder(run.path / "again") as other:
+        result, tried = choice(other, candidates=("static", "recurrent"), minutes=0.5).best()
+    assert result.spec == StaticMap(prefix_ticks=20)
+    assert [one.label.split(",")[0] for one in tried] == ["static", "recurrent (5 x 32 units"]
+
+
+def test_counted_time_grows_with_updates_lengths_units_and_members(run):
+    fit = choice(run).fit
+
+    def cost(units=32, members=1, updates=(100,), lengths=(1.0,)):
+        training = replace(TINY, updates=updates, lengths_s=lengths)
+        return training_cost.training_seconds(Recurrent(units=units), fit.channels, training, members)
+
+    assert cost(members=3) == pytest.approx(3 * cost())
+    assert cost(updates=(200,)) == pytest.approx(2 * cost())
+    assert cost() < cost(units=64) < cost(units=64, lengths=(2.0,))
 
 
 def test_every_tick_that_may_be_learned_from_is_left_out_by_one_fit_and_the_twin_has_learned_from_all(run):
@@ -153,7 +181,7 @@ def test_long_recordings_are_judged_by_the_validation_part_and_have_one_wide_net
     result, tried = one.best()
     assert [fold.train for fold in one.folds] == [one.fit.data.train]
     assert [fold.validation for fold in one.folds] == [one.fit.data.validation]
-    assert tried[1].label.startswith("recurrent (96 units, on the static map)")
+    assert tried[1].label.startswith("recurrent (96 units, on the map)")
     assert [twin for twin, _ in result.unseen] == [tried[i].trial.fits[0].fitted.twin for i in range(len(tried))
                                                    if tried[i].chosen]  # fmt: skip
     assert result.facts["folds"] == 1
@@ -323,3 +351,44 @@ def test_a_share_of_a_training_keeps_its_stages():
 def test_settings_that_cannot_be_are_refused(change, message):
     with pytest.raises(ConfigError, match=message):
         load_twin_experiment(None, [change])
+
+
+@pytest.mark.training
+def test_trainings_side_by_side_note_how_far_they_are(run):
+    channels, series = sample_series(2)
+    scales = fit_scales(channels, series)
+    jobs = []
+    for which in range(3):
+        member = Recurrent(units=3).member(channels, scales, None, which)
+        folder = (run.path / f"member_{which}", "k" * 32)
+        jobs.append(MemberTraining(f"member {which}", member, series, series, TINY, folder))
+    assert noted_progress(jobs) is None
+    for job in jobs[:2]:
+        noting_member(job)
+    (run.path / "member_2").mkdir()
+    note = run.path / "member_2" / "progress.json"
+    note.write_text("{ half a")  # as it may be read while it is written
+    event = noted_progress(jobs)
+    assert (event.update, event.updates) == (40, 60)
+    assert event.validation > 0.0
+    jobs[2] = replace(jobs[2], folder=None)
+    assert noted_progress(jobs).update == 40
+
+
+def test_a_choice_looks_at_helpers_while_it_waits(run, monkeypatch):
+    looks = []
+
+    class Waiting:
+        workers = 2
+
+        def ordered(self, function, jobs, waiting):
+            assert function is noting_member
+            waiting()
+            waiting()
+            return iter([])
+
+    seen = iter([None, FreeRunProgress(3, 9, 0.1, 1.0, None, False)])
+    monkeypatch.setattr(fit_twin, "noted_progress", lambda jobs: next(seen))
+    fit = replace(choice(run).fit, helpers=Waiting())
+    assert list(fit.train_members([], looks.append)) == []
+    assert [event.update for event in looks] == [3]

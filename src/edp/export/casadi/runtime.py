@@ -196,6 +196,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "sqrt": ca.sqrt,
     "sine": ca.sin,
     "cosine": ca.cos,
+    "log": lambda x: ca.log(ca.fmax(x, 2.0**-126)),
     "positive": lambda x: _keep_nan(x, x > 0),
 }
 

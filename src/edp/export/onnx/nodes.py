@@ -17,8 +17,8 @@ OPSETS = {9: 4, 11: 6, 13: 7, 17: 8, 21: 10}
 """IR version by opset: the one that was current when the opset came out, so that readers of that time take the file."""
 DEFAULT_OPSET = 13
 _NAMES = """
-Add Clip Concat Conv Cos Div Erf Exp GRU Gather Gemm Identity LSTM Max Min Mul ReduceMean Relu Reshape Sigmoid Sign Sin
-Softmax Softplus Split Sqrt Sub Tanh Transpose
+Add Clip Concat Conv Cos Div Erf Exp GRU Gather Gemm Identity LSTM Log Max Min Mul ReduceMean Relu Reshape Sigmoid Sign
+Sin Softmax Softplus Split Sqrt Sub Tanh Transpose
 """
 OPTIONAL = ("LSTM", "GRU")
 """Operators whose outputs may be left out."""

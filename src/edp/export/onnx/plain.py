@@ -29,6 +29,8 @@ def activate(nodes: Nodes, function: Function, x: str) -> str:
     if function is Function.POSITIVE:
         # Sign gives -1, 0 and 1; ReLU makes 0 of the negative ones. Comparisons would give booleans.
         return nodes.add("Relu", nodes.add("Sign", x))
+    if function is Function.LOG:
+        x = nodes.add("Max", x, nodes.constant(np.float32(layers.LEAST)))
     return nodes.add(OPERATORS[function], x)
 
 
@@ -41,6 +43,7 @@ OPERATORS = {
     Function.SQRT: "Sqrt",
     Function.SINE: "Sin",
     Function.COSINE: "Cos",
+    Function.LOG: "Log",
 }
 
 

@@ -32,6 +32,7 @@ FUNCTIONS = {
     Function.SQRT: "sqrt({x})",
     Function.SINE: "sin({x})",
     Function.COSINE: "cos({x})",
+    Function.LOG: "log(max({x}, realmin('single')))",
     Function.POSITIVE: "positive({x})",
 }
 """Element-wise functions by name."""

@@ -121,6 +121,11 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
         ExportError: a kind of layer that has no integer form, sums that would not fit in 32 bits, or formats of
             another graph.
     """
+    if not any(layer.macs for layer in graph.layers):
+        raise ExportError(
+            "the list of layers has no matrix of weights, and its equations would lose digits in 16 bits; 8-bit "
+            "weights save nothing here: export in float32"
+        )
     graph = balanced(graph)
     inside = integer_part(graph)
     work = _Work(graph, chosen.fracs, WeightRounding(chosen.weights, moments or {}), {}, [], {})

@@ -73,6 +73,17 @@ def log1p(x: Rows) -> Rows:
     return np.asarray(f(2.0) * (s + s * q * tail))
 
 
+def _log(x: Rows) -> Rows:
+    """``natural_log`` of the runtime."""
+    f = np.float32
+    half, power = np.frexp(np.clip(x, f(layers.LEAST), np.finfo(f).max))
+    # Between 0.71 and 1.41 the logarithm of a number near 1 keeps its digits.
+    above = half > f(0.707106769)
+    mantissa, n = np.where(above, half, f(2.0) * half), (power - 1 + above).astype(f)
+    y = n * f(0.693359375) + (n * f(-2.12194440e-4) + log1p(mantissa - ONE))
+    return np.asarray(np.where(np.isnan(x), x, y))
+
+
 def _softplus(x: Rows) -> Rows:
     return np.asarray(np.where(x > 0, x, np.float32(0)) + log1p(exp(-np.abs(x))))
 
@@ -111,6 +122,7 @@ FUNCTIONS: dict[Function, Callable[[Rows], Rows]] = {
     Function.SQRT: np.sqrt,
     Function.SINE: lambda x: _turned(x, 0),
     Function.COSINE: lambda x: _turned(x, 1),
+    Function.LOG: _log,
     Function.POSITIVE: lambda x: (x > 0).astype(np.float32),
 }
 

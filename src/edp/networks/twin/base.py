@@ -13,7 +13,7 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, ExportError
 from edp.ir import Builder, Graph
-from edp.networks.twin.lowering import plant_graph
+from edp.networks.twin.lowering import bounded_layers, plant_graph
 from edp.networks.twin.scales import Array, TwinScales
 from edp.registry import Registry
 from edp.settings.bounds import MOST_TICKS, integer
@@ -73,6 +73,13 @@ class Twin(ABC):
             f"a twin of class {type(self).__name__} has no form as a list of layers; run it with edp rollout, or train "
             "one of another kind"
         )
+
+    def lower_answers(self, build: Builder, commands: str, fed: str) -> str:
+        """Layers of its own and of the bounds: all answers, scaled; arguments and errors are those of `lower`."""
+        with build.inside("cell"):
+            proposed = self.lower(build, commands, fed)
+        with build.inside("answers"):
+            return bounded_layers(build, self, fed, proposed)
 
     def graph(self) -> Graph:
         """A tick as layers with a feedback edge, from which exported forms are made (see `plant_graph`).

@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
+from edp.networks.twin.lumped.lowering import lowered_answers
 from edp.networks.twin.lumped.parts import (
+    EDGE,
     MOST_ELEMENTS,
+    SLIP,
+    SPILL,
     Doubles,
     LagElement,
     LumpedNumber,
@@ -29,12 +34,6 @@ from edp.settings.bounds import MOST_UPDATES, check_bounds, check_count, integer
 
 Values = NDArray[Any]
 """Real, or complex where the imaginary part carries a derivative (a complex step is exact to rounding)."""
-SLIP = 0.005
-"""Share of the fastest velocity over which friction turns round; less makes the fit stiff, more lets loads creep."""
-EDGE = 0.01
-"""Share of a tank's height over which its overflow sets in; a hard edge leaves the fit in valleys of its own."""
-SPILL = 0.8
-"""Share of what stands above the edge that leaves in a tick; explicit steps stay stable below 2 a step."""
 PRIOR = 0.2
 """Plausible deviation of a level that is not measured, as a share of the tank's height."""
 
@@ -265,6 +264,9 @@ class ElementsTwin(Twin):
             answer, hidden = after.astype(np.float32), levels.astype(np.float32)
             answers[:, t] = answer
         return answers, {"answer": answer.copy(), "hidden": hidden.copy()}
+
+    def lower_answers(self, build: Builder, commands: str, fed: str) -> str:
+        return lowered_answers(build, self, fed)
 
     def arrays(self) -> dict[str, Array]:
         return self.scales.arrays() | {"numbers": self.numbers.astype(np.float32)}

@@ -9,8 +9,9 @@ from edp.networks.twin import TWINS
 from edp.networks.twin.base import PREFIX
 from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, SHARE, check_bounds, check_count, integer
+from edp.settings.bounds import MOST_NAMES, SHARE, check_bounds, check_count, integer, span
 
+BUDGET = span(0.0, 100_000.0)
 KINDS: Registry[type] = Registry("twin")
 """Every formulation, and the choice among several of them."""
 FOLDS = integer(1, MOST_MEMBERS)
@@ -30,6 +31,8 @@ class AutoTwin:
         folds: parts of training and validation part together that are left out in turn, where both are short; with 1
             the validation part alone is left out.
         prefix_ticks: measured ticks before a free run.
+        minutes: counted processor time for the recurrent networks: trainings that do not fit into it are left out;
+            0: no bound.
 
     Raises:
         ConfigError: a value out of range, no candidate, or an unknown one.
@@ -39,9 +42,10 @@ class AutoTwin:
     least_gain: float = 0.02
     folds: int = 5
     prefix_ticks: int = 30
+    minutes: float = 0.0
 
     def __post_init__(self) -> None:
-        check_bounds("automatic twin", self, least_gain=SHARE, folds=FOLDS, prefix_ticks=PREFIX)
+        check_bounds("automatic twin", self, least_gain=SHARE, folds=FOLDS, prefix_ticks=PREFIX, minutes=BUDGET)
         check_count("automatic twin", "candidates", self.candidates, MOST_NAMES, least=1)
         for name in self.candidates:
             try:

@@ -37,10 +37,8 @@ def plant_graph(twin: Twin) -> Graph:
     command = build.add(Standardise, "commands", logged, offset=scales.command_offset, scale=scales.command_width)
     with build.inside("ports"):
         fed, last = _ports(build, twin, commands)
-    with build.inside("cell"):
-        proposed = twin.lower(build, command, fed)
+    answer = twin.lower_answers(build, command, fed)
     with build.inside("answers"):
-        answer = _bounded(build, twin, fed, proposed)
         # A map of the commands alone reads no port; an edge that leads nowhere would be memory for nothing.
         if any(fed in layer.inputs for layer in build.layers):
             build.add(Feed, "feed", answer, into=last)
@@ -64,7 +62,7 @@ def _ports(build: Builder, twin: Twin, commands: int) -> tuple[str, str]:
     return build.combine("fed", ADD, *parts), last
 
 
-def _bounded(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
+def bounded_layers(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
     """Answers within the bounds, scaled: `Twin.bounded` in layers."""
     scales, channels = twin.scales, twin.channels
     count, strokes = len(channels.velocities), len(channels.strokes)
@@ -73,17 +71,25 @@ def _bounded(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
     clipped = build.add(Clip, "bounded", proposed, low=low[free], high=high[free])
     if not strokes:
         return clipped
-    velocity, ends = build.pick("velocity", clipped, range(count)), slice(count, 2 * count)
-    both = build.combine("both_ends", ADD, build.pick("velocity_before", fed, range(count)), velocity)
-    zero = np.zeros(count)
-    moved = build.add(ScaleShift, "moved", both, gain=scales.trapezoid(channels), shift=zero)
-    stroke = build.combine("stroke", ADD, build.pick("stroke_before", fed, range(count, 2 * count)), moved)
-    velocity = _stopped(build, "open", stroke, velocity, high[ends], high[:count], 1.0)
-    velocity = _stopped(build, "closed", stroke, velocity, low[ends], low[:count], -1.0)
-    stroke = build.add(Clip, "held", stroke, low=low[ends], high=high[ends])
+    velocity = build.pick("velocity", clipped, range(count))
+    velocity, stroke = stopped_strokes(build, twin, fed, velocity, list(range(count)))
     pressures = build.width(clipped) - count
     rest = [build.pick("pressure", clipped, range(count, count + pressures))] if pressures else []
     return build.join("together", velocity, stroke, *rest)
+
+
+def stopped_strokes(build: Builder, twin: Twin, fed: str, velocity: str, columns: list[int]) -> tuple[str, str]:
+    """Velocities of these columns that do not go into an end stop, and the strokes that they add up to; all scaled."""
+    scales, count = twin.scales, len(twin.channels.velocities)
+    low, high = ((end - scales.answer_offset) / scales.answer_width for end in (scales.low, scales.high))
+    both = build.combine("both_ends", ADD, build.pick("velocity_before", fed, columns), velocity)
+    gain, zero = scales.trapezoid(twin.channels)[columns], np.zeros(len(columns))
+    moved = build.add(ScaleShift, "moved", both, gain=gain, shift=zero)
+    ends = [count + column for column in columns]
+    stroke = build.combine("stroke", ADD, build.pick("stroke_before", fed, ends), moved)
+    velocity = _stopped(build, "open", stroke, velocity, high[ends], high[columns], 1.0)
+    velocity = _stopped(build, "closed", stroke, velocity, low[ends], low[columns], -1.0)
+    return velocity, build.add(Clip, "held", stroke, low=low[ends], high=high[ends])
 
 
 def _stopped(build: Builder, name: str, stroke: str, velocity: str, stop: Array, most: Array, side: float) -> str:

@@ -36,8 +36,9 @@ from edp.workflows.identify.elements import NO_MOTORS, check_strokes, excavator_
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
 from edp.workflows.identify.machine_text import machine_text
 from edp.workflows.identify.mapping import GreyParts
-from edp.workflows.identify.rows import IdentifiedNumber, body_rows, line_comments, number_rows
-from edp.workflows.identify.tie import MachineTie, deviations, kept_back, nearest
+from edp.workflows.identify.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
+from edp.workflows.identify.stability import covariance
+from edp.workflows.identify.tie import MachineTie, kept_back, nearest
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 Doubles = NDArray[np.float64]
@@ -73,6 +74,18 @@ class _Fitted:
 
     twin: GreyTwin
     elements: Elements
+    information: Doubles
+
+
+@dataclass(frozen=True, eq=False)
+class _Tied:
+    """The machine fitted through its grey box: that at the end of the fit, coordinates, where they ended, and what the
+    last rounds knew of them.
+    """
+
+    twin: GreyTwin
+    tie: MachineTie
+    theta: Doubles
     information: Doubles
 
 
@@ -124,8 +137,10 @@ def identify(
     parts = parts_of(fitted.twin, fitted.elements, base, celsius)
     notes += _notes(parts)
     tell("fitting the machine itself to free runs")
-    tie, theta, information = _refined(base, parts, fitted, (data, settings), on_event)
-    machine_found, rows = _machine(tie, theta, information, (fitted.twin, data))
+    fit = _refined(base, parts, fitted, (data, settings), on_event)
+    tell("asking what parts of the logs, and runs of other lengths, would say")
+    spread = covariance(fit.twin, fit.tie, fit.theta, data.train, settings.training.seed)
+    machine_found, rows = _machine(fit, spread, data)
     machine_found = replace(machine_found, name=_name(target), description=_description(base))
     text = machine_text(machine_found, _head(base, rows, notes), line_comments(rows))
     try:
@@ -226,8 +241,8 @@ def _refined(
     fitted: _Fitted,
     logs: tuple[Prepared, TwinExperiment],
     on_event: Callable[[FreeRunProgress], None] | None,
-) -> tuple[MachineTie, Doubles, Doubles]:
-    """The machine fitted to free runs through its grey box: coordinates, where the fit ended, and their information."""
+) -> _Tied:
+    """The machine fitted to free runs through its grey box."""
     data, settings = logs
     tie = MachineTie.of(base, parts, fitted.twin.numbers[parts.load])
     tie = replace(tie, begin=nearest(tie, fitted.twin.numbers, fitted.information))
@@ -237,15 +252,15 @@ def _refined(
     spec = replace(twin.spec, fit=last)
     tied = GreyTwin(twin.channels, twin.scales, spec, (twin.table, twin.wiring), tie.numbers(tie.begin), twin.full)
     result = fit_grey_box(tied, data.train, data.validation, settings.training.seed + 1, on_event, tie)
-    return tie, result.theta, result.information
+    every = replace(twin.spec, fit=fit)
+    end = GreyTwin(twin.channels, twin.scales, every, (twin.table, twin.wiring), tie.numbers(result.theta), twin.full)
+    return _Tied(end, tie, result.theta, result.information)
 
 
-def _machine(
-    tie: MachineTie, theta: Doubles, information: Doubles, logs: tuple[GreyTwin, Prepared]
-) -> tuple[Machine, list[IdentifiedNumber]]:
+def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber]]:
     """The machine of the coordinates, those that the logs do not tell set back to the guess; and a row of each."""
-    twin, data = logs
-    count, left = len(MACHINE_NUMBERS), deviations(information)
+    twin, tie, theta, information = fit.twin, fit.tie, fit.theta, fit.information
+    count, left = len(MACHINE_NUMBERS), np.sqrt(np.diag(spread))
     excited = left[:count] < UNEXCITED
     back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
     final = replace(tie, free=excited)
@@ -262,9 +277,8 @@ def _machine(
     speeds = len(twin.channels.velocities)
     strokes = np.concatenate([part.targets[:, speeds : 2 * speeds] for part in data.train]).astype(np.float64)
     poses = Poses.of(machine, strokes)
-    spread = np.linalg.inv(information + np.eye(len(theta)))[count:, count:]
-    covariance = spread * tie.load_width * tie.load_width[:, None]
-    nine, body = body_rows(tie.base, tie.parts, load, covariance, twin.wiring.z_of, poses)
+    of_load = spread[count:, count:] * tie.load_width * tie.load_width[:, None]
+    nine, body = body_rows(tie.base, tie.parts, load, of_load, twin.wiring.z_of, poses)
     machine = replace(machine, bodies=realised(nine, tie.base))
     return machine, number_rows(tie.base, machine, left[:count], excited) + body
 
@@ -343,10 +357,11 @@ def _description(base: Machine) -> str:
 
 
 def _head(base: Machine, rows: Sequence[IdentifiedNumber], notes: Sequence[str]) -> list[str]:
-    excited = sum(row.excited for row in rows)
+    told_count, rough_count = sum(row.is_told for row in rows), sum(row.excited and not row.is_told for row in rows)
     return [
-        f"Identified from logs by edp identify: {excited} of {len(rows)} numbers are told by them.",
-        "Behind a number: an approximate 95 % interval (too narrow: errors of the structure are not in it), or that it",
-        f"is kept. Numbers without a comment are those of machine {base.name}, bodies but for their lengths excepted.",
+        f"Identified from logs by edp identify: {told_count} of {len(rows)} numbers are told, {rough_count} roughly.",
+        "Behind a number: an approximate 95 % interval, from how far parts of the logs and runs of other lengths",
+        f"differ ('roughly' where it is wider than {TOLD:.0%}), or that the number is kept. Numbers without a comment",
+        f"are those of machine {base.name}, bodies but for their lengths excepted.",
         *notes,
     ]

@@ -17,6 +17,8 @@ from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
 from edp.workflows.identify.mapping import GreyParts
 
 Doubles = NDArray[np.float64]
+TOLD = 0.2
+"""Share of a number that its interval may reach to either side for it to be told, and not roughly told."""
 BODIES = "inertia and gravity"
 """Group of the nine numbers of the bodies."""
 
@@ -33,7 +35,8 @@ class IdentifiedNumber:
         value: identified; that of the guess where the logs do not tell it.
         low: lower end of an approximate 95 % interval; `high` the upper one.
         high: upper end.
-        excited: whether the logs tell it.
+        excited: whether the logs say something of it; else it is that of the guess.
+        is_told: whether they tell it: its interval reaches no farther than `TOLD` of it.
     """
 
     label: str
@@ -44,6 +47,13 @@ class IdentifiedNumber:
     low: float
     high: float
     excited: bool
+    is_told: bool
+
+    def interval(self, unknown: str) -> str:
+        """For readers: its ends, roughly or not, or `unknown`."""
+        if not self.excited:
+            return unknown
+        return f"{'' if self.is_told else 'roughly '}{self.low:.3g} to {self.high:.3g}"
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
@@ -66,7 +76,7 @@ def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray
         rows.append(
             IdentifiedNumber(
                 number.label, number.group, number.unit, number.of(base), value, float(ends[0]), float(ends[1]),
-                bool(is_known),
+                bool(is_known), bool(is_known and reach <= 1.0 + TOLD),
             )
         )  # fmt: skip
     return rows
@@ -102,9 +112,11 @@ def body_rows(
     for i, name in enumerate(NAMES):
         reach, unit = NORMAL * float(left[i]), "kg m" if i < 6 else "kg m^2"
         ends = (float(nine[i]) - reach, float(nine[i]) + reach)
-        excited = bool(left[i] < UNEXCITED * before[i])
+        excited, is_told = bool(left[i] < UNEXCITED * before[i]), reach <= TOLD * abs(float(nine[i]))
         label = f"bodies.{name}"
-        rows.append(IdentifiedNumber(label, BODIES, unit, float(guess[i]), float(nine[i]), *ends, excited))
+        rows.append(
+            IdentifiedNumber(label, BODIES, unit, float(guess[i]), float(nine[i]), *ends, excited, excited and is_told)
+        )
     return nine, rows
 
 
@@ -113,7 +125,7 @@ def line_comments(rows: Sequence[IdentifiedNumber]) -> dict[tuple[str, str], str
     comments: dict[tuple[str, str], list[str]] = {}
     for number, row in zip(MACHINE_NUMBERS, rows, strict=False):
         name = "" if number.cylinder is None else f"{CYLINDERS[number.cylinder]} "
-        text = f"{row.low:.3g} to {row.high:.3g}" if row.excited else "kept, not told by the logs"
+        text = row.interval("kept, not told by the logs")
         comments.setdefault((number.section, number.key), []).append(f"{name}{text}")
     static = ("friction", "static_fraction")
     comments[static] = [f"less Coulomb: {text}" for text in comments[static]]

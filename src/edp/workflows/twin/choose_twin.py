@@ -22,6 +22,7 @@ from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec
 from edp.training.free_run_members import MemberTraining, joined_members
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
+from edp.workflows.twin.training_cost import training_seconds
 
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
 """Shares of the updates of `[training]` that are tried in turn, each with a whole schedule of its learning rate.
@@ -185,18 +186,32 @@ class TwinChoice:
             plain = replace(plain, members=count, units=count * MEMBER_UNITS)
         forms = [replace(plain, valve_map=True), plain]
         tried: list[TwinCandidate] = []
+        unfit: list[TwinCandidate] = []
+        spent = 0.0
         for round_, share in enumerate(LENGTHS):
-            before = _least(tried)
+            before, count_before = _least(tried), len(tried)
             ahead = self._simplest(tried)
             for form in forms if round_ < BOTH_FORMS or ahead is None else [one for one in forms if one == ahead.spec]:
                 training = shortened(self.fit.experiment.training, share)
+                cost = training_seconds(form, self.fit.channels, training, count)
+                if self.auto.minutes and spent + cost > 60.0 * self.auto.minutes:
+                    unfit.append(self._beyond_budget(form, training, spent + cost))
+                    continue
+                spent += cost
                 # A length that helped neither form would take more time than all before it.
                 most = FAR_BEHIND if round_ < BOTH_FORMS else 1.0
                 tried.append(self._trained(form, training, _best(tried), most))
+            if len(tried) == count_before:
+                break
             # Before the first training has ended there is nothing to be better than.
             if before * (1.0 - LENGTHENED) < _least(tried) < math.inf:
                 break
-        return tried
+        return tried + unfit[:1]
+
+    def _beyond_budget(self, form: Recurrent, training: FreeRunSpec, seconds: float) -> TwinCandidate:
+        """A training that is left out, and why."""
+        why = f"about {seconds / 60.0:.2g} min of counted time with those before it, of minutes = {self.auto.minutes:g}"
+        return TwinCandidate(labelled(form, training), 0.0, why=why)
 
     def _trained(
         self, form: Recurrent, training: FreeRunSpec, rival: TwinCandidate | None, most: float
@@ -332,8 +347,8 @@ def described(spec: TwinSpec) -> str:
     name = TWINS.name_of(spec)
     if not isinstance(spec, Recurrent):
         return name
-    members = f"{spec.members} members, " if spec.members > 1 else ""
-    return f"recurrent ({members}{spec.units} units{', on the static map' if spec.valve_map else ''})"
+    members = f"{spec.members} x " if spec.members > 1 else ""
+    return f"recurrent ({members}{spec.alone().units} units{', on the map' if spec.valve_map else ''})"
 
 
 def labelled(form: Recurrent, training: FreeRunSpec) -> str:

@@ -22,7 +22,7 @@ from edp.sandbox.helpers import Helpers
 from edp.storage.runs import KeyedRun
 from edp.training.elements_fit import fit_elements
 from edp.training.free_run import FittedTwin, FreeRunProgress
-from edp.training.free_run_members import MemberTraining, fit_members, one_by_one, trained_member
+from edp.training.free_run_members import MemberTraining, fit_members, noted_progress, noting_member, one_by_one
 from edp.training.grey_fit import fit_grey_box
 from edp.training.residual_fit import fit_residual
 
@@ -106,14 +106,22 @@ class TwinFit:
     def train_members(
         self, jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None
     ) -> Iterable[FittedTwin]:
-        """Train networks side by side and without their progress, or one by one with it; in order.
+        """Train networks side by side, or one by one; in order.
 
         Raises:
             EdpError: see `fit_free_runs`, or a helper died.
         """
         if self.helpers is None or self.helpers.workers <= 1:
             return one_by_one(jobs, on_event)
-        return self.helpers.ordered(trained_member, jobs)
+        shown: list[int] = []
+
+        def look() -> None:
+            event = noted_progress(jobs)
+            if on_event is not None and event is not None and event.update not in shown:
+                shown[:] = [event.update]
+                on_event(event)
+
+        return self.helpers.ordered(noting_member, jobs, look)
 
     def refitted(self, first: FittedFormulation) -> FittedFormulation:
         """What needs no stretches to choose its weights, fitted anew to the validation part as well.

@@ -110,6 +110,7 @@ def train_twin(
         bundle = replace(bundle, scores=scores)
         save_twin(bundle, run.file(FOLDER))
         run.write_status("finished")
+        run.remove_parts()
     return TrainedTwin(bundle, scores, False)
 
 

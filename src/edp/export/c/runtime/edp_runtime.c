@@ -140,6 +140,25 @@ static float small_log1p(float x) {
     return 2.0f * (s + s * q * tail);
 }
 
+/* The natural logarithm of x above 0; less than the least normal number counts as that. */
+static float natural_log(float x) {
+    const float value = (x < 1.17549435e-38f) ? 1.17549435e-38f : x;
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    int32_t n = (int32_t)(bits >> 23) - 127;
+    bits = (bits & 0x7fffffu) | 0x3f800000u;
+    float mantissa;
+    memcpy(&mantissa, &bits, sizeof mantissa);
+    /* Between 0.71 and 1.41 the logarithm of a number near 1 keeps its digits; the series holds there, too. */
+    if (mantissa > 1.41421354f) {
+        mantissa *= 0.5f;
+        n++;
+    }
+    const float whole = (float)n;
+    const float y = whole * 0.693359375f + (whole * -2.12194440e-4f + small_log1p(mantissa - 1.0f));
+    return (value == value) ? y : value;
+}
+
 void edp_fill(float value, uint32_t n, float *y) {
     for (uint32_t i = 0; i < n; i++) {
         y[i] = value;
@@ -261,6 +280,12 @@ void edp_map_sine(const float *x, uint32_t n, float *y) {
 void edp_map_cosine(const float *x, uint32_t n, float *y) {
     for (uint32_t i = 0; i < n; i++) {
         y[i] = turned(x[i], 1u);
+    }
+}
+
+void edp_map_log(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = natural_log(x[i]);
     }
 }
 

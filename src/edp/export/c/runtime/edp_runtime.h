@@ -104,6 +104,7 @@ void edp_map_exp(const float *x, uint32_t n, float *y);
 void edp_map_sqrt(const float *x, uint32_t n, float *y);
 void edp_map_sine(const float *x, uint32_t n, float *y);
 void edp_map_cosine(const float *x, uint32_t n, float *y);
+void edp_map_log(const float *x, uint32_t n, float *y);
 void edp_map_positive(const float *x, uint32_t n, float *y); /* 1 where x > 0, else 0 */
 
 /* ---- rows ------------------------------------------------------------------------------------------------------ */

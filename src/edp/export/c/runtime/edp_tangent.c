@@ -139,6 +139,12 @@ void edp_slope_cosine(const float *x, uint32_t n, float *slope) {
     }
 }
 
+void edp_slope_log(const float *x, uint32_t n, float *slope) {
+    for (uint32_t i = 0; i < n; i++) {
+        slope[i] = (x[i] > 1.17549435e-38f) ? 1.0f / x[i] : 0.0f;
+    }
+}
+
 void edp_slope_positive(const float *x, uint32_t n, float *slope) {
     for (uint32_t i = 0; i < n; i++) {
         slope[i] = 0.0f * x[i];

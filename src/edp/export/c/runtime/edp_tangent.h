@@ -47,6 +47,7 @@ void edp_slope_exp(const float *x, uint32_t n, float *slope);
 void edp_slope_sqrt(const float *x, uint32_t n, float *slope); /* infinite at 0 */
 void edp_slope_sine(const float *x, uint32_t n, float *slope);
 void edp_slope_cosine(const float *x, uint32_t n, float *slope);
+void edp_slope_log(const float *x, uint32_t n, float *slope);
 void edp_slope_positive(const float *x, uint32_t n, float *slope); /* 0 */
 
 /* ---- rows ------------------------------------------------------------------------------------------------------ */

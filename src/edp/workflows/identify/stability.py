@@ -1,0 +1,107 @@
+"""What the numbers of a fit are worth: how far parts of the logs, and free runs of other lengths, pull them apart.
+
+The information of a fit takes its errors for noise that is new at each tick. They are not: neighbouring ticks err
+alike, and so does a structure that is not the machine's, in every run of a length. So at the optimum each block of the
+logs and each length of the free runs says where it would go (one Gauss-Newton step), and the covariance is a sum::
+
+    A (sum_b g_b g_b') A + A + d d' / 4 + mean_l (e_l e_l')
+
+A is the inverse information with what was plausible before, g_b the gradient of block b about their mean (White, 1982,
+by clusters), d the difference of what two halves of the logs say, and e_l where free runs of length l alone would go. A
+structure that is wrong fits short and long runs by different numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.networks.twin.greybox import GreyTwin
+from edp.training.grey_fit import GreyProblem, Tie
+
+Doubles = NDArray[np.float64]
+LEAST_BLOCKS, MOST_BLOCKS = 6, 16
+"""Blocks of the logs: a spread over fewer says little, and more of them take time."""
+LENGTHS = 3
+"""Of the fit's last stages, from which free runs are drawn."""
+TICKS = 3000
+"""Of the free runs of a block and a length, about; a third of a second of a desktop core."""
+
+
+def covariance(twin: GreyTwin, tie: Tie, theta: Doubles, train: Sequence[Series], seed: int) -> Doubles:
+    """Covariance of the coordinates of a fit; that of the guess where the logs are too short to be divided.
+
+    Args:
+        twin: the grey box at the optimum.
+        tie: the coordinates.
+        theta: the optimum, in plausible deviations ``(coordinate,)``.
+        train: stretches that the fit has learned from.
+        seed: of the free runs.
+    """
+    rate, prefix = twin.channels.rate_hz, twin.prefix_ticks
+    lengths = sorted({max(1, round(length * rate)) for length in twin.spec.fit.lengths_s[-LENGTHS:]})
+    blocks = divided(train, prefix + lengths[-1] + 1)
+    size = len(theta)
+    if len(blocks) < 2:
+        return np.eye(size)
+    rng, shape = np.random.default_rng(seed), (len(lengths), len(blocks), size)
+    matrices, gradients = np.zeros((len(lengths), 2, size, size)), np.zeros(shape)
+    for b, block in enumerate(blocks):
+        problem = GreyProblem(twin, block, tie)
+        for k, ticks in enumerate(lengths):
+            drawn = problem.draw(ticks, max(4, min(TICKS, twin.spec.fit.ticks) // ticks), rng)
+            matrix, gradients[k, b], _ = problem.losses(theta, drawn, True)
+            matrices[k, b % 2] += matrix
+    return spread(theta, matrices, gradients)
+
+
+def spread(theta: Doubles, matrices: Doubles, gradients: Doubles) -> Doubles:
+    """The sum of four, see above.
+
+    Args:
+        theta: the optimum ``(coordinate,)``.
+        matrices: by length and by half of the blocks, even and odd ``(length, 2, coordinate, coordinate)``.
+        gradients: by length and by block ``(length, block, coordinate)``.
+    """
+    lengths, blocks, size = gradients.shape
+    prior = np.eye(size)
+
+    def moved(matrix: Doubles, gradient: Doubles, share: float) -> Doubles:
+        # A part of the logs stands for all of them: as much information, other numbers.
+        return np.asarray(np.linalg.solve(matrix / share + prior, gradient / share + theta))
+
+    inverse = np.linalg.inv(matrices.sum(axis=(0, 1)) + prior)
+    by_block = gradients.sum(axis=0)
+    centred = by_block - by_block.mean(axis=0)
+    sandwich = inverse @ (centred.T @ centred) @ inverse * blocks / (blocks - 1)
+    halves = [
+        moved(matrices[:, h].sum(axis=0), by_block[h::2].sum(axis=0), len(by_block[h::2]) / blocks) for h in range(2)
+    ]
+    apart = halves[0] - halves[1]
+    each = np.array([moved(matrices[k].sum(axis=0), gradients[k].sum(axis=0), 1.0 / lengths) for k in range(lengths)])
+    return np.asarray(sandwich + inverse + np.outer(apart, apart) / 4.0 + each.T @ each / lengths)
+
+
+def divided(train: Sequence[Series], least: int) -> list[list[Series]]:
+    """Stretches as `LEAST_BLOCKS` to `MOST_BLOCKS` groups, each with one of at least `least` ticks; fewer where the
+    logs are shorter.
+    """
+    usable = [part for part in train if part.samples >= least]
+    pieces = [piece for part in usable for piece in _cut(part, -(-LEAST_BLOCKS // len(usable)), least)]
+    count = min(len(pieces), MOST_BLOCKS)
+    return [pieces[b::count] for b in range(count)]
+
+
+def _cut(part: Series, pieces: int, least: int) -> list[Series]:
+    """A stretch in so many pieces, or as many as have `least` ticks each."""
+    count = max(1, min(pieces, part.samples // least))
+    edges = np.linspace(0, part.samples, count + 1).astype(int)
+    return [
+        replace(part, inputs=part.inputs[first:last], targets=part.targets[first:last])
+        for first, last in pairwise(edges)
+    ]
