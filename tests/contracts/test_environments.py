@@ -13,7 +13,7 @@ IDS = [f"edp/Excavator-{name}-v0" for name in machine_names()]
 
 def test_every_machine_has_a_name():
     register()
-    assert sorted(name for name in gymnasium.registry if name.startswith("edp/")) == sorted(IDS)
+    assert sorted(name for name in gymnasium.registry if name.startswith("edp/Excavator-")) == sorted(IDS)
 
 
 @pytest.mark.parametrize("name", IDS)

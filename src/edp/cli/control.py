@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
 
 TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
@@ -16,7 +17,10 @@ ControllerOption = Annotated[str, typer.Option("--controller", help="What moves 
 SeedsOption = Annotated[
     int | None, typer.Option("--seeds", min=1, help="Number of loops, each along a reference of its own; default: 6.")
 ]
-PlantOption = Annotated[Path | None, typer.Option("--plant", help="Run folder of a twin that is the plant instead.")]
+PlantOption = Annotated[
+    Path | None, typer.Option("--plant", help="Run folder of a twin, or an FMU (.fmu), that is the plant instead.")
+]
+YesOption = Annotated[bool, typer.Option("--yes", help="Run the native code of an FMU without confirmation.")]
 TwinOption = Annotated[Path | None, typer.Option("--twin", help="Run folder of a twin that the controller uses.")]
 PredictorOption = Annotated[
     Path | None, typer.Option("--predictor", help="Run folder of edp train that the controller uses.")
@@ -36,22 +40,24 @@ def control(
     predictor: PredictorOption = None,
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
+    yes: YesOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a controller in closed loop: scores, a recording a loop, and a page with paths, errors and levers.
 
-    The plant is the simulator, or a twin with --plant. Position errors are to the reference of the same time; the
-    distance to the path stands beside them.
+    The plant is the simulator, or with --plant a twin or an FMU, whose native code it asks about first. Position
+    errors are to the reference of the same time; the distance to the path stands beside them.
 
     Example: `edp control runs/grade --task grade --machine M22 --controller pi --seeds 6`
     """
     from edp.config.control import load_control_experiment
     from edp.workflows.control import ControlSources, control_loops
 
+    ask_for_fmus(yes, plant)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
     with progress(as_json) as shown:
         on_loop = counted(shown, Steps(as_json), "control", "loops run")
-        run = control_loops(experiment, folder, ControlSources(plant, twin, predictor), on_loop)
+        run = control_loops(experiment, folder, ControlSources(plant, twin, predictor, trusted=True), on_loop)
 
     def show() -> None:
         out.print(run.content["sentence"])
@@ -67,7 +73,7 @@ def tune(
     machine: MachineOption = "",
     controller: ControllerOption = "",
     seeds: SeedsOption = None,
-    on: Annotated[Path | None, typer.Option("--on", help="Run folder of a twin on which to tune.")] = None,
+    on: Annotated[Path | None, typer.Option("--on", help="Run folder of a twin, or an FMU, on which to tune.")] = None,
     plant: PlantOption = None,
     twin: TwinOption = None,
     predictor: PredictorOption = None,
@@ -75,9 +81,10 @@ def tune(
     loops: Annotated[int, typer.Option(min=1, help="References that each of them is run along.")] = 4,
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
+    yes: YesOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Tune a controller's gains on the simulator, or on a twin with --on, and judge them on the plant.
+    """Tune a controller's gains on the simulator, or with --on on a twin or FMU, and judge them on the plant.
 
     References of the tuning are never those of the judgement. The tuned settings are for `edp control --config`.
 
@@ -87,10 +94,11 @@ def tune(
     from edp.workflows.control import ControlSources, TuningSpec, tune_gains
     from edp.workflows.control.tune_gains import TUNED
 
+    ask_for_fmus(yes, on, plant)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
     with progress(as_json) as shown:
         on_trial = counted(shown, Steps(as_json), "tune", "trials run")
-        tuned_on, judged_on = (ControlSources(where, twin, predictor) for where in (on, plant))
+        tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (on, plant))
         tuning = tune_gains(experiment, folder, tuned_on, judged_on, TuningSpec(trials=trials, loops=loops), on_trial)
     judged = tuning.content["judged_mm"]
 

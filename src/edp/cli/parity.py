@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
 from edp.cli.train import MapOption, RepairOption, source_of
-from edp.errors import ConfigError
 
 if TYPE_CHECKING:
     from edp.workflows.parity import Row
@@ -83,13 +82,7 @@ def _ask(bundle: Path) -> None:
     """
     from edp.workflows.parity import WHAT
 
-    why = f"'{bundle}' is not the folder of a run of yours. {WHAT}"
-    # Without a person at the terminal nobody can agree.
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ConfigError(f"{why}. Give --yes if you trust its source; nothing was run")
-    err.print(f"{why}.")
-    if not typer.confirm("Go on?", err=True):
-        raise ConfigError("nothing was run")
+    ask(f"'{bundle}' is not the folder of a run of yours. {WHAT}")
 
 
 def _show(rows: list[Row], ticks: int) -> None:

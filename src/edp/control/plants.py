@@ -1,34 +1,65 @@
-"""Plants by one argument: the simulator, or a twin that was trained on recordings."""
+"""Plants by one argument: the simulator, a twin that was trained on recordings, or an FMU."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from edp.control.fmu.environment import FmuEnvironment
 from edp.control.twin_environment import TwinEnvironment
 from edp.errors import ConfigError
+from edp.networks.twin import Twin
 from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
 from edp.training.twin_bundle import load_twin
 
+FMU = ".fmu"
 
-def plant_of(machine: str, duration_s: float, rate_hz: float, twin: str | Path | None = None) -> Any:
+
+def is_fmu(plant: str | Path) -> bool:
+    """Whether a plant is an FMU, by the ending of its file."""
+    return Path(plant).suffix.lower() == FMU
+
+
+def plant_of(
+    machine: str, duration_s: float, rate_hz: float, plant: str | Path | None = None, trusted: bool = False
+) -> Any:
     """An environment in which a controller can be run.
 
     Args:
-        machine: name of a machine, or path of a machine file: simulated, or the kinematics of a twin.
+        machine: name of a machine, or path of a machine file: simulated, or the kinematics of another plant.
         duration_s: longest loop.
         rate_hz: ticks per second.
-        twin: run folder of a twin that takes the simulator's place.
+        plant: run folder of a twin, or an FMU, that takes the simulator's place.
+        trusted: an FMU is native code that runs with the rights of this process; it is not loaded without this.
 
     Raises:
-        ConfigError: gymnasium is not installed, or the twin is of another rate or machine.
+        EdpError: gymnasium is not installed, or the plant cannot be used, or is of another rate or machine.
     """
-    if twin is None:
+    if plant is None:
         return ExcavatorEnv(EnvironmentSpec(machine=machine, duration_s=duration_s, rate_hz=rate_hz))
-    plant = load_twin(twin).twin
-    if plant.channels.rate_hz != rate_hz:
-        raise ConfigError(
-            f"twin '{twin}' has {plant.channels.rate_hz:g} Hz, the loops {rate_hz:g} Hz; set rate_hz = "
-            f"{plant.channels.rate_hz:g}"
-        )
-    return TwinEnvironment(plant, machine, duration_s)
+    if is_fmu(plant):
+        if not trusted:
+            raise ConfigError(f"FMU '{plant}' is native code, which runs with your rights; pass trusted=True if you do")
+        return FmuEnvironment(plant, machine, duration_s, rate_hz)
+    return TwinEnvironment(twin_of(plant, rate_hz), machine, duration_s)
+
+
+def twin_of(run: str | Path, rate_hz: float) -> Twin:
+    """The twin of a run folder.
+
+    Raises:
+        EdpError: there is none, or it is of another rate.
+    """
+    return of_rate(load_twin(run).twin, f"twin '{run}'", rate_hz)
+
+
+def of_rate(twin: Twin, what: str, rate_hz: float) -> Twin:
+    """A twin of a rate.
+
+    Raises:
+        ConfigError: it has another one.
+    """
+    own = twin.channels.rate_hz
+    if own != rate_hz:
+        raise ConfigError(f"{what} has {own:g} Hz, the loops {rate_hz:g} Hz; set rate_hz = {own:g}")
+    return twin

@@ -8,19 +8,57 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.control.geometry import AXES, TipGeometry
-from edp.control.plant import PILOTS, STROKES, VELOCITIES
+from edp.control.plant import PILOTS, STROKES
+from edp.control.rest import RestingMachine, check_plant_channels
 from edp.errors import ConfigError, closest
-from edp.networks.twin import Twin
+from edp.networks.twin import Twin, TwinState
 from edp.signals import Channel
-from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
 from edp.sim.environment.library import gymnasium
-from edp.sim.machine.machine_files import load_machine
 
 Array = NDArray[np.float64]
 OPTIONS = ("strokes", "material")
 """Options of a reset; a twin knows no soil, so that ``material`` must be empty."""
 MIDDLE = (0.5, 0.5, 0.5)
 TIP = ("TipX", "TipY", "TipAngle")
+
+
+class TwinStart:
+    """How a twin becomes a plant: its channels, how levers command it, and how it begins.
+
+    Args:
+        twin: of an excavator, with the channels of Table A.1 and strokes.
+        machine: name or file of the machine whose kinematics, nominal commands and pressures at rest are used.
+
+    Attributes:
+        channels: of a row: answers, then commands.
+        machine: its numbers.
+        commands: nominal pilot pressures of levers.
+        strokes: columns of the strokes in a row.
+
+    Raises:
+        ConfigError: the twin has no strokes, or channels that no excavator has.
+    """
+
+    def __init__(self, twin: Twin, machine: str) -> None:
+        channels, self._twin = twin.channels, twin
+        answers, commands = ([channel.name for channel in part] for part in (channels.answers, channels.commands))
+        check_plant_channels("the twin", commands, answers, "train it on such recordings")
+        self.channels: tuple[Channel, ...] = (*channels.answers, *channels.commands)
+        self.strokes = np.array([answers.index(name) for name in STROKES])
+        self._answers, self._columns = len(answers), np.array([PILOTS.index(name) for name in commands])
+        self._rest = RestingMachine(machine, (*answers, *commands), channels.rate_hz, twin.prefix_ticks)
+        self.machine, self.commands = self._rest.machine, self._rest.commands
+
+    def begin(self, shares: Any) -> tuple[TwinState, NDArray[np.float32]]:
+        """State of a batch of one at rest at strokes (shares of full), and its row."""
+        rows = self._rest.rows(shares)
+        state = self._twin.reset(rows[None, :-1, self._answers :], rows[None, :-1, : self._answers])
+        return state, rows[-1]
+
+    def pilots(self, levers: Array) -> NDArray[np.float32]:
+        """Commands of the twin, shape (..., command), of levers, shape (..., 3)."""
+        pressures = self.commands(np.clip(levers, -1.0, 1.0))
+        return np.asarray(pressures[..., self._columns], np.float32)
 
 
 class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -48,36 +86,15 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     source = "the twin"
 
     def __init__(self, twin: Twin, machine: str, duration_s: float = 60.0) -> None:
-        channels = twin.channels
-        names = [channel.name for channel in (*channels.commands, *channels.answers)]
-        lacking = [name for name in (*STROKES, *VELOCITIES) if name not in names]
-        strange = [channel.name for channel in channels.commands if channel.name not in PILOTS]
-        if lacking or strange:
-            what = f"has no {lacking[0]}" if lacking else f"is commanded by '{strange[0]}'{closest(strange[0], PILOTS)}"
-            raise ConfigError(
-                f"the twin {what}; a plant in closed loop answers the velocities and strokes of an excavator to the "
-                "pilot pressures of Table A.1: train it on such recordings"
-            )
-        self.twin, self.machine = twin, load_machine(machine)
-        self.rate_hz, self.render_mode = channels.rate_hz, None
-        self.channels: tuple[Channel, ...] = (*channels.answers, *channels.commands)
+        self._start = TwinStart(twin, machine)
+        self.twin, self.machine, self.commands = twin, self._start.machine, self._start.commands
+        self.rate_hz, self.render_mode = twin.channels.rate_hz, None
+        self.channels = self._start.channels
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(self.channels),), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (AXES,), np.float32)
         self._geometry = TipGeometry(self.machine)
-        self._command_columns = np.array([PILOTS.index(channel.name) for channel in channels.commands])
-        self._stroke_columns = np.array([[c.name for c in channels.answers].index(name) for name in STROKES])
-        self._ticks, self._tick = round(duration_s * channels.rate_hz), 0
+        self._ticks, self._tick = round(duration_s * self.rate_hz), 0
         self._state: Any = None
-        self._rest = ExcavatorEnv(
-            EnvironmentSpec(
-                machine=machine,
-                duration_s=(twin.prefix_ticks + 2) / self.rate_hz,
-                rate_hz=self.rate_hz,
-                sensor_noise=False,
-                observed=tuple(channel.name for channel in self.channels),
-            )
-        )
-        self.commands = self._rest.commands
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -96,13 +113,10 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         for name in chosen:
             if name not in OPTIONS:
                 raise ConfigError(f"reset of a twin: option '{name}' is unknown{closest(name, OPTIONS)}")
-        if chosen.get("material"):
-            raise ConfigError(f"reset: material = '{chosen['material']}'; a twin knows no soil: choose another task")
-        rows = self._prefix(chosen.get("strokes") or MIDDLE)
-        answers, commands = rows[:, : len(self.twin.channels.answers)], rows[:, len(self.twin.channels.answers) :]
-        self._state = self.twin.reset(commands[None, :-1], answers[None, :-1])
+        check_air(chosen.get("material"))
+        self._state, row = self._start.begin(chosen.get("strokes") or MIDDLE)
         self._tick = 0
-        return self._shown(answers[-1], commands[-1])
+        return row, self._info(row)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Hold lever positions, shape (3,), for one tick.
@@ -115,23 +129,25 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ConfigError(f"levers {levers.tolist()}; give three finite positions: boom, arm and bucket")
         if self._state is None:
             raise ConfigError("the environment has no episode under way; call reset() before step()")
-        command = self.commands(np.clip(levers, -1.0, 1.0))[self._command_columns].astype(np.float32)
+        command = self._start.pilots(levers)
         answer, self._state = self.twin.step(command[None], self._state)
         self._tick += 1
-        observation, info = self._shown(answer[0], command)
-        return observation, 0.0, False, self._tick >= self._ticks, info
+        row = np.concatenate([answer[0], command]).astype(np.float32)
+        return row, 0.0, False, self._tick >= self._ticks, self._info(row)
 
-    def _prefix(self, shares: Any) -> NDArray[np.float32]:
-        """What the machine shows at rest, a row a tick: answers, then commands; one more row than the prefix."""
-        options = {"strokes": tuple(map(float, shares))}
-        rows = [self._rest.reset(seed=0, options=options)[0]]
-        rows += [self._rest.step(np.zeros(AXES))[0] for _ in range(self.twin.prefix_ticks)]
-        return np.array(rows, np.float32)
-
-    def _shown(
-        self, answer: NDArray[np.float32], command: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        strokes = answer[self._stroke_columns].astype(float)
+    def _info(self, row: NDArray[np.float32]) -> dict[str, Any]:
+        strokes = row[self._start.strokes].astype(float)
         tip = self._geometry.tip(strokes)
-        truth = dict(zip((*STROKES, *TIP), (*strokes.tolist(), *tip.tolist()), strict=True))
-        return np.concatenate([answer, command]).astype(np.float32), {"truth": truth}
+        return {"truth": dict(zip((*STROKES, *TIP), (*strokes.tolist(), *tip.tolist()), strict=True))}
+
+
+def check_air(material: Any, what: str = "a twin") -> None:
+    """Refuse a soil where a plant knows none.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if material:
+        raise ConfigError(
+            f"reset: material = '{material}'; {what} knows no soil: choose another task, or material = ''"
+        )

@@ -1,5 +1,6 @@
 """Closed loops: a controller on a plant along tasks, with a page; gains tuned on one plant and judged on another."""
 
+from edp.control.plants import is_fmu as is_fmu
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.control.export_controller import export_controller
 from edp.workflows.control.run_control import ControlRun, control_loops

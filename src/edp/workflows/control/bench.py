@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,17 @@ class ControlSources:
     """Run folders that closed loops read; None for none.
 
     Attributes:
-        plant: of a twin that takes the place of the simulator.
+        plant: of a twin, or an FMU, that takes the place of the simulator.
         twin: of a twin that the controller uses.
         predictor: of a look-ahead predictor that the controller uses.
+        trusted: whether the native code of an FMU may run here with the rights of this process.
     """
 
     plant: Path | None = None
     twin: Path | None = None
     predictor: Path | None = None
+    # Not a setting of the run: it decides whether there is one.
+    trusted: bool = field(default=False, repr=False)
 
 
 class ControlBench:
@@ -64,13 +67,13 @@ class ControlBench:
     ) -> None:
         self.experiment, self._options = experiment, options
         rate = experiment.rate_hz
-        probe = plant_of(experiment.machine, RUN_S + 1.0, rate, sources.plant)
+        probe = plant_of(experiment.machine, RUN_S + 1.0, rate, sources.plant, sources.trusted)
         geometry = interface_of(probe).geometry
         seeds = range(experiment.seed, experiment.seed + experiment.loops)
         self.tasks = [draw_task(experiment.task, geometry, rate, seed) for seed in seeds]
         # A loop steps the plant after its last row, too.
         longest = (max(task.reference.ticks for task in self.tasks) + 1) / rate
-        self._env = plant_of(experiment.machine, longest, rate, sources.plant)
+        self._env = plant_of(experiment.machine, longest, rate, sources.plant, sources.trusted)
         self.plant = interface_of(self._env)
         self.models = models or self._commissioned(probe, sources)
 

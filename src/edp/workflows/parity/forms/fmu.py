@@ -73,9 +73,9 @@ class Fmu:
 
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""
-        for package, extra in (("fmpy", "dev"), ("ziglang", "fmu")):
+        for package in ("fmpy", "ziglang"):
             if importlib.util.find_spec(package) is None:
-                raise Missing(f"needs the package {package}: pip install 'excavator-dynamics-predictor[{extra}]'")
+                raise Missing(f"needs the package {package}: pip install 'excavator-dynamics-predictor[fmu]'")
         runs = []
         for version, file in zip((2, 3), FmuTarget(binaries="linux64").write(case.bundle, NAME, folder), strict=True):
             try:

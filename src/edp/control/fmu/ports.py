@@ -1,0 +1,119 @@
+"""Which variables of an FMU are the commands, answers and start of an excavator, by their names and units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from edp.control.fmu.archive import plain
+from edp.control.fmu.description import FmuDescription, FmuVariable
+from edp.control.plant import PILOTS, STROKES
+from edp.control.rest import check_plant_channels
+from edp.errors import DataError
+from edp.networks.twin.plant import FLAG
+from edp.signals import VOCABULARY, Channel
+
+AHEAD = "_ahead_1"
+"""Behind the name of an answer one tick after the inputs, as exported twins write it."""
+START = "_start"
+"""Behind the name of a stroke, for a parameter that holds it at the start."""
+BASES: Mapping[str, Mapping[str, float]] = {
+    "Pa": {"kg": 1, "m": -1, "s": -2},
+    "m": {"m": 1},
+    "m/s": {"m": 1, "s": -1},
+    "m/s^2": {"m": 1, "s": -2},
+    "rad": {"rad": 1},
+    "rad/s": {"rad": 1, "s": -1},
+}
+"""Exponents of units that may have another name in an FMU, such as N/m2."""
+
+
+@dataclass(frozen=True, eq=False)
+class FmuPorts:
+    """Value references of an FMU as a plant.
+
+    Attributes:
+        commands: pilot pressures that it reads.
+        answers: channels that it gives.
+        inputs: of the commands.
+        outputs: of the answers.
+        measured: inputs that take a measured value of each answer, and their flags; empty where it has none.
+        starts: parameters of the strokes at the start; empty where it has none.
+    """
+
+    commands: tuple[Channel, ...]
+    answers: tuple[Channel, ...]
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+    measured: tuple[tuple[int, ...], tuple[int, ...]]
+    starts: tuple[int, ...]
+
+
+def ports_of(description: FmuDescription, where: str) -> FmuPorts:
+    """The ports of an FMU.
+
+    Args:
+        description: of it.
+        where: the FMU, for messages.
+
+    Raises:
+        ConfigError: it is no excavator of Table A.1.
+        DataError: a variable has another unit or type.
+    """
+    variables = description.variables
+    inputs = {name: entry for name, entry in variables.items() if entry.causality == "input"}
+    outputs = {name: entry for name, entry in variables.items() if entry.causality == "output"}
+    # In the order of the FMU, which for exported twins is that of the twin.
+    plain_names = {name: name if name in VOCABULARY else name.removesuffix(AHEAD) for name in outputs}
+    answers = {VOCABULARY[name]: outputs[own] for own, name in plain_names.items() if name in VOCABULARY}
+    names = [channel.name for channel in answers]
+    commands = {VOCABULARY[name]: inputs[name] for name in PILOTS if name in inputs}
+    change = "give an FMU with variables of these names, such as edp export makes of a twin"
+    # Without any pilot pressure the first input is the one to complain of; commands of soil or load are left alone.
+    strange = [] if commands else [plain(name) for name in inputs][:1] or ["nothing"]
+    check_plant_channels(where, [*strange, *(channel.name for channel in commands)], names, change)
+    ports = [(inputs.get(name), inputs.get(name + FLAG)) for name in names]
+    starts = [variables.get(name + START) for name in STROKES]
+    measured = [(value, flag) for value, flag in ports if value is not None and flag is not None]
+    for channel, entry in (*commands.items(), *answers.items()):
+        _check_unit(channel, entry, where)
+    for channel, (value, _) in zip(answers, measured if len(measured) == len(answers) else (), strict=False):
+        _check_unit(channel, value, where)
+    for name, start in zip(STROKES, starts, strict=True):
+        if start is not None:
+            _check_unit(VOCABULARY[name], start, where)
+    fed = len(measured) == len(answers)
+    return FmuPorts(
+        tuple(commands),
+        tuple(answers),
+        tuple(entry.reference for entry in commands.values()),
+        tuple(entry.reference for entry in answers.values()),
+        (
+            tuple(value.reference for value, _ in measured if fed),
+            tuple(flag.reference for _, flag in measured if fed),
+        ),
+        tuple(start.reference for start in starts if start is not None) if all(starts) else (),
+    )
+
+
+def _check_unit(channel: Channel, entry: FmuVariable, where: str) -> None:
+    """Refuse a variable that is no real number in the SI unit of its channel.
+
+    Raises:
+        DataError: it is not.
+    """
+    if not entry.real:
+        raise DataError(
+            f"{where}: variable '{plain(entry.name)}' is no real number of double precision; export it as one"
+        )
+    bases, expected = entry.bases, BASES.get(channel.unit)
+    same = entry.unit in ("", channel.unit)
+    if bases is not None:
+        same = bases["factor"] == 1.0 and bases["offset"] == 0.0
+        powers = {name: power for name, power in bases.items() if power and name not in ("factor", "offset")}
+        same = same and (powers == expected if expected is not None else entry.unit == channel.unit)
+    if not same:
+        raise DataError(
+            f"{where}: variable '{plain(entry.name)}' is in {plain(entry.unit)}; {channel.unit} must hold: export "
+            "it in SI units"
+        )

@@ -1,0 +1,142 @@
+"""What a policy sees: measured channels, errors, the reference ahead, and levers, in numbers of about one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.geometry import AXES
+from edp.control.learning.spec import LearningSpec
+from edp.control.plant import STROKES, PlantInterface
+from edp.control.reference import TipReference
+from edp.signals import KINDS, Channel, Kind
+
+Array = NDArray[np.float64]
+SCALES = {Kind.VELOCITY: 0.1, Kind.PRESSURE: 10e6}
+"""SI values that become one: usual speeds of grading, usual pressures. Other kinds: their largest plausible value."""
+STROKE_M, TIP_M, ATTITUDE_RAD, SPEED_M_S = 0.02, 0.05, 0.05, 0.2
+"""Errors and reference speeds that become one; errors of a good loop are a tenth of these."""
+MOST = 10.0
+"""Features are cut to this; what is ten times as large as usual says no more."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceNow:
+    """A reference as a policy sees it at a tick, a row a lane.
+
+    Attributes:
+        strokes: now, m, shape (lanes, 3).
+        tip: now: x, y (m), attitude (rad), shape (lanes, 3).
+        ahead: stroke velocities now and later, m/s, shape (lanes, previews, 3).
+    """
+
+    strokes: Array
+    tip: Array
+    ahead: Array
+
+
+class TaskFeatures:
+    """Builds observations; the same for an environment and for a controller.
+
+    Args:
+        spec: of the task.
+        plant: as a controller sees it.
+
+    Attributes:
+        names: of the values, in their order.
+        reads: channels that are read.
+        preview: ticks ahead of which the reference is shown.
+        depth: how many past levers must be remembered.
+
+    Raises:
+        ConfigError: the plant does not measure one of the channels.
+    """
+
+    def __init__(self, spec: LearningSpec, plant: PlantInterface) -> None:
+        self.reads = tuple(dict.fromkeys((*spec.observed, *STROKES)))
+        channels = [plant.channels[column] for column in plant.columns(self.reads)]
+        self._geometry = plant.geometry
+        self._shown = np.array([self.reads.index(name) for name in spec.observed], dtype=np.int64)
+        self._strokes = np.array([self.reads.index(name) for name in STROKES])
+        pairs = [self._scale(channel) for channel in channels]
+        self._offset, self._width = np.array(pairs).T
+        self.preview = np.array([round(ahead * spec.rate_hz) for ahead in spec.preview_s], dtype=np.int64)
+        # Now is row 0: the levers of the last tick.
+        self._past = np.array([0, *(round(ago * spec.rate_hz) for ago in spec.past_s)], dtype=np.int64)
+        self.depth = int(self._past.max()) + 1
+        axes = ("boom", "arm", "bucket")
+        names = [*spec.observed, *(f"error of {name}" for name in (*STROKES, "TipX", "TipY", "TipAngle"))]
+        names += [f"reference speed of {axis} in {ticks} ticks" for ticks in self.preview for axis in axes]
+        names += [f"{axis} lever {ticks + 1} ticks ago" for ticks in self._past for axis in axes]
+        self._with_base = bool(spec.base)
+        self.names = (*names, *(f"{axis} lever of {spec.base}" for axis in axes if spec.base))
+
+    def _scale(self, channel: Channel) -> tuple[float, float]:
+        """Offset and width by which a channel becomes about one."""
+        if channel.name in STROKES:
+            half = 0.5 * float(self._geometry.full_m[STROKES.index(channel.name)])
+            return half, half
+        return 0.0, SCALES.get(channel.kind, float(np.abs(KINDS[channel.kind].plausible).max()))
+
+    def values(self, measured: Array, now: ReferenceNow, levers: Array, base: Array) -> NDArray[np.float32]:
+        """The observation of each lane, shape (lanes, value).
+
+        Args:
+            measured: channels of `reads`, SI units, shape (lanes, channel).
+            now: the reference.
+            levers: those of the last ticks, the latest first, shape (lanes, depth, 3).
+            base: those of the base controller for this tick, shape (lanes, 3); not read without one.
+        """
+        lanes = len(measured)
+        strokes = measured[:, self._strokes]
+        tip = now.tip - self._geometry.tip(strokes)
+        parts = [
+            ((measured - self._offset) / self._width)[:, self._shown],
+            (now.strokes - strokes) / STROKE_M,
+            tip[:, :2] / TIP_M,
+            # The difference of two angles, whatever turn they are counted in.
+            np.arctan2(np.sin(tip[:, 2:]), np.cos(tip[:, 2:])) / ATTITUDE_RAD,
+            now.ahead.reshape(lanes, -1) / SPEED_M_S,
+            levers[:, self._past].reshape(lanes, -1),
+        ]
+        if self._with_base:
+            parts.append(base)
+        return np.asarray(np.clip(np.concatenate(parts, axis=1), -MOST, MOST), np.float32)
+
+
+class ReferenceRows:
+    """References of some lanes as arrays, so that a tick of all of them is one look-up.
+
+    Args:
+        lanes: how many.
+        ticks: most ticks of an episode.
+        preview: ticks ahead that are looked up.
+    """
+
+    def __init__(self, lanes: int, ticks: int, preview: NDArray[np.int64]) -> None:
+        self._preview, self._lane = preview, np.arange(lanes)
+        rows = ticks + int(preview.max(initial=0)) + 1
+        self._strokes, self._tip, self._speeds = (np.zeros((lanes, rows, AXES)) for _ in range(3))
+        self._judged = np.zeros((lanes, rows), dtype=np.bool_)
+
+    def put(self, lane: int, reference: TipReference) -> None:
+        """Lay a reference into a lane; beyond its end it stands still."""
+        rows = reference.rows(0, self._strokes.shape[1])
+        self._strokes[lane], self._tip[lane] = reference.strokes[rows], reference.tip[rows]
+        self._speeds[lane], self._judged[lane] = reference.speeds()[rows], reference.judged[rows]
+
+    def now(self, ticks: NDArray[np.int64]) -> ReferenceNow:
+        """Rows of each lane at its tick, shape (lanes,)."""
+        ahead = self._speeds[self._lane[:, None], ticks[:, None] + self._preview]
+        return ReferenceNow(self._strokes[self._lane, ticks], self._tip[self._lane, ticks], ahead)
+
+    def judged(self, ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether each lane's tick counts, shape (lanes,)."""
+        return self._judged[self._lane, ticks]
+
+
+def remembered(levers: Array, applied: Array) -> Array:
+    """Past levers, the latest first, shape (lanes, depth, 3), with those of a tick, shape (lanes, 3), before them."""
+    return np.concatenate([applied[:, None], levers[:, :-1]], axis=1)
