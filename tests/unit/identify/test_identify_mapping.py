@@ -28,7 +28,7 @@ from edp.workflows.identify.elements import check_strokes, excavator_elements, f
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS, guesses, with_values
 from edp.workflows.identify.machine_text import machine_text
 from edp.workflows.identify.mapping import GreyParts, grey_numbers
-from edp.workflows.identify.tie import CUSHIONS, MachineTie, coordinates, kept_back, nearest
+from edp.workflows.identify.tie import CUSHIONS, MachineTie, coordinates, deviations, kept_back, nearest
 
 M22 = load_machine("M22")
 PILOTS = ("BmUp", "BmDwn", "AmIn", "AmOut", "BktIn", "BktOut")
@@ -90,6 +90,7 @@ def test_a_number_set_back_moves_those_that_make_up_for_it():
     moved = kept_back(theta, information, np.array([False, True]))
     # What matters is the sum, which the first one now gives alone, but for what was thought before.
     assert moved == pytest.approx([0.5 + 49.0 / 51.0 * -0.5, 0.0])
+    assert deviations(np.diag([0.0, 99.0])) == pytest.approx([1.0, 0.1])
 
 
 def test_opening_curves_and_areas_are_those_of_the_simulator(parts):
