@@ -57,12 +57,12 @@ def main() -> None:
             order = SimulationOrder(machine=name, minutes=minutes, recordings=recordings, seed=seed + 1)
             simulate_data_set(source, order, workers=1)
             truth = load_machine(name)
-            write_bytes(folder / "measured.toml", machine_text(measured(truth), [], {}).encode())
+            write_bytes(folder / f"{name}_measured.toml", machine_text(measured(truth), [], {}).encode())
             began = time.process_time()
             result = identify(
                 DataSource.of(source),
-                folder / "found.toml",
-                str(folder / "measured.toml"),
+                folder / f"{name}_found.toml",
+                str(folder / f"{name}_measured.toml"),
                 load_twin_experiment(None, ["twin.kind=greybox", *changes]),
                 on_event=lambda e: print(f"round {e.update}/{e.updates}, validation {e.validation:.4f}", flush=True),
             )

@@ -38,7 +38,7 @@ from edp.workflows.identify.machine_text import machine_text
 from edp.workflows.identify.mapping import GreyParts
 from edp.workflows.identify.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
 from edp.workflows.identify.stability import covariance
-from edp.workflows.identify.tie import MachineTie, kept_back, nearest
+from edp.workflows.identify.tie import MachineTie, deviations, kept_back, nearest
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 Doubles = NDArray[np.float64]
@@ -261,7 +261,8 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     """The machine of the coordinates, those that the logs do not tell set back to the guess; and a row of each."""
     twin, tie, theta, information = fit.twin, fit.tie, fit.theta, fit.information
     count, left = len(MACHINE_NUMBERS), np.sqrt(np.diag(spread))
-    excited = left[:count] < UNEXCITED
+    # What the fit had no information of; a number that is told badly stays where the others made up for it.
+    excited = deviations(information)[:count] < UNEXCITED
     back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
     final = replace(tie, free=excited)
     settled = kept_back(theta, information, back)

@@ -155,6 +155,11 @@ def nearest(tie: MachineTie, numbers: Doubles, information: Doubles, prior: floa
     return theta
 
 
+def deviations(information: Doubles) -> Doubles:
+    """Deviations that the data leave of coordinates whose plausible ones are 1, if errors were new at each tick."""
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(information))))))
+
+
 def kept_back(theta: Doubles, information: Doubles, back: NDArray[np.bool_]) -> Doubles:
     """Where the other coordinates go once some are set back to the guess: the conditional optimum of the quadratic.
 
