@@ -121,8 +121,8 @@ def _tree(content: bytes, where: str) -> ET.Element:
         depth[0], count[0] = depth[0] + 1, count[0] + 1
         if depth[0] > DEEPEST or count[0] > MOST_ELEMENTS:
             raise DataError(
-                f"{where}: elements of {DESCRIPTION} are more than {DEEPEST} deep or {MOST_ELEMENTS:,}; do not use this "
-                "file"
+                f"{where}: elements of {DESCRIPTION} are more than {DEEPEST} deep or {MOST_ELEMENTS:,}; do not use "
+                "this file"
             )
         builder.start(tag, attributes)
 
