@@ -9,10 +9,12 @@ import struct
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from edp.control.fmu.archive import MOST_ENTRIES, MOST_XML, FmuArchive
-from edp.control.fmu.description import MOST_VARIABLES, read_description
+from edp.control.fmu.description import MOST_ELEMENTS, MOST_VARIABLES, read_description
+from edp.control.fmu.ports import ports_of
 from edp.control.plants import plant_of
 from edp.errors import ConfigError, DataError
 
@@ -302,3 +304,37 @@ def test_the_archive_reads_what_it_says(tmp_path):
     assert (tmp_path / "out/resources/a").read_bytes() == b"1"
     assert not (tmp_path / "out/binaries").exists()
     assert io.BytesIO(path.read_bytes()).getvalue()[:2] == b"PK"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damage_anywhere_ends_in_one_of_our_errors_or_in_a_sound_description(tmp_path, seed):
+    rng, texts = np.random.default_rng(seed), []
+    sound = whole(tmp_path, resources__a=b"1" * 100, binaries__linux64__plant_so=b"2" * 100).read_bytes()
+    path = tmp_path / "damaged.fmu"
+    for _ in range(60):
+        raw = bytearray(sound)
+        for at in rng.integers(0, len(raw), rng.integers(1, 8)):
+            raw[at] = rng.integers(256)
+        path.write_bytes(raw)
+        try:
+            archive = FmuArchive(path)
+            ports_of(read_description(archive.description(), "a test"), "a test")
+            archive.unpack(tmp_path / "out", ("resources", "binaries"))
+        except (ConfigError, DataError) as error:
+            texts.append(str(error))
+    xml = described()
+    for _ in range(200):
+        raw = bytearray(xml)
+        for at in rng.integers(0, len(raw), rng.integers(1, 5)):
+            raw[at] = rng.integers(256)
+        try:
+            ports_of(read_description(bytes(raw), "a test"), "a test")
+        except (ConfigError, DataError) as error:
+            texts.append(str(error))
+    assert texts
+    assert all(text.isprintable() for text in texts)
+
+
+def test_a_description_of_elements_without_end_is_refused():
+    with pytest.raises(DataError, match="elements"):
+        read_description(b"<a>" + b"<b/>" * (MOST_ELEMENTS + 1) + b"</a>", "a test")

@@ -96,7 +96,7 @@ class RunFolder:
             if stored_identity["key"] != key:
                 raise StorageError(
                     f"run folder '{self.path}' holds another run (other settings, data or version); nothing was "
-                    "changed. Choose another folder with --out, or remove this one"
+                    "changed. Choose another folder, or remove this one"
                 )
             return True
         # Settings before the identity: a kill between the two leaves a folder that is not bound yet.

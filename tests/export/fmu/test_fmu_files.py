@@ -18,7 +18,7 @@ from edp.export.fmu.units import BASES, shown
 from edp.export.golden import random_inputs, tolerance
 from edp.signals import KINDS, Kind
 
-fmpy = pytest.importorskip("fmpy", reason="needs FMPy: pip install 'excavator-dynamics-predictor[dev]'")
+fmpy = pytest.importorskip("fmpy", reason="needs FMPy: pip install 'excavator-dynamics-predictor[fmu]'")
 from fmpy.fmi1 import FMICallException  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 

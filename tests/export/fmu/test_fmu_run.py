@@ -14,7 +14,7 @@ from edp.export.c.model import HOLD_TICKS
 from edp.export.golden import random_inputs
 from edp.networks.input_range import usual_range
 
-fmpy = pytest.importorskip("fmpy", reason="needs FMPy: pip install 'excavator-dynamics-predictor[dev]'")
+fmpy = pytest.importorskip("fmpy", reason="needs FMPy: pip install 'excavator-dynamics-predictor[fmu]'")
 from fmpy.fmi1 import FMICallException  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 

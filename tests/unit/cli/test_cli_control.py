@@ -109,3 +109,27 @@ def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):
     assert ended.code == 1
     assert "another run" in ended.err
     assert (run / "results.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--set", "task.length_m=[30,40]"),
+        ("--plant", "nowhere"),
+        ("--plant", "nowhere.fmu", "--yes"),
+        ("--controller", "inversion"),
+        ("--machine", "C15"),
+    ],
+)
+@pytest.mark.parametrize("command", ["control", "tune"])
+def test_what_was_refused_does_not_keep_the_corrected_command_out_of_its_folder(edp, tmp_path, command, words):
+    run = tmp_path / "run"
+    assert edp(command, run, "--seeds", 1, *words).code == 1
+    assert not run.exists()
+
+
+def test_a_table_of_scores_fits_into_a_usual_terminal(edp, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE)
+    assert "\u2026" not in ended.out
+    assert "path, mm" in ended.out

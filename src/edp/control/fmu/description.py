@@ -17,6 +17,8 @@ from edp.control.fmu.archive import DESCRIPTION, plain
 from edp.errors import DataError
 
 MOST_VARIABLES = 100_000
+MOST_ELEMENTS = 1_000_000
+"""Each takes some 200 bytes of memory, and four bytes of the file suffice for one."""
 DEEPEST = 50
 """Of elements; those of the standard reach 6, annotations of tools somewhat more."""
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
@@ -113,12 +115,15 @@ def _tree(content: bytes, where: str) -> ET.Element:
     Raises:
         DataError: it is not well-formed, has a document type, or is too deep.
     """
-    builder, parser, depth = ET.TreeBuilder(), expat.ParserCreate(), [0]
+    builder, parser, depth, count = ET.TreeBuilder(), expat.ParserCreate(), [0], [0]
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
-        depth[0] += 1
-        if depth[0] > DEEPEST:
-            raise DataError(f"{where}: elements of {DESCRIPTION} are more than {DEEPEST} deep; do not use this file")
+        depth[0], count[0] = depth[0] + 1, count[0] + 1
+        if depth[0] > DEEPEST or count[0] > MOST_ELEMENTS:
+            raise DataError(
+                f"{where}: elements of {DESCRIPTION} are more than {DEEPEST} deep or {MOST_ELEMENTS:,}; do not use "
+                "this file"
+            )
         builder.start(tag, attributes)
 
     def end(tag: str) -> None:

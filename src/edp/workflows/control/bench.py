@@ -107,6 +107,14 @@ class ControlBench:
             results.append(run_loop(self._env, controller, task, task.seed, self._options))
         return results
 
+    def check(self) -> None:
+        """Build the controller of the experiment, for its refusal only.
+
+        Raises:
+            ConfigError: plant and controller do not fit, or a model is missing.
+        """
+        self.experiment.controller.build(self._interface, self.tasks[0].limits, self.models)
+
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""
         return float(np.mean([result.score.position_rms_mm for result in self.results(spec)]))

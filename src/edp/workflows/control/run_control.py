@@ -59,10 +59,12 @@ def control_loops(
         EdpError: settings, models or folder cannot be used.
     """
     chosen = sources or ControlSources()
+    # Before the folder is claimed: a reference or plant that is refused must not keep the corrected command out.
+    bench = ControlBench(experiment, chosen)
+    bench.check()
     with RunFolder(out) as run:
         run.claim(run_key(CONTROL_SETTINGS.plain(experiment), repr(chosen)), control_toml(experiment))
         run.write_status("running")
-        bench = ControlBench(experiment, chosen)
         results = bench.results(on_loop=on_loop)
         folder = make_folder(run.file(LOOPS))
         for result in results:

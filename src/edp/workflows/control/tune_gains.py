@@ -88,10 +88,14 @@ def tune_gains(
             f"seed = {experiment.seed}: references from {TUNING_SEED} on are for tuning; choose lower ones"
         )
     key = run_key(CONTROL_SETTINGS.plain(experiment), repr((tuned_on, judged_on, chosen)))
+    # Both before the first trial, and before the folder is claimed: what is refused is refused at once.
+    bench = ControlBench(replace(experiment, seed=TUNING_SEED, loops=chosen.loops), tuned_on)
+    judge = ControlBench(experiment, judged_on)
+    bench.check()
+    judge.check()
     with RunFolder(out) as run:
         run.claim(key, control_toml(experiment))
         run.write_status("running")
-        bench = ControlBench(replace(experiment, seed=TUNING_SEED, loops=chosen.loops), tuned_on)
         study = Study(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )
@@ -107,7 +111,6 @@ def tune_gains(
             study.tell(trial.number, [cost])
             best = spec if not rows or cost < min(row["cost_mm"] for row in rows) else best
             rows.append({"gains": dict(trial.values), "cost_mm": cost})
-        judge = ControlBench(experiment, judged_on)
         before, after = judge.cost(experiment.controller), judge.cost(best)
         content = {
             "schema": 1,
