@@ -5,11 +5,11 @@ against the inversion of a look-ahead predictor and of a twin; then with oil at 
 noise of velocities and pressures five times as large, all with the models of the plant as it was. The score is the
 position error to the reference of the same time; the distance to the path stands beside it.
 
-Part nmpc sets predictive control on a well-trained twin beside a PI loop that is tuned in the same run and inversions,
-on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part o4 asks
-whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the plant; part
-o4_other the same for C14 in loam. Their models are trained where --data has none: 3 h of recordings, some 20 processor
-minutes.
+Part nmpc sets predictive control on a well-trained twin beside a PI loop that is tuned in the same run and an
+inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part
+o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
+plant; part o4_other the same for C14 in loam. Their models are trained where --data has none: 3 h of recordings, some
+ten processor minutes.
 """
 
 from __future__ import annotations

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 
 from common import table
-from edp.config.experiment import load_experiment
 from edp.config.twin import load_twin_experiment
 from edp.evaluation.ahead import look_ahead
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training.twin_bundle import load_twin
-from edp.workflows.train_evaluate import train
 from edp.workflows.twin import train_twin
 from edp.workflows.twin.prepare_twin import prepare_twin
 
@@ -35,7 +33,6 @@ JUDGED = (
     *("judge.seconds=20", "judge.at_s=[1.0,5.0,10.0]", "judge.covered_at_s=[0.1,1.0,10.0]", "judge.floors=[]"),
     *("judge.ahead_ticks=20", "training.patience=0"),
 )
-LEAD_TICKS = 20
 AHEAD = (1, 5, 10, 20, 50)
 """Ticks ahead of measured ports at which the twin is judged, told the commands."""
 GROUND = ("dry_sand", "sandy_loam", "clay")
@@ -57,7 +54,6 @@ class ModelSize:
         recordings: of M22.
         twin: settings of its twin.
         one_step: settings of the network that is trained on measured feedback alone.
-        predictor: settings of the look-ahead predictor.
         other: minutes of C14 from which a twin goes on; the first for the controllers, all for tuning.
     """
 
@@ -65,20 +61,18 @@ class ModelSize:
     recordings: int
     twin: tuple[str, ...]
     one_step: tuple[str, ...]
-    predictor: tuple[str, ...]
     other: tuple[int, ...]
 
 
 FULL = ModelSize(
     *(180.0, 60, ("twin.kind=recurrent", "twin.units=96")),
     ONE_STEP,
-    ("training.epochs=8", "training.updates=150"),
     (20, 5, 45),
 )
 QUICK = ModelSize(
     *(20.0, 20, ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1,0.3]", "training.updates=[20,20]")),
     ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1]", "training.updates=[10]"),
-    *(("training.epochs=1", "training.updates=20"), (5,)),
+    (5,),
 )
 
 
@@ -113,12 +107,6 @@ class Models:
         """A model that stands beside it: ``static``, ``arx`` or ``one_step``."""
         settings = self.size.one_step if name == "one_step" else (f"twin.kind={name}",)
         return self._twin(self.recordings(), name, settings)
-
-    def predictor(self) -> Path:
-        """A look-ahead predictor of M22."""
-        changes = (f"task.horizons=[{LEAD_TICKS}]", "training.threads=1", *self.size.predictor)
-        train(self.recordings(), load_experiment(None, "quick", changes), self.folder / "good_predictor")
-        return self.folder / "good_predictor"
 
     def other_twin(self, minutes: int) -> Path:
         """The twin of M22 gone on with minutes of C14."""

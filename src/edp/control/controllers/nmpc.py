@@ -66,7 +66,7 @@ class PredictiveControl:
     space: ClassVar[Mapping[str, tuple[float, float]]] = {
         "along": (0.1, 2.0),
         "change": (0.02, 2.0),
-        "smoothing": (0.02, 0.5),
+        "smoothing": (0.005, 0.2),
     }
 
     blocks: tuple[int, ...] = (2, 3, 4, 6, 10, 15)
@@ -76,7 +76,7 @@ class PredictiveControl:
     feedforward: float = 0.01
     trust_m_s: float = 0.1
     window_s: float = 0.2
-    smoothing: float = 0.05
+    smoothing: float = 0.02
     fallback: bool = True
 
     def __post_init__(self) -> None:
