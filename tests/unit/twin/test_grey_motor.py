@@ -193,7 +193,7 @@ def motor_log(seed, ticks=1200):
     rows, x = [], np.array([0.0, 0.0, 0.0, 5e6, 5e6])
     for height in lever:
         rows.append(x[2:])
-        # LSODA by its short way: a tick is one step or two, beside which the objects of `solve_ivp` take most of the time.
+        # LSODA by its short way: a tick is a step or two, beside which the objects of `solve_ivp` take most time.
         x = odeint(slope, x, (0.0, 0.01), args=(height,), rtol=1e-6, atol=1e-6, tfirst=True)[-1]
     return Series(f"log {seed}", lever[:, None].astype(np.float32), np.array(rows, np.float32))
 
