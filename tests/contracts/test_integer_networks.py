@@ -35,9 +35,9 @@ def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, ro
     graph = predictor.graph()
     if {type(layer) for layer in graph.layers} & set(REFUSED):
         with pytest.raises(ExportError, match="no form in integer arithmetic; train with"):
-            calibrate(graph, [rows_of(predictor, 50)])
+            calibrate(graph, [rows_of(predictor, 5)])
     else:
-        calibrate(graph, [rows_of(predictor, 50)])
+        calibrate(graph, [rows_of(predictor, 5)])
 
 
 @pytest.mark.covering
@@ -94,6 +94,7 @@ def test_chunks_and_company_change_no_bit(network, rows_of):
     torch.testing.assert_close(torch.cat(parts, dim=1)[0], whole[1], rtol=0, atol=0)
 
 
+@pytest.mark.covering
 def test_weights_and_formats_are_all_that_is_needed(network):
     predictor, integers = network
     again = IntegerPredictor(predictor, integers.formats)
@@ -102,6 +103,7 @@ def test_weights_and_formats_are_all_that_is_needed(network):
         assert values.dtype == other.dtype
 
 
+@pytest.mark.covering
 def test_no_weight_stays_real(network):
     _, integers = network
     for layer in integers.integers.layers:

@@ -144,6 +144,7 @@ def rules_of(c, folder):
     return set(re.findall(r"\[misra-c2012-([\d.]+)\]", (folder / "found.txt").read_text()))
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("whole", [False, True])
 def test_values_do_not_lie_over_values_that_are_still_read(structure, whole, bundle_of):
     predictor = bundle_of(structure, whole).predictor

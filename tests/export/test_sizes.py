@@ -179,6 +179,7 @@ def test_an_adaptation_is_counted(network, whole, rank, bundle_of, compiled, tmp
     assert constant_bytes(graph, bundle.adaptation, DESKTOP) == here
 
 
+@pytest.mark.covering
 def test_a_network_in_whole_numbers_is_counted_before_it_is_one(structure, predictor_of, integers_of):
     """Neither recordings nor weights change what it takes."""
     integers = integers_of(structure)

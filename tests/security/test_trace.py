@@ -199,19 +199,43 @@ TRAPS: dict[str, Callable[[str], str]] = {
 }
 
 
-@pytest.mark.parametrize("trap", TRAPS)
-def test_the_trace_sees_what_it_is_for(trap, tmp_path):
-    """A reader that does such a thing is found."""
-    folder = tmp_path / "files"
-    folder.mkdir()
-    (folder / "log.csv").write_text("time,BmUp\n0,1\n0.01,2\n0.02,3\n")
-    deed = TRAPS[trap](str(tmp_path / "marker"))
-    script = (
-        f"import sys; sys.argv = ['worker', {str(folder)!r}]; sys.path.insert(0, {str(WORKER.parent)!r})\n"
-        "import trace_worker, subprocess, socket, pickle\n"
-        f"trace_worker.read = lambda path: str({deed})\n"
-        "trace_worker.main()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, cwd=tmp_path)
+TRAPPED = """
+import os, sys
+sys.path.insert(0, {place!r})
+import trace_worker, subprocess, socket, pickle
+deeds = [{deeds}]
+for folder, deed in zip(sys.argv[1:], deeds, strict=True):
+    # A process each, forked from one that has loaded the readers: what a deed leaves ends with it.
+    child = os.fork()
+    if not child:
+        sys.argv = ["worker", folder]
+        trace_worker.LIBRARIES += (f"/proc/{{os.getpid()}}",)
+        trace_worker.read = deed
+        trace_worker.main()
+        sys.stdout.flush()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0, folder
+"""
+
+
+@pytest.fixture(scope="module")
+def trapped(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
+    """What the trace saw of each of `TRAPS`."""
+    place = tmp_path_factory.mktemp("traps")
+    folders, deeds = [], []
+    for number, deed in enumerate(TRAPS.values()):
+        folders.append(place / str(number))
+        folders[-1].mkdir()
+        (folders[-1] / "log.csv").write_text("time,BmUp\n0,1\n0.01,2\n0.02,3\n")
+        deeds.append(f"lambda path: str({deed(str(place / f'marker{number}'))})")
+    script = TRAPPED.format(place=str(WORKER.parent), deeds=", ".join(deeds))
+    command = [sys.executable, "-c", script, *map(str, folders)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=place)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert json.loads(done.stdout.splitlines()[-1])["events"]["log.csv"]
+    return dict(zip(TRAPS, map(json.loads, done.stdout.splitlines()), strict=True))
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_the_trace_sees_what_it_is_for(trap, trapped):
+    """A reader that does such a thing is found."""
+    assert trapped[trap]["events"]["log.csv"]

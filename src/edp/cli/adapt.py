@@ -30,7 +30,7 @@ def adapt(
     Example: `edp adapt runs/first --out runs/first_adapted --set adapt.rank=12`
     """
     from edp.config.commands import command_settings
-    from edp.ir.rls import AdaptationSpec
+    from edp.workflows.adaptation import AdaptationSpec
     from edp.workflows.adaptation import adapt as make
 
     spec, _ = command_settings("adapt", AdaptationSpec, config, changes)

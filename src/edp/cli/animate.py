@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
 from edp.cli.train import MapOption
-from edp.errors import ConfigError, DataError
-from edp.recording import Recording
+from edp.errors import ConfigError
 
 PAGES = (".html", ".htm")
 
@@ -34,11 +31,12 @@ def animate(
 
     Example: `edp animate data/m22/m22_000_combined.parquet`
     """
+    from edp.logs.source import DataSource, read_with_truth
     from edp.report.animation.film import FILMS, write_film
     from edp.report.animation.page import scene_of, write_animation
 
     target = output or log.with_name(f"{log.stem}.html")
-    scene = scene_of(_read(log, signal_map), machine, start, seconds)
+    scene = scene_of(read_with_truth(DataSource.of(log, signal_map)), machine, start, seconds)
     film = target.suffix.lower() in FILMS
     if not film and target.suffix.lower() not in PAGES:
         endings = ", ".join((*PAGES, *FILMS))
@@ -49,22 +47,3 @@ def animate(
         out.print(f"animation: {target.resolve()}")
 
     emit(as_json, {"animation": str(target)}, show)
-
-
-def _read(log: Path, signal_map: Path | None) -> Recording:
-    """One recording, with the truth that lies in or beside its log."""
-    from edp.logs import known_suffixes, read_truth
-    from edp.logs.source import DataSource
-
-    recordings = DataSource.of(log, signal_map).read()
-    if len(recordings) != 1:
-        raise DataError(f"'{log}' holds {len(recordings)} recordings; give one log to animate")
-    recording = recordings[0]
-    truth = read_truth(log) if log.suffix.lower() in known_suffixes() and log.is_file() else None
-    if truth is None:
-        return recording
-    new = [c for c in truth.channels if c.name not in recording.channel_names]
-    # The truth may hold one sample more or less than the log.
-    rows = min(recording.samples, truth.samples)
-    values = np.concatenate((recording.values[:rows], truth.select([c.name for c in new])[:rows]), axis=1)
-    return replace(recording, channels=(*recording.channels, *new), values=values)

@@ -18,10 +18,10 @@ CONTROLLER, CONTROLLER_NAME = "controller", "machine"
 def _list_forms(listing_asked: bool) -> None:
     """Every registered target, with the first line of what is said about it."""
     if listing_asked:
-        from edp.export import TARGETS
+        from edp.workflows.deployment import forms
 
-        for name, target in TARGETS.items():
-            out.print(f"{name}: {(target.__doc__ or '').strip().splitlines()[0]}", soft_wrap=True)
+        for name, summary in forms().items():
+            out.print(f"{name}: {summary}", soft_wrap=True)
         out.print(
             f"{CONTROLLER}: C99, float32: the controller of a run of edp control, with model and solver", soft_wrap=True
         )

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import tomli_w
 
-from edp import storage
 from edp.data.augment import AUGMENTATIONS
 from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS, Derived, FeatureSet
@@ -22,7 +21,7 @@ from edp.networks.losses import LOSSES, TERMS
 from edp.networks.physics import PhysicsSpec
 from edp.networks.plain import NETWORK_PARTS, USUAL_KINDS
 from edp.networks.predictor import ModelSpec
-from edp.settings.tree import Change, SettingsTree, Table, merged, override, read_toml
+from edp.settings.tree import Change, SettingsTree, Table, merged, override, parse_toml, read_toml
 from edp.training.averages import AVERAGES
 from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
@@ -199,7 +198,7 @@ def preset_table(name: str) -> Table:
     if name not in (*PRESETS, AUTO):
         raise ConfigError(f"there is no preset '{name}'{closest(name, (*PRESETS, AUTO))}")
     text = resources.files("edp.config").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8")
-    table = storage.parse_toml(text, f"preset '{name}'", ConfigError)
+    table = parse_toml(text, f"preset '{name}'")
     base = table.pop("base", None)
     return table if base is None else merged(preset_table(str(base)), table)
 

@@ -71,14 +71,19 @@ def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
     Raises:
         DataError: no such input channel.
     """
-    names = recording.channel_names
     for name in inputs:
-        if name not in names:
+        if name not in (names := recording.channel_names):
             raise DataError(f"input '{name}' is not a channel of '{recording.name}'{closest(name, names)}")
+    return roles_of_channels(recording.channels, inputs)
+
+
+def roles_of_channels(channels: Sequence[Channel], inputs: Sequence[str] = ()) -> Roles:
+    """The same of channels without values; `inputs` are among them."""
+    names = [channel.name for channel in channels]
     table_axes = [] if inputs else [axis for i in range(3) if (axis := _of_table(i, names)) is not None]
     if table_axes:
         return Roles(tuple(table_axes), tuple(name for axis in table_axes for name in axis.command))
-    return _by_kind(recording.channels, tuple(inputs))
+    return _by_kind(channels, tuple(inputs))
 
 
 def _of_table(i: int, names: Sequence[str]) -> Axis | None:

@@ -8,10 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edp.errors import ConfigError, DataError
+from edp.logs.detect import known_suffixes
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into
-from edp.logs.read import find_recordings, read_data_set, read_recording, unique_names
+from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
 from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
@@ -229,3 +232,23 @@ def _map_table(table: Table) -> Table:
         for name, entry in channels.items()
     ]
     return {**table, "channels": entries}
+
+
+def read_with_truth(source: DataSource) -> Recording:
+    """The one recording of a source, with the truth that lies in or beside its log.
+
+    Raises:
+        DataError: more than one recording, or a log that cannot be used as it is.
+    """
+    recordings = source.read()
+    if len(recordings) != 1:
+        raise DataError(f"'{source.path}' holds {len(recordings)} recordings; give one log")
+    recording, log = recordings[0], source.path
+    truth = read_truth(log) if log.suffix.lower() in known_suffixes() and log.is_file() else None
+    if truth is None:
+        return recording
+    new = [c for c in truth.channels if c.name not in recording.channel_names]
+    # The truth may hold one sample more or less than the log.
+    rows = min(recording.samples, truth.samples)
+    values = np.concatenate((recording.values[:rows], truth.select([c.name for c in new])[:rows]), axis=1)
+    return replace(recording, channels=(*recording.channels, *new), values=values)

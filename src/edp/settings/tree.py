@@ -55,6 +55,15 @@ def read_toml(path: str | Path) -> Table:
     return storage.read_toml(path, error=ConfigError)
 
 
+def parse_toml(text: str, where: str) -> Table:
+    """Settings from a text, which messages call `where`.
+
+    Raises:
+        ConfigError: it is beyond the bounds of `edp.storage.parse_toml`, or is not TOML.
+    """
+    return storage.parse_toml(text, where, ConfigError)
+
+
 def merged(base: Table, change: Mapping[str, Any]) -> Table:
     """`base` with `change` laid over it; a table of another kind replaces the old one whole."""
     result = dict(base)
@@ -81,10 +90,10 @@ def override(change: Change) -> Table:
         raise ConfigError(f"--set '{text}': write key.path=value, for example training.epochs=10")
     where = f"--set '{text[:SHOWN_CHANGE]}'"
     try:
-        return storage.parse_toml(f"{key.strip()} = {value.strip()}", where, ConfigError)
+        return parse_toml(f"{key.strip()} = {value.strip()}", where)
     except ConfigError:
         # Words need no quotes on a command line, where a shell would take them away.
-        return storage.parse_toml(f'{key.strip()} = "{value.strip()}"', where, ConfigError)
+        return parse_toml(f'{key.strip()} = "{value.strip()}"', where)
 
 
 class SettingsTree:

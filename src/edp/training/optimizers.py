@@ -13,6 +13,7 @@ from torch import nn
 from edp.errors import ConfigError
 from edp.registry import Registry
 from edp.settings.bounds import DECAY, MOST_NAMES, MOST_UPDATES, RATE, below, check_bounds, check_count, integer, shown
+from edp.training.eager import EagerAdamW, EagerSgd
 
 
 class OptimizerSpec(Protocol):
@@ -58,7 +59,7 @@ class AdamW:
         matrices, vectors = _decaying(named)
         groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
         # Fused: one pass over the memory instead of one an operation; small networks gain most.
-        return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
+        return EagerAdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
 
     def remembers(self, shape: Sequence[int]) -> int:
         """Two means."""
@@ -81,7 +82,7 @@ class Sgd:
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
         """The optimiser on all parameters."""
-        return torch.optim.SGD([parameter for _, parameter in named], lr=self.learning_rate)
+        return EagerSgd([parameter for _, parameter in named], lr=self.learning_rate)
 
     def remembers(self, shape: Sequence[int]) -> int:
         """Nothing."""
@@ -125,7 +126,7 @@ class Discriminative:
             for some, decay in zip(_decaying(parameters), (self.weight_decay, 0.0), strict=True)
             if some
         ]
-        return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
+        return EagerAdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
 
     def remembers(self, shape: Sequence[int]) -> int:
         """Two means."""

@@ -59,6 +59,11 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
     return counted, describe(predictor.spec), bundle.adaptation
 
 
+def forms() -> dict[str, str]:
+    """The first line of what is said about each form, by name."""
+    return {name: (target.__doc__ or "").strip().partition("\n")[0] for name, target in TARGETS.items()}
+
+
 def export_bundle(
     path: str | Path,
     to: str,

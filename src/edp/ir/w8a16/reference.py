@@ -67,15 +67,16 @@ class Integers:
         values: dict[str, Any] = {INPUT: np.asarray(inputs, dtype=np.float32)}
         for layer in self.graph.layers:
             layer_inputs = [values[name] for name in layer.inputs]
-            if isinstance(layer, quantised.Quantise):
+            run = INTEGER_STEPS.get(type(layer)) or OVER_TIME.get(type(layer))
+            # First: asking what a layer is takes as long as the step of a small one.
+            if run is not None:
+                values[layer.name] = run(layer, self.memory[layer.name], *layer_inputs)
+            elif isinstance(layer, quantised.Quantise):
                 values[layer.name] = self._quantised(layer, layer_inputs[0])
-                continue
-            if isinstance(layer, memory.Feed):
+            elif isinstance(layer, memory.Feed):
                 self.memory[layer.into]["last"] = layer_inputs[0][-1]
-                continue
-            kind = type(layer)
-            run = INTEGER_STEPS[kind] if kind in INTEGER_STEPS else OVER_TIME[kind]
-            values[layer.name] = run(layer, self.memory[layer.name], *layer_inputs)
+            else:
+                raise KeyError(type(layer))
         return values
 
     def _quantised(self, layer: quantised.Quantise, x: NDArray[np.float32]) -> Fixed:

@@ -7,7 +7,7 @@ import math
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
 from edp.report.common.templates import template
-from edp.sim import Machine, load_machine
-from edp.sim.machine import layout as at
-from edp.sim.machine.parameters import pack
-from edp.sim.physics import linkage
-from edp.sim.physics.soil import BEYOND_M, SPACING_M
+from edp.signals import GROUND_POINTS
 from edp.storage import write_bytes
+
+if TYPE_CHECKING:
+    from edp.sim import Machine
 
 Array = NDArray[np.float64]
 JOINTS = ("boom", "arm", "bucket")
@@ -74,6 +73,10 @@ def scene_of(
         DataError: neither angles nor strokes, or strokes that this machine does not have.
         ConfigError: a machine is needed and not known, or the stretch lies outside the recording.
     """
+    # The simulator brings Numba, a second of every command that writes a page of another kind.
+    from edp.sim import load_machine
+    from edp.sim.physics.soil import BEYOND_M, SPACING_M
+
     chosen = load_machine(machine or _machine_of(recording))
     if not 0.0 <= start_s < recording.duration_s or (seconds is not None and not seconds > 0.0):
         raise ConfigError(
@@ -93,10 +96,10 @@ def scene_of(
         whole = np.stack([_filled(recording.column(f"CylStroke_{i}")) for i in (1, 2, 3)], axis=1)
         velocity = np.gradient(whole, axis=0)[rows] * strokes_per_s
     pressures = [f"CylPressures_{k}" for i in (1, 2, 3) for k in (i, i + 4)]
-    ground = [f"Ground_{k:02d}" for k in range(at.GROUND_POINTS)]
+    ground = [f"Ground_{k:02d}" for k in range(GROUND_POINTS)]
     soil = shown.has(*ground)
     points = math.ceil((sum(chosen.bodies.length) + BEYOND_M) / SPACING_M)
-    index = np.arange(at.GROUND_POINTS) * (points - 1) // (at.GROUND_POINTS - 1)
+    index = np.arange(GROUND_POINTS) * (points - 1) // (GROUND_POINTS - 1)
     extra = {"payload kg": ("Payload", 1.0, 0.0), "oil °C": ("OilTemperature", 1.0, -273.15)}
     readings = {k: f * shown.take(n)[:, 0] + add for k, (n, f, add) in extra.items() if shown.has(n)}
     if shown.has("TipForceX", "TipForceY"):
@@ -154,6 +157,10 @@ def _machine_of(recording: Recording) -> str:
 
 def _angles(shown: _Columns, machine: Machine) -> Array:
     """Joint angles, shape (frame, 3), from the angles themselves or from strokes."""
+    from edp.sim.machine import layout as at
+    from edp.sim.machine.parameters import pack
+    from edp.sim.physics import linkage
+
     angles, strokes = ([f"{kind}_{i}" for i in (1, 2, 3)] for kind in ("JointAngle", "CylStroke"))
     if shown.has(*angles):
         return shown.take(*angles)

@@ -14,6 +14,7 @@ from edp.data.lags import DoubleArray
 from edp.networks.committee import Members
 from edp.networks.losses.base import Penalty
 from edp.training.bagging.spec import BaggingSpec
+from edp.training.eager import EagerAdamW
 from edp.training.spec import TrainingSpec
 
 JUDGED_ROWS = 4000
@@ -48,7 +49,7 @@ class MemberGroup:
         ]
         self.parameters += [last.requires_grad_(), torch.zeros(members.members, 1, outputs).requires_grad_()]
         bagging = spec.bagging or BaggingSpec()
-        self.optimizer = torch.optim.AdamW(self.parameters, lr=bagging.learning_rate, weight_decay=bagging.weight_decay)
+        self.optimizer = EagerAdamW(self.parameters, lr=bagging.learning_rate, weight_decay=bagging.weight_decay)
         self.average = [parameter.detach().clone() for parameter in self.parameters]
         self.best = [parameter.clone() for parameter in self.average]
         self.least = torch.full((members.members,), math.inf)

@@ -29,6 +29,7 @@ from edp.networks.predictor import ModelSpec, Predictor
 from edp.signals import KINDS
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.table import bank_rows
+from edp.training.eager import EagerAdamW
 from edp.training.outcome import Diverged, Fitted, TrainingProgress
 from edp.training.spec import TrainingSpec
 from edp.training.validation import standard_targets
@@ -203,7 +204,7 @@ class _Perceptrons:
         hidden = sum(group.members * group.units for group in self.groups)
         self.last = nn.Parameter(torch.zeros(hidden + 1, targets[0].shape[1]))  # and a bias
         learned = [self.last, *(parameter for group in self.groups for parameter in group.parameters())]
-        self.optimizer = torch.optim.AdamW(learned, lr=RATE, weight_decay=DECAY)
+        self.optimizer = EagerAdamW(learned, lr=RATE, weight_decay=DECAY)
 
     def advance(self, start: int, stop: int) -> float:
         """Updates from one number to another; their mean loss.

@@ -83,7 +83,7 @@ def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
     machine = replace(machine, oil=replace(machine.oil, temperature=parts.celsius))
     axes, plant = pack(machine)
     table = parts.table
-    si = table.nominal * np.array([number.factor for number in table.numbers])
+    si = table.nominal * table.factor
     for i in range(sim.AXES):
         _put_cylinder(si, table.actuator_at[i], axes[i], plant)
         for second, j in enumerate((parts.primary[i], parts.conflux[i])):
@@ -95,7 +95,7 @@ def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
         si[a + grey.LINE], si[a + grey.RELIEF] = plant[sim.LINE_VOLUME], plant[sim.PUMP_RELIEF]
         si[a + grey.BYPASS], si[a + grey.BYPASS_CLOSED] = plant[sim.BYPASS], plant[sim.BYPASS_CLOSED]
     _put_circuit(si, table.circuit_at, plant, float(np.mean([parts.reach[j] for j in parts.primary])))
-    numbers = si / np.array([number.factor for number in table.numbers])
+    numbers = si / table.factor
     numbers[parts.load] = load
     return np.asarray(numbers)
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edp.data.roles import roles_of
+from edp.data.roles import roles_of_channels
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
-from edp.recording import Recording
 from edp.settings.bounds import check_bounds, integer, span
 from edp.signals import Channel, Kind
 
@@ -188,9 +187,8 @@ def default_elements(channels: TwinChannels) -> Elements:
     """
     every = channels.commands + channels.answers
     names = {channel.name for channel in channels.answers}
-    recording = Recording("", every, np.zeros((1, len(every)), np.float32), channels.rate_hz, "")
     commands = tuple(channel.name for channel in channels.commands)
-    roles = roles_of(recording)
+    roles = roles_of_channels(every)
     axes = {axis.velocity: axis for axis in roles.axes}
     actuators, valves, left = [], [], [c.name for c in channels.pressures]
     for i, velocity in enumerate(channels.velocities):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations_with_replacement
 from math import comb
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,20 +64,31 @@ class NumberTable:
         """Place of the number whose value each one has: mostly its own."""
         return np.array([index - number.leader for index, number in enumerate(self.numbers)], dtype=np.int64)
 
+    @cached_property
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        # A fit asks for them thousands of times.
+        names = ("positive", "nominal", "width", "factor")
+        return {name: np.array([getattr(number, name) for number in self.numbers]) for name in names}
+
     @property
     def positive(self) -> NDArray[np.bool_]:
         """Which are fitted by their logarithm."""
-        return np.array([number.positive for number in self.numbers])
+        return self._columns["positive"].copy()
 
     @property
     def nominal(self) -> Array:
         """Where a fit starts."""
-        return np.array([number.nominal for number in self.numbers])
+        return self._columns["nominal"].copy()
 
     @property
     def width(self) -> Array:
         """Plausible deviations."""
-        return np.array([number.width for number in self.numbers])
+        return self._columns["width"].copy()
+
+    @property
+    def factor(self) -> Array:
+        """SI units in one of each number's own."""
+        return self._columns["factor"].copy()
 
     def values(self, theta: Array) -> Array:
         """Numbers from coordinates of a fit, in which the nominal is 0."""
