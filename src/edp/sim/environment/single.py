@@ -163,7 +163,8 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._in_soil = bool(start.scenario.material)
 
     def _truth(self, row: Array) -> Truth:
-        return Truth(row, self.model.machine.valves.pilot_pressure, self._in_soil)
+        shares = self._episodes.shares(0)
+        return Truth(row, self.model.machine.valves.pilot_pressure, self._in_soil, shares if len(shares) else None)
 
 
 def spaces(channels: tuple[Channel, ...]) -> tuple[Any, Any]:

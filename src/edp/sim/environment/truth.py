@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.signals import TABLE_A1
+from edp.signals import FAULT_CHANNELS, TABLE_A1
 from edp.sim.machine import layout as at
 from edp.sim.sensors.sensors import KELVIN, OIL, truth_columns
 
@@ -36,15 +36,21 @@ class Truth(Mapping[str, Any]):
         rows: the present row of the plant's log, shape (columns,), or one for each of many machines.
         pilot_pressure: full pilot pressure, Pa; for many machines shape (machine,).
         in_soil: whether there is ground to name.
+        shares: how much of each fault is there, shape (..., fault); None where there are none.
     """
 
-    __slots__ = ("_pilot_pressure", "_rows", "_sources")
+    __slots__ = ("_pilot_pressure", "_rows", "_shares", "_sources")
 
-    def __init__(self, rows: Array, pilot_pressure: float | Array, in_soil: bool) -> None:
+    def __init__(self, rows: Array, pilot_pressure: float | Array, in_soil: bool, shares: Array | None = None) -> None:
         self._rows, self._pilot_pressure, self._sources = rows, pilot_pressure, sources(in_soil)
+        faults = () if shares is None else list(FAULT_CHANNELS)[: shares.shape[-1]]
+        self._shares = {name: shares[..., n] for n, name in enumerate(faults)} if shares is not None else {}
 
     def __getitem__(self, name: str) -> Any:
         """A number, or an array of shape (machine,)."""
+        if name in self._shares:
+            share = self._shares[name]
+            return float(share) if self._rows.ndim == 1 else share.copy()
         column, sign = self._sources[name]
         value = self._rows[..., column]
         if sign != 0.0:
@@ -54,7 +60,7 @@ class Truth(Mapping[str, Any]):
         return float(value) if self._rows.ndim == 1 else value.copy()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._sources)
+        return iter((*self._sources, *self._shares))
 
     def __len__(self) -> int:
-        return len(self._sources)
+        return len(self._sources) + len(self._shares)
