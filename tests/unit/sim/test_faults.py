@@ -59,7 +59,7 @@ def test_texts_and_tables_say_the_same():
     ("text", "words"),
     [
         ("", "write KIND"),
-        ("internal_leek:boom:3L/min", "did you mean 'internal_leak'.*there are attachment_mass"),
+        ("internal_leek:boom:3L/min", "unknown kind of fault; did you mean 'internal_leak'.*there are attachment_mass"),
         ("internal_leak", "nothing came behind the kind; write internal_leak:SITE:SIZE; sites are boom, arm, bucket"),
         ("internal_leak:boom", "write internal_leak:SITE:SIZE.*sizes are in L/min"),
         ("internal_leak:boom:3L/min:x", "write internal_leak:SITE:SIZE"),

@@ -175,7 +175,7 @@ class FaultSpec:
         kind = FAULTS[self.kind]
         what = f"fault '{self.kind}'"
         if kind.sites and self.site not in kind.sites:
-            raise ConfigError(f"{what}: site {shown(self.site)} is unknown{_among(str(self.site), kind.sites)}")
+            raise ConfigError(f"{what}: site {shown(self.site)} is unknown{among(str(self.site), kind.sites)}")
         if self.site and not kind.sites:
             raise ConfigError(f"{what}: site {shown(self.site)} must be left out; a machine has one such part")
         _check_size(what, kind, self.size, self.unit)
@@ -213,7 +213,8 @@ class FaultSpec:
         )
 
 
-def _among(name: str, options: Iterable[str]) -> str:
+def among(name: str, options: Iterable[str]) -> str:
+    """A suffix for messages on a name that is none of the options: the closest one, and all of them."""
     hint = closest(name, options)
     listed = ", ".join(options)
     return f"{hint}; there are {listed}" if hint.startswith("; did") else f"; there are {listed}"
@@ -229,7 +230,7 @@ def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> No
     if isinstance(size, bool) or not isinstance(size, int | float) or not math.isfinite(size):
         raise ConfigError(f"{what}: size = {shown(size)} must be a finite number")
     if not isinstance(unit, str) or unit not in kind.units:
-        raise ConfigError(f"{what}: unit {shown(unit)} of the size is unknown{_among(str(unit), kind.units)}")
+        raise ConfigError(f"{what}: unit {shown(unit)} of the size is unknown{among(str(unit), kind.units)}")
     in_first = size * kind.units[unit] / kind.units[kind.unit]
     # The product may miss a bound by rounding: 900 % as a share of 9.
     if not kind.bound.low - 1e-9 <= in_first <= kind.bound.high + 1e-9:

@@ -9,7 +9,7 @@ from typing import Any
 
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import check_count, shown
-from edp.sim.faults.base import FAULTS, MOST_FAULTS, FaultSpec
+from edp.sim.faults.base import FAULTS, MOST_FAULTS, FaultSpec, among
 
 MOST_CHARACTERS = 200
 """Of one fault: kinds and sites are words, numbers have some digits."""
@@ -31,10 +31,9 @@ def parse_fault(text: str) -> FaultSpec:
     head, *options = text.split(",")
     what, at_sign, onset = head.partition("@")
     name, *rest = what.split(":")
-    try:
-        kind = FAULTS[name]
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}; there are {', '.join(FAULTS)}") from None
+    if name not in FAULTS:
+        raise ConfigError(f"{where}: unknown kind of fault{among(name, FAULTS)}")
+    kind = FAULTS[name]
     form = ":".join([name, *(["SITE"] if kind.sites else []), *(["SIZE"] if kind.units else [])])
     if len(rest) != form.count(":"):
         parts = "nothing" if not rest else ", ".join(f"'{part}'" for part in rest)
