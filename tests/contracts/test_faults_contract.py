@@ -1,5 +1,7 @@
 """Every registered fault: nothing at its neutral size, nothing before its onset, the same bits in every form."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -187,6 +189,11 @@ def test_side_by_side_each_has_its_own_faults():
         np.testing.assert_array_equal(observations, [step[0] for step in steps])
         assert np.isnan(infos["truth"]["Fault_1"][0])
         assert infos["truth"]["Fault_3"][2] == steps[2][4]["truth"]["Fault_3"]
+    # What is true travels between processes, and stays what it was.
+    copy = pickle.loads(pickle.dumps(infos["truth"]))
+    together.reset(seed=1)
+    np.testing.assert_array_equal(copy["Fault_3"], infos["truth"]["Fault_3"])
+    assert set(copy) == set(infos["truth"])
 
 
 def test_snapshots_and_branches_carry_the_faults():

@@ -213,19 +213,8 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         self._in_soil = any(each is not None and bool(each.scenario.material) for each in starts)
 
     def _truth(self) -> Truth:
-        return Truth(self._present[1].copy(), self._pilots.copy(), self._in_soil, self._shares())
-
-    def _shares(self) -> Array | None:
-        """How much of each fault is there, shape (machine, fault), NaN beyond those of a machine; None without any."""
-        starts = self._episodes.starts
-        most = max((len(start.scenario.faults) for start in starts if start is not None), default=0)
-        if most == 0:
-            return None
-        shares = np.full((self.num_envs, most), np.nan)
-        for index in range(self.num_envs):
-            present = self._episodes.shares(index)
-            shares[index, : len(present)] = present
-        return shares
+        pilots, episodes = self._pilots.copy(), self._episodes
+        return Truth(self._present[1].copy(), pilots, self._in_soil, episodes.most_faults, episodes.shares())
 
 
 def _side_by_side(

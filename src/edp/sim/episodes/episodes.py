@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.sim.episodes import blocks, tick
+from edp.sim.faults import FaultSpec
 from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at, spare_s
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
@@ -69,12 +72,17 @@ class Episodes:
     Args:
         count: how many.
         columns: what observations show, numbers of `tick.SOURCES`.
+
+    Attributes:
+        starts: how each began; None where none has.
+        most_faults: largest number of faults that one of them has.
     """
 
     def __init__(self, count: int, columns: NDArray[np.int64]) -> None:
         self.count, self.columns = count, columns
         self.memory, self.drawn = np.zeros((count, 0)), np.zeros((count, 0))
         self.starts: list[EpisodeStart | None] = [None] * count
+        self.most_faults = 0
         self._scratch = tick.new_scratch()
         self._all = np.ones(count, dtype=np.bool_)
 
@@ -120,13 +128,19 @@ class Episodes:
         """Ticks done since an episode began."""
         return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
 
-    def shares(self, index: int) -> Array:
-        """How much of each fault of an episode is there now, 0 to 1, shape (fault,)."""
-        start = self.starts[index]
-        if start is None or not start.scenario.faults:
-            return np.zeros(0)
-        present: Array = shares_at(start.scenario.faults, np.array([self.ticks(index)]), start.scenario.rate_hz)[0]
-        return present
+    def shares(self) -> Callable[[], Array] | None:
+        """What gives, whenever it is called, how much of each fault is there now; None where no episode has faults.
+
+        The shares are from 0 to 1, shape (episode, fault), NaN beyond the faults of an episode.
+        """
+        if self.most_faults == 0:
+            return None
+        plans = tuple(
+            ((), 1.0) if start is None else (start.scenario.faults, start.scenario.rate_hz) for start in self.starts
+        )
+        ticks = self.memory[:, blocks.BLOCKS * blocks.ENTRY + blocks.TICK].astype(np.int64)
+        # No closure: what is true travels between processes.
+        return partial(_shares_of, plans, ticks, self.most_faults)
 
     def ended(self, index: int) -> bool:
         """Whether an episode has all its ticks behind it."""
@@ -188,6 +202,7 @@ class Episodes:
     def _put(self, index: int, start: EpisodeStart, memory: Array, drawn: Array) -> None:
         """Give an episode these rows; all rows become as long as the longest."""
         self.starts[index] = start
+        self.most_faults = max(len(each.scenario.faults) for each in self.starts if each is not None)
         if self.count == 1:
             self.memory, self.drawn = memory[None], drawn[None]
             return
@@ -215,6 +230,14 @@ def _bridge(present: Array, fresh: Array, done: int, depth: int) -> None:
     bias, errors = slice(chain.RATE_BIAS, chain.RATE_ERROR), slice(chain.RATE_ERROR, None)
     present[done:, bias] = present[done - 1, bias] + fresh[done:, bias] - fresh[done - 1, bias]
     present[done:, errors] = fresh[done:, errors]
+
+
+def _shares_of(plans: Sequence[tuple[tuple[FaultSpec, ...], float]], ticks: NDArray[np.int64], most: int) -> Array:
+    """How much of each fault of several episodes is there at their ticks, shape (episode, fault)."""
+    shares = np.full((len(plans), most), np.nan)
+    for index, (faults, rate_hz) in enumerate(plans):
+        shares[index, : len(faults)] = shares_at(faults, ticks[index : index + 1], rate_hz)[0]
+    return shares
 
 
 def _sensor_draws(start: EpisodeStart, noise: np.random.SeedSequence, chance: np.random.SeedSequence) -> Array:
