@@ -217,7 +217,13 @@ GROUND_CHANNELS: Mapping[str, Channel] = {
 }
 """Logged beside `EXTRA_CHANNELS` where a recording was made in soil."""
 
-VOCABULARY: Mapping[str, Channel] = {**TABLE_A1, **EXTRA_CHANNELS, **GROUND_CHANNELS}
+FAULT_CHANNELS: Mapping[str, Channel] = {
+    name: Channel(name, Kind.RATIO, "share of the full size of a fault that is there, in the order of the recording's")
+    for name in (f"Fault_{k}" for k in range(1, 9))
+}
+"""Logged beside `EXTRA_CHANNELS` where a recording was made with faults."""
+
+VOCABULARY: Mapping[str, Channel] = {**TABLE_A1, **EXTRA_CHANNELS, **GROUND_CHANNELS, **FAULT_CHANNELS}
 
 
 _SLOWEST, _FASTEST = 1e-9, 1e9

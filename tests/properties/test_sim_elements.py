@@ -122,7 +122,7 @@ def test_filters_settle_on_the_demand_within_the_play():
     valves, demand = np.zeros((6, 5)), np.array([0.8, -0.5, 0.3, 0.6, -0.2, 0.0])
     filters = valve.spool_filters(load_machine("M22"), 5e-4)
     for _ in range(2000):
-        valve.pilot_half_step(demand, filters, 0.012, valves)
+        valve.pilot_half_step(demand, filters, AXES, valves)
         valve.spool_half_step(filters, valves)
     np.testing.assert_allclose(valves[:, at.PILOT], demand, atol=1e-6)
     np.testing.assert_allclose(valves[:, at.SPOOL], demand, atol=0.0121)

@@ -41,6 +41,13 @@ def simulate(
             "material file (.toml); air for none. Give it again for more soils, in equal shares."
         ),
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Fault of machine or sensors in every recording, KIND[:SITE][:SIZE][@ONSET][,ramp=TIME]"
+            "[,on=TIME,off=TIME], such as internal_leak:boom:3L/min@120s. Give it again for more faults."
+        ),
+    ] = None,
     form: Annotated[
         str | None,
         typer.Option("--format", help="Ending of the logs, of any format that EDP writes (default: parquet)."),
@@ -63,6 +70,8 @@ def simulate(
 
     Example: `edp simulate data/many --family 8 --set masses=[12,30] --material clay`
 
+    Example: `edp simulate data/leak --fault internal_leak:boom:3L/min@120s --fault pressure_bias:arm_head:10bar@5min`
+
     Example: `edp simulate data/m22 --limit --set limit.moments=60 --set limit.horizons=[1,10]`
 
     With --limit, moments of the recordings are branched with fresh randomness of operator, soil and sensors. Of each
@@ -70,6 +79,7 @@ def simulate(
     and all laws, but neither the operator's future choices nor, in the second column, anything but them.
     """
     from edp.sim.data_set import SimulationOrder, suffix_of
+    from edp.sim.faults import fault_text, parse_fault
     from edp.sim.scenario_file import limit_settings
 
     order = SimulationOrder.of(
@@ -84,6 +94,7 @@ def simulate(
         # Equal shares of several soils.
         materials=dict.fromkeys(material, 1.0) if material else None,
         suffix=None if form is None else suffix_of(form),
+        faults=tuple(map(parse_fault, fault)) if fault else None,
     )
     # Settings of the limit are checked even where it is not asked for.
     spec = limit_settings(scenario, changes)
@@ -91,12 +102,16 @@ def simulate(
     limit_facts = run_limit(folder, order, spec, workers, as_json) if limit else None
     what_simulated = f"{order.family} machines" if order.family else order.machine
     facts: dict[str, Any] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
+    if order.faults:
+        facts["faults"] = [fault_text(entry) for entry in order.faults]
     facts |= {"machine": what_simulated, "seed": order.seed} | ({} if limit_facts is None else {"limit": limit_facts})
 
     def show() -> None:
         if limit_facts is not None:
             limit_table(limit_facts)
         out.print(f"{len(paths)} recordings of {what_simulated}, {order.minutes:g} min, in {folder}")
+        for text in facts.get("faults", ()):
+            out.print(f"fault: {text}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
 
     emit(as_json, facts, show)

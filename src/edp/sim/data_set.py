@@ -272,7 +272,7 @@ def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".p
 def bytes_needed(plan: Sequence[Scenario], suffix: str) -> int:
     """Room that the logs of a plan take, rounded up."""
     usual = len(TABLE_A1) + len(EXTRA_CHANNELS)
-    values = sum(s.samples * (usual + (len(GROUND_CHANNELS) if s.material else 0)) for s in plan)
+    values = sum(s.samples * (usual + (len(GROUND_CHANNELS) if s.material else 0) + len(s.faults)) for s in plan)
     return int(values * BYTES_PER_VALUE.get(suffix, max(BYTES_PER_VALUE.values())))
 
 

@@ -15,6 +15,7 @@ from edp.recording import Recording
 from edp.sandbox.helpers import Helpers, Job, Result
 from edp.settings.bounds import above, check_bounds, integer, span
 from edp.sim.excitation import EXCITATIONS
+from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics import soil
@@ -67,6 +68,7 @@ class DataSetSpec:
         start_strokes: range of the strokes to start from, as shares of full.
         sensor_noise: False logs the truth.
         sensors: values that replace those of the machine's ``[sensors]``.
+        faults: of machine and sensors, in every recording; see `edp.sim.faults`.
 
     Raises:
         ConfigError: a value is out of range or a name is unknown.
@@ -86,8 +88,10 @@ class DataSetSpec:
     start_strokes: tuple[float, float] = START_STROKES
     sensor_noise: bool = True
     sensors: Mapping[str, Any] = field(default_factory=dict)
+    faults: tuple[FaultSpec, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "faults", faults_of(self.faults, "data set"))
         check_bounds("data set", self, **BOUNDS)
         if not self.family and tuple(self.masses) != MASSES_T:
             raise ConfigError(f"masses = {list(self.masses)} are those of a family; say how many machines with family")
@@ -132,6 +136,7 @@ class DataSetSpec:
                 material=soils[i],
                 start_strokes=self.start_strokes,
                 sensors=self.sensors,
+                faults=self.faults,
             )
             for i in range(self.recordings)
         )

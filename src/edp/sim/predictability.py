@@ -165,8 +165,13 @@ def plan_limit(scenarios: Sequence[Scenario], spec: LimitSpec) -> list[LimitJob]
     """Which moments of which recordings are branched.
 
     Raises:
-        ConfigError: the recordings are too short for the horizons.
+        ConfigError: the recordings are too short for the horizons, or have faults.
     """
+    faulty = next((scenario for scenario in scenarios if scenario.faults), None)
+    if faulty is not None:
+        raise ConfigError(
+            f"limit: '{faulty.label}' has faults, and the limit is that of a sound machine; leave out faults or limit"
+        )
     # Stream 1 chooses moments, stream 2 resamples: neither changes with the other.
     rng = np.random.default_rng([spec.seed, 1])
     count = min(len(scenarios), spec.recordings, spec.moments)

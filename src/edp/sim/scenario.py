@@ -9,6 +9,7 @@ from typing import Any
 
 from edp.errors import ConfigError, EdpError
 from edp.sim.excitation import EXCITATIONS
+from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine.machine import Machine, Sensors
 from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.sim.machine.machine_files import load_machine
@@ -40,6 +41,7 @@ class Scenario:
         start_strokes: range of the strokes to start from, as shares of full.
         sensors: values that replace those of the machine's ``[sensors]``, by key: to switch faults on or off.
         seed: the same seed gives the same bits on the same machine.
+        faults: of machine and sensors; each may be given as a text or as a table, see `edp.sim.faults`.
         name: name of the recording; empty builds one from machine, excitation and seed.
 
     Raises:
@@ -57,9 +59,11 @@ class Scenario:
     material: str = ""
     start_strokes: tuple[float, float] = START_STROKES
     sensors: Mapping[str, Any] = field(default_factory=dict)
+    faults: tuple[FaultSpec, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_strokes", tuple(self.start_strokes))
+        object.__setattr__(self, "faults", faults_of(self.faults, "scenario"))
         self.load()
         EXCITATIONS[self.excitation]
         if self.material:
@@ -109,4 +113,7 @@ class Scenario:
 def plain(scenario: Scenario) -> dict[str, Any]:
     """A scenario as JSON gives it back; `Scenario(**plain(s)) == s`."""
     values = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
-    return {**values, "start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}
+    values |= {"start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}
+    # Only where there are some: data sets and recordings without faults stay what they were.
+    del values["faults"]
+    return values | ({"faults": [fault.plain() for fault in scenario.faults]} if scenario.faults else {})

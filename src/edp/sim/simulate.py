@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.recording import Recording
-from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim.excitation import EXCITATIONS
+from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at, spare_s
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import known_mass
@@ -18,7 +19,7 @@ from edp.sim.physics.jit import rehearsal
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.snapshot import Snapshot, capture, restored
 from edp.sim.scenario import Scenario, SimulationError, plain
-from edp.sim.sensors import sensors
+from edp.sim.sensors import draws, sensors
 from edp.sim.start import seeds_of, start_of
 from edp.sim.view import view_of
 
@@ -39,7 +40,8 @@ class Simulation:
         hand = np.random.default_rng(seeds_of(scenario)[1])
         self.machine = machine
         ground, strokes = start_of(scenario, machine)
-        self.plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground)
+        self.plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground, spare_s(scenario.faults))
+        self._course = MachineCourse(scenario.faults, numbers_of(self.plant))
         self.operator = EXCITATIONS[scenario.excitation](hand, scenario.rate_hz, machine)
         self.samples = 0
         self._hand = hand
@@ -81,7 +83,7 @@ class Simulation:
         Raises:
             SimulationError: the state became non-finite.
         """
-        rows = self.plant.follow(targets) if self.operator.by_hand else self.plant.run(targets)
+        rows = self._moved(targets)
         self.samples += len(rows)
         # Asked once a block: what once is not finite stays so.
         if not self.plant.finite:
@@ -94,12 +96,20 @@ class Simulation:
         self._targets.append(targets)
         return rows
 
+    def _moved(self, targets: Array) -> Array:
+        """Move the plant, whose numbers follow the faults from tick to tick."""
+        run = self.plant.follow if self.operator.by_hand else self.plant.run
+        if not self._course.faults:
+            return run(targets)
+        live, rows = numbers_of(self.plant), []
+        for first, behind in self._course.pieces(self.samples, self.samples + len(targets)):
+            self._course.write(first, live)
+            rows.append(run(targets[first - self.samples : behind - self.samples]))
+        return np.concatenate(rows)
+
     def recording(self) -> Recording:
         """What the sensors made of the log so far."""
-        noise = None
-        if self.scenario.sensor_noise:
-            noise = np.random.default_rng(seeds_of(self.scenario)[2])
-        return _recording(self.scenario, self.machine, self.log, self.plant.clamps, noise)
+        return _recording(self.scenario, self.machine, self.log, self.plant.clamps)
 
     def snapshot(self) -> Snapshot:
         """This moment: plant, operator, random state and log; nothing that follows changes it."""
@@ -168,18 +178,26 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     return simulation.recording()
 
 
-def _recording(
-    scenario: Scenario, machine: Machine, log: Array, clamps: int, noise: np.random.Generator | None
-) -> Recording:
-    measured = sensors.measured_signals(log, machine, scenario.rate_hz, noise, log[:, at.LOG_OIL] + 273.15)
+def _recording(scenario: Scenario, machine: Machine, log: Array, clamps: int) -> Recording:
+    rate_hz, _, _, noise, _, chance = scenario.rate_hz, *seeds_of(scenario)
+    rng = np.random.default_rng(noise) if scenario.sensor_noise else None
+    faults = SensorCourse(scenario.faults)
+    drawn = faults.drawn(draws.draw(machine, len(log), rate_hz, rng), rate_hz, np.random.default_rng(chance))
+    kelvin = log[:, at.LOG_OIL] + 273.15
+    measured = sensors.shown_signals(log, machine, rate_hz, rng is not None, drawn, kelvin, faults.table)
     truth = sensors.truth_signals(log)
+    # Strokes, pump pressures and oil temperature as they are shown: only a fault makes them differ from the truth.
+    truth |= {name: measured[:, column] for name, column in sensors.shown_names().items()}
     extra = {name: channel for name, channel in {**EXTRA_CHANNELS, **GROUND_CHANNELS}.items() if name in truth}
     facts = {key: value for key, value in plain(scenario).items() if key != "name"}
     mass = known_mass(scenario.machine)
     if mass is not None:
         facts["mass_t"] = round(mass, 3)
+    shares = shares_at(scenario.faults, np.arange(len(log)), rate_hz)
+    for name, share in zip(FAULT_CHANNELS, shares.T, strict=False):
+        extra[name], truth[name] = FAULT_CHANNELS[name], share
     values = np.empty((len(log), len(TABLE_A1) + len(extra)), np.float32)
-    values[:, : len(TABLE_A1)] = measured
+    values[:, : len(TABLE_A1)] = measured[:, : len(TABLE_A1)]
     for n, name in enumerate(extra, start=len(TABLE_A1)):
         values[:, n] = truth[name]
     return Recording(

@@ -16,14 +16,14 @@ START_CLEARANCE_M, START_TRIES = 0.3, 100
 
 
 def seeds_of(scenario: Scenario) -> list[np.random.SeedSequence]:
-    """Seeds of start, operator, sensors and soil, in this order."""
+    """Seeds of start, operator, sensors, soil and faults, in this order."""
     # The order is fixed: another one would give other recordings for the same seed.
-    return np.random.SeedSequence(scenario.seed).spawn(4)
+    return np.random.SeedSequence(scenario.seed).spawn(5)
 
 
 def start_of(scenario: Scenario, machine: Machine) -> tuple[soil.Ground | None, Array]:
     """The ground, None in free air, and the strokes (shares of full, shape (3,)) to start from."""
-    start, _, _, course = seeds_of(scenario)
+    start, _, _, course, _ = seeds_of(scenario)
     ground = None
     if scenario.material:
         material = soil.load_material(scenario.material)

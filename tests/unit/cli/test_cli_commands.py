@@ -10,6 +10,7 @@ from edp import __version__
 from edp.cli import app, demo
 from edp.cli import train as train_command
 from edp.cli.console import duration
+from edp.logs import read_recording
 from edp.signals import TABLE_A1
 from edp.storage import read_json
 
@@ -184,6 +185,25 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     assert "write it without quotes" in edp(*command, "--set", "limit.horizons=[1,x]").err
     assert "must be even" in edp(*command, "--set", "limit.branches=5").err
     assert "unknown key 'limit.branch'" in edp(*command, "--set", "limit.branch=5").err
+
+
+def test_faults_of_the_command_line_take_the_place_of_those_of_the_file(edp, tmp_path):
+    file = tmp_path / "set.toml"
+    file.write_text('minutes = 0.05\nrecordings = 1\n[[faults]]\nkind = "cooler"\nsize = 50\nunit = "%"\n')
+    command = ("simulate", tmp_path / "data", "--scenario", file, "--workers", 1)
+    refused = edp(*command, "--fault", "internal_leek:boom:3L/min@1s")
+    assert refused.code == 1
+    assert "did you mean 'internal_leak'" in refused.err
+    assert not (tmp_path / "data").exists()
+    asked = ("--fault", "internal_leak:boom:3L/min@1s", "--fault", "velocity_stuck:arm@2s")
+    made = edp(*command, *asked, "--json").json
+    assert made["faults"] == ["internal_leak:boom:3.0L/min@1.0s", "velocity_stuck:arm@2.0s"]
+    (log,) = (tmp_path / "data").glob("*.parquet")
+    recording = read_recording(log)
+    assert [table["kind"] for table in recording.meta["faults"]] == ["internal_leak", "velocity_stuck"]
+    assert recording.select(["Fault_1", "Fault_2"]).sum(axis=0).tolist() == [200.0, 100.0]
+    assert "fault: velocity_stuck:arm@2.0s" in edp(*command, *asked).out
+    assert edp(*command).code == 1
 
 
 def test_soil_family_and_format_of_the_command_line_go_before_the_scenario_file(edp, tmp_path):

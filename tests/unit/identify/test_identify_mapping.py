@@ -229,10 +229,11 @@ def test_the_chain_of_lags_moves_as_the_spools_of_the_simulator(parts):
                 state[k] = ahead + (state[k] - ahead) * np.exp(-h / lag)
         grey.append(state[3])
     filters, valves, sim = spool_filters(M22, 5e-4), np.zeros((6, 5)), []
+    no_play = pack(replace(M22, valves=replace(M22.valves, hysteresis=0.0)))[0]
     for n in range(10 * ticks):
         demand = np.full(6, float(n + 0.5 >= 1e3 * M22.valves.dead_time[1]))
         for _ in range(2):
-            pilot_half_step(demand, filters, 0.0, valves)
+            pilot_half_step(demand, filters, no_play, valves)
             spool_half_step(filters, valves)
         sim.append(valves[1, 3])
     apart = np.array(grey) - np.array(sim[9::10])

@@ -163,7 +163,8 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._in_soil = bool(start.scenario.material)
 
     def _truth(self, row: Array) -> Truth:
-        return Truth(row, self.model.machine.valves.pilot_pressure, self._in_soil)
+        pilot_pressure, episodes = self.model.machine.valves.pilot_pressure, self._episodes
+        return Truth(row, pilot_pressure, self._in_soil, episodes.most_faults, episodes.shares())
 
 
 def spaces(channels: tuple[Channel, ...]) -> tuple[Any, Any]:

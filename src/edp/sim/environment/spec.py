@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import check_bounds, integer, shown, span
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1, Channel
+from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine import layout as at
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass
 from edp.sim.scenario import START_STROKES, Scenario
 from edp.sim.sensors import chain
-from edp.sim.sensors.sensors import truth_columns
+from edp.sim.sensors.sensors import shown_names, truth_columns
 
 OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
 """What is shown unless told otherwise: Table A.1, and the strokes, which have no model of a sensor."""
@@ -44,6 +45,7 @@ class EnvironmentSpec:
         sensors: values that replace those of the machine's ``[sensors]``, by key.
         randomise: True or a spread draws a machine of the family of M22 at each reset; the spread widens its scatter.
         masses_t: range of the masses of that family.
+        faults: of machine and sensors; each may be given as a text or as a table, see `edp.sim.faults`.
 
     Raises:
         ConfigError: a value is out of range, or a machine, material or channel is unknown (the closest is offered).
@@ -63,10 +65,12 @@ class EnvironmentSpec:
     sensors: Mapping[str, Any] = field(default_factory=dict)
     randomise: bool | float = False
     masses_t: tuple[float, float] = MASSES_T
+    faults: tuple[FaultSpec, ...] = ()
 
     def __post_init__(self) -> None:
         for key in ("start_strokes", "observed", "masses_t"):
             object.__setattr__(self, key, tuple(getattr(self, key)))
+        object.__setattr__(self, "faults", faults_of(self.faults, "environment"))
         check_bounds("environment", self, loop_latency=integer(0, MOST_LATENCY), lost_frames=span(0.0, 0.99))
         self.scenario(0)
         if self.duration_s * self.rate_hz > MOST_SAMPLES:
@@ -109,6 +113,7 @@ class EnvironmentSpec:
             material=self.material,
             start_strokes=self.start_strokes,
             sensors=self.sensors,
+            faults=self.faults,
         )
 
     @property
@@ -137,7 +142,8 @@ class EnvironmentSpec:
             )
         if columns[name] >= at.LOG_GROUND and not self.material:
             raise ConfigError(f"environment: observed channel '{name}' is there only in soil; choose a material")
-        return chain.MEASURED + columns[name]
+        # Strokes, pump pressures and oil temperature may have faults: what is shown of them is not the row of the log.
+        return shown_names()[name] if name in shown_names() else chain.SENSED + columns[name]
 
 
 def settings_of(settings: EnvironmentSpec | None, changes: Mapping[str, Any]) -> EnvironmentSpec:

@@ -12,11 +12,22 @@ from edp.errors import ConfigError, closest
 from edp.settings.bounds import shown
 from edp.sim.environment.spec import EnvironmentSpec
 from edp.sim.episodes.episodes import EpisodeStart
+from edp.sim.faults import fault_text
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import check_machine
 from edp.sim.machine.machine_files import family_member, known_mass
 
-OF_SPEC = ("machine", "material", "sensor_noise", "hand", "loop_latency", "lost_frames", "start_strokes", "sensors")
+OF_SPEC = (
+    "machine",
+    "material",
+    "sensor_noise",
+    "hand",
+    "loop_latency",
+    "lost_frames",
+    "start_strokes",
+    "sensors",
+    "faults",
+)
 """Settings that the options of a reset may override for one episode."""
 OWN = ("strokes", "oil_temperature")
 """Options besides: strokes to start from (shares of full), and the oil's temperature at the start (degC)."""
@@ -48,6 +59,8 @@ def episode_start(
         scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
     )
     facts: dict[str, Any] = {"seed": seed, "machine": machine.name, "material": spec.material}
+    if spec.faults:
+        facts["faults"] = "; ".join(map(fault_text, spec.faults))
     mass_t = known_mass(machine.name)
     return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
 

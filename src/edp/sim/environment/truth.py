@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.signals import TABLE_A1
+from edp.signals import FAULT_CHANNELS, TABLE_A1
 from edp.sim.machine import layout as at
 from edp.sim.sensors.sensors import KELVIN, OIL, truth_columns
 
@@ -36,15 +36,28 @@ class Truth(Mapping[str, Any]):
         rows: the present row of the plant's log, shape (columns,), or one for each of many machines.
         pilot_pressure: full pilot pressure, Pa; for many machines shape (machine,).
         in_soil: whether there is ground to name.
+        faults: how many faults are named at most.
+        shares: gives how much of each fault is there, shape (machine, fault); None where there are none.
     """
 
-    __slots__ = ("_pilot_pressure", "_rows", "_sources")
+    __slots__ = ("_faults", "_pilot_pressure", "_rows", "_shares", "_sources")
 
-    def __init__(self, rows: Array, pilot_pressure: float | Array, in_soil: bool) -> None:
+    def __init__(
+        self,
+        rows: Array,
+        pilot_pressure: float | Array,
+        in_soil: bool,
+        faults: int = 0,
+        shares: Callable[[], Array] | None = None,
+    ) -> None:
         self._rows, self._pilot_pressure, self._sources = rows, pilot_pressure, sources(in_soil)
+        self._faults, self._shares = tuple(FAULT_CHANNELS)[:faults], shares
 
     def __getitem__(self, name: str) -> Any:
         """A number, or an array of shape (machine,)."""
+        if name in self._faults and self._shares is not None:
+            share = self._shares()[:, self._faults.index(name)]
+            return float(share[0]) if self._rows.ndim == 1 else share
         column, sign = self._sources[name]
         value = self._rows[..., column]
         if sign != 0.0:
@@ -54,7 +67,7 @@ class Truth(Mapping[str, Any]):
         return float(value) if self._rows.ndim == 1 else value.copy()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._sources)
+        return iter((*self._sources, *self._faults))
 
     def __len__(self) -> int:
-        return len(self._sources)
+        return len(self._sources) + len(self._faults)

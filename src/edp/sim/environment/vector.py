@@ -213,7 +213,8 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         self._in_soil = any(each is not None and bool(each.scenario.material) for each in starts)
 
     def _truth(self) -> Truth:
-        return Truth(self._present[1].copy(), self._pilots.copy(), self._in_soil)
+        pilots, episodes = self._pilots.copy(), self._episodes
+        return Truth(self._present[1].copy(), pilots, self._in_soil, episodes.most_faults, episodes.shares())
 
 
 def _side_by_side(

@@ -16,19 +16,24 @@ from edp.sim.physics.jit import pasted
 Array = NDArray[np.float64]
 
 # numbers[...], the first block of a changing row
-TICK, SAMPLES, CLAMPS, HAND_S, IN_AIR, DELAY = range(6)
-"""Ticks done and in all, clamped pressures, time step of the hand (0: none), 1 in free air, ticks of loop latency."""
-NUMBERS = 6
+TICK, SAMPLES, CLAMPS, HAND_S, IN_AIR, DELAY, CHANGED = range(7)
+"""Ticks done and in all, clamped pressures, time step of the hand (0: none), 1 in free air, ticks of loop latency, and
+how many of the changes that faults make are done."""
+NUMBERS = 7
 
 # blocks of the row that changes
 (
     NUMBER, STATE, VALVES, HAND, PAST, AXES, PLANT, DELAYS, COARSE, FINE, COARSE_FILTERS, FINE_FILTERS,
     HEIGHTS, GROUND_MEMORY, SENSOR_NUMBERS, SENSOR_AXES, SENSOR_PLANT, SENSOR_MEMORY, HISTORY, ROW, MEASURED, SHOWN,
-) = range(22)  # fmt: skip
+    SOIL_NUMBERS, SENSOR_FAULTS, FAULT_MEMORY,
+) = range(25)  # fmt: skip
 # blocks of the row that was drawn
-SENSOR_DRAWS, LOST, SOIL_NUMBERS, SOIL_TABLES, SOIL_COURSE = range(22, 27)
-BLOCKS = 27
-CHANGING = 22
+SENSOR_DRAWS, LOST, SOIL_TABLES, SOIL_COURSE, CHANGES = range(25, 30)
+BLOCKS = 30
+CHANGING = 25
+# changes[number, ...]: what a fault makes of a number of the row that changes: at which tick, its block, its place in
+# that, and its value from then on
+AT_TICK, BLOCK, WITHIN, VALUE = range(4)
 ENTRY = 3
 """Numbers of a table's entry: first place in its row, rows and columns of the block."""
 

@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.sim.episodes import blocks, tick
+from edp.sim.faults import FaultSpec
+from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at, spare_s
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.physics import soil
 from edp.sim.physics.plant import Plant
 from edp.sim.scenario import Scenario, SimulationError
-from edp.sim.sensors import chain, draws
+from edp.sim.sensors import alterations, chain, draws
 from edp.sim.start import seeds_of, start_of
 
 Array = NDArray[np.float64]
+
+
+_FAULTY = (
+    blocks.AXES,
+    blocks.PLANT,
+    blocks.DELAYS,
+    blocks.COARSE_FILTERS,
+    blocks.FINE_FILTERS,
+    blocks.SOIL_NUMBERS,
+)
+"""Blocks that hold what faults of the machine change, in the order of `edp.sim.faults.course.BLOCKS`."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +72,17 @@ class Episodes:
     Args:
         count: how many.
         columns: what observations show, numbers of `tick.SOURCES`.
+
+    Attributes:
+        starts: how each began; None where none has.
+        most_faults: largest number of faults that one of them has.
     """
 
     def __init__(self, count: int, columns: NDArray[np.int64]) -> None:
         self.count, self.columns = count, columns
         self.memory, self.drawn = np.zeros((count, 0)), np.zeros((count, 0))
         self.starts: list[EpisodeStart | None] = [None] * count
+        self.most_faults = 0
         self._scratch = tick.new_scratch()
         self._all = np.ones(count, dtype=np.bool_)
 
@@ -108,6 +128,20 @@ class Episodes:
         """Ticks done since an episode began."""
         return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
 
+    def shares(self) -> Callable[[], Array] | None:
+        """What gives, whenever it is called, how much of each fault is there now; None where no episode has faults.
+
+        The shares are from 0 to 1, shape (episode, fault), NaN beyond the faults of an episode.
+        """
+        if self.most_faults == 0:
+            return None
+        plans = tuple(
+            ((), 1.0) if start is None else (start.scenario.faults, start.scenario.rate_hz) for start in self.starts
+        )
+        ticks = self.memory[:, blocks.BLOCKS * blocks.ENTRY + blocks.TICK].astype(np.int64)
+        # No closure: what is true travels between processes.
+        return partial(_shares_of, plans, ticks, self.most_faults)
+
     def ended(self, index: int) -> bool:
         """Whether an episode has all its ticks behind it."""
         first = blocks.BLOCKS * blocks.ENTRY
@@ -147,11 +181,11 @@ class Episodes:
         start = self.starts[index]
         if start is None:
             raise ConfigError(f"episode {index} has not begun; reset it first")
-        noise, lost, course = seed.spawn(3)
+        noise, lost, course, chance = seed.spawn(4)
         drawn, done = self.drawn[index].copy(), self.ticks(index) + 1
         present = blocks.view(blocks.SENSOR_DRAWS, self.memory[index], drawn)
-        if start.scenario.sensor_noise:
-            fresh = draws.draw(start.machine, len(present), start.scenario.rate_hz, np.random.default_rng(noise))
+        if start.scenario.sensor_noise or present.shape[1] > chain.DRAWS:
+            fresh = _sensor_draws(start, noise, chance)
             _bridge(present, fresh, done, len(blocks.view(blocks.HISTORY, self.memory[index], drawn)))
         losses = blocks.view(blocks.LOST, self.memory[index], drawn)[0]
         losses[done:] = _losses(start, len(losses), lost)[done:]
@@ -168,6 +202,7 @@ class Episodes:
     def _put(self, index: int, start: EpisodeStart, memory: Array, drawn: Array) -> None:
         """Give an episode these rows; all rows become as long as the longest."""
         self.starts[index] = start
+        self.most_faults = max(len(each.scenario.faults) for each in self.starts if each is not None)
         if self.count == 1:
             self.memory, self.drawn = memory[None], drawn[None]
             return
@@ -192,9 +227,25 @@ def _bridge(present: Array, fresh: Array, done: int, depth: int) -> None:
     late = slice(chain.AT_JOINTS, chain.AT_VALVES + 1)
     earliest = (np.arange(len(present)) - (depth - 1.0))[:, None]
     present[done:, late] = np.maximum(np.maximum(fresh[done:, late], earliest[done:]), present[done - 1, late])
-    bias, errors = slice(chain.RATE_BIAS, chain.RATE_ERROR), slice(chain.RATE_ERROR, chain.DRAWS)
+    bias, errors = slice(chain.RATE_BIAS, chain.RATE_ERROR), slice(chain.RATE_ERROR, None)
     present[done:, bias] = present[done - 1, bias] + fresh[done:, bias] - fresh[done - 1, bias]
     present[done:, errors] = fresh[done:, errors]
+
+
+def _shares_of(plans: Sequence[tuple[tuple[FaultSpec, ...], float]], ticks: NDArray[np.int64], most: int) -> Array:
+    """How much of each fault of several episodes is there at their ticks, shape (episode, fault)."""
+    shares = np.full((len(plans), most), np.nan)
+    for index, (faults, rate_hz) in enumerate(plans):
+        shares[index, : len(faults)] = shares_at(faults, ticks[index : index + 1], rate_hz)[0]
+    return shares
+
+
+def _sensor_draws(start: EpisodeStart, noise: np.random.SeedSequence, chance: np.random.SeedSequence) -> Array:
+    """What is random in the sensors of an episode and in their faults, shape (samples, columns)."""
+    scenario = start.scenario
+    rng = np.random.default_rng(noise) if scenario.sensor_noise else None
+    healthy = draws.draw(start.machine, scenario.samples, scenario.rate_hz, rng)
+    return SensorCourse(scenario.faults).drawn(healthy, scenario.rate_hz, np.random.default_rng(chance))
 
 
 def _losses(start: EpisodeStart, samples: int, seed: np.random.SeedSequence) -> Array:
@@ -204,22 +255,44 @@ def _losses(start: EpisodeStart, samples: int, seed: np.random.SeedSequence) -> 
     return (np.random.default_rng(seed).random(samples) < start.lost_frames).astype(float)
 
 
+def _changes(start: EpisodeStart, plant: Plant) -> Array:
+    """What faults make of the plant's numbers, as the block of changes has it."""
+    changes = MachineCourse(start.scenario.faults, numbers_of(plant)).changes(start.scenario.samples)
+    changes[:, blocks.BLOCK] = np.array(_FAULTY, dtype=float)[changes[:, blocks.BLOCK].astype(np.int64)]
+    return changes
+
+
+def _sensor_parts(start: EpisodeStart) -> dict[int, Array]:
+    """Blocks of the sensors, their draws and their faults."""
+    scenario, seeds = start.scenario, seeds_of(start.scenario)
+    drawn = _sensor_draws(start, seeds[2], seeds[4])
+    faults = SensorCourse(scenario.faults).table
+    numbers, axes, plant, table = draws.pack_sensors(start.machine, scenario.rate_hz, scenario.sensor_noise, faults)
+    return {
+        blocks.SENSOR_NUMBERS: numbers,
+        blocks.SENSOR_AXES: axes,
+        blocks.SENSOR_PLANT: plant,
+        blocks.SENSOR_MEMORY: np.zeros(chain.SENSOR_MEMORY),
+        blocks.HISTORY: np.zeros((draws.depth(drawn), chain.REMEMBERED)),
+        blocks.MEASURED: np.zeros(chain.SENSED),
+        blocks.SENSOR_FAULTS: table,
+        blocks.FAULT_MEMORY: np.zeros(alterations.memory_shape(faults, drawn[:, chain.DRAWS :])),
+        blocks.SENSOR_DRAWS: drawn,
+    }
+
+
 def _rows(start: EpisodeStart, width: int) -> tuple[Array, Array]:
     """Both rows of an episode at rest at its start; `width` is that of its observations."""
     scenario, machine = start.scenario, start.machine
     ground, strokes = start_of(scenario, machine)
     if start.strokes is not None:
         strokes = np.array(start.strokes)
-    plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground)
+    plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground, spare_s(scenario.faults))
     if len(plant.past) > tick.MOST_PAST:
         raise ConfigError(
             f"machine {machine.name} has dead times of {len(plant.past)} ticks at {scenario.rate_hz} Hz; at most "
             f"{tick.MOST_PAST} are taken: choose a lower rate_hz"
         )
-    seeds = seeds_of(scenario)
-    rng = np.random.default_rng(seeds[2]) if scenario.sensor_noise else None
-    drawn = draws.draw(machine, scenario.samples, scenario.rate_hz, rng)
-    sensor_numbers, sensor_axes, sensor_plant = draws.pack_sensors(machine, scenario.rate_hz, rng is not None)
     coarse, fine = plant.clocks
     soil_numbers, tables, course, heights, ground_memory = soil.no_ground() if ground is None else ground.arrays()
     columns = at.LOG_COLUMNS if ground is None else at.LOG_GROUND + at.GROUND_POINTS
@@ -230,6 +303,7 @@ def _rows(start: EpisodeStart, width: int) -> tuple[Array, Array]:
         1.0 / scenario.rate_hz if start.hand else 0.0,
         ground is None,
         start.loop_latency,
+        0.0,
     ]
     parts = {
         blocks.NUMBER: np.array(numbers, dtype=float),
@@ -246,18 +320,12 @@ def _rows(start: EpisodeStart, width: int) -> tuple[Array, Array]:
         blocks.FINE_FILTERS: fine[3].reshape(at.SPOOLS, -1),
         blocks.HEIGHTS: heights,
         blocks.GROUND_MEMORY: ground_memory,
-        blocks.SENSOR_NUMBERS: sensor_numbers,
-        blocks.SENSOR_AXES: sensor_axes,
-        blocks.SENSOR_PLANT: sensor_plant,
-        blocks.SENSOR_MEMORY: np.zeros(chain.SENSOR_MEMORY),
-        blocks.HISTORY: np.zeros((draws.depth(drawn), chain.REMEMBERED)),
         blocks.ROW: np.zeros((1, columns)),
-        blocks.MEASURED: np.zeros(chain.MEASURED),
         blocks.SHOWN: np.zeros((start.loop_latency + 2, width)),
-        blocks.SENSOR_DRAWS: drawn,
-        blocks.LOST: _losses(start, len(drawn), seeds[1]),
+        blocks.LOST: _losses(start, scenario.samples, seeds_of(scenario)[1]),
         blocks.SOIL_NUMBERS: soil_numbers,
         blocks.SOIL_TABLES: tables,
         blocks.SOIL_COURSE: course,
+        blocks.CHANGES: _changes(start, plant),
     }
-    return blocks.rows_of(parts)
+    return blocks.rows_of(parts | _sensor_parts(start))

@@ -15,8 +15,8 @@ from edp.sim.sensors import chain, logbook
 
 Array = NDArray[np.float64]
 LOG_WIDTH = at.LOG_GROUND + at.GROUND_POINTS
-SOURCES = chain.MEASURED + LOG_WIDTH
-"""What an observation may show: the measured signals, then every column of the log."""
+SOURCES = chain.SENSED + LOG_WIDTH
+"""What an observation may show: the signals that are sensed, then every column of the log."""
 Out = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
 """Observations, shape (episode, column); present rows of the log, shape (episode, LOG_WIDTH); which have ended."""
 KELVIN = 273.15
@@ -67,7 +67,7 @@ MOST_PAST = 256
 def setup_of(memory: Array, drawn: Array, scratch: Array) -> Setup:
     """What the plant's step takes: axes, plant, work and the arrays of the ground."""
     ground = (
-        blocks.line(blocks.SOIL_NUMBERS, memory, drawn),
+        blocks.line(blocks.SOIL_NUMBERS, memory, memory),
         blocks.table(blocks.SOIL_TABLES, memory, drawn),
         blocks.table(blocks.SOIL_COURSE, memory, drawn),
         blocks.line(blocks.HEIGHTS, memory, memory),
@@ -103,6 +103,18 @@ def move(memory: Array, lever: Array, setup: Setup, room: Array) -> int:
 
 
 @inlined
+def change(memory: Array, drawn: Array) -> None:
+    """Give the plant the numbers that faults have made by this tick."""
+    numbers, changes = blocks.line(blocks.NUMBER, memory, memory), blocks.table(blocks.CHANGES, memory, drawn)
+    done = int(numbers[blocks.CHANGED])
+    while done < changes.shape[0] and changes[done, blocks.AT_TICK] <= numbers[blocks.TICK]:
+        first = int(memory[blocks.ENTRY * int(changes[done, blocks.BLOCK])])
+        memory[first + int(changes[done, blocks.WITHIN])] = changes[done, blocks.VALUE]
+        done += 1
+    numbers[blocks.CHANGED] = done
+
+
+@inlined
 def look(memory: Array, drawn: Array, setup: Setup, work: Array) -> None:
     """Log the present instant and let the sensors take it."""
     state, valves = blocks.line(blocks.STATE, memory, memory), blocks.table(blocks.VALVES, memory, memory)
@@ -114,11 +126,13 @@ def look(memory: Array, drawn: Array, setup: Setup, work: Array) -> None:
         blocks.line(blocks.SENSOR_NUMBERS, memory, memory),
         blocks.table(blocks.SENSOR_AXES, memory, memory),
         blocks.line(blocks.SENSOR_PLANT, memory, memory),
+        blocks.table(blocks.SENSOR_FAULTS, memory, memory),
     )
     sensor_state = (
         blocks.line(blocks.SENSOR_MEMORY, memory, memory),
         blocks.table(blocks.HISTORY, memory, memory),
         work,
+        blocks.table(blocks.FAULT_MEMORY, memory, memory),
     )
     draws = blocks.table(blocks.SENSOR_DRAWS, memory, drawn)
     measured = blocks.line(blocks.MEASURED, memory, memory)
@@ -137,10 +151,7 @@ def show(memory: Array, drawn: Array, columns: NDArray[np.int64], index: int, ou
     last, now = shown[ring], shown[tick % ring]
     for c in range(columns.shape[0]):
         source = columns[c]
-        value = measured[source] if source < chain.MEASURED else row[source - chain.MEASURED]
-        if source == chain.MEASURED + at.LOG_OIL:
-            value += KELVIN
-        now[c] = value
+        now[c] = measured[source] if source < chain.SENSED else row[source - chain.SENSED]
     visible = shown[max(tick - late, 0) % ring]
     if tick == 0 or blocks.line(blocks.LOST, memory, drawn)[tick] == 0.0:
         for c in range(columns.shape[0]):
@@ -191,6 +202,7 @@ def step_all(
         numbers = blocks.line(blocks.NUMBER, memory[e], memory[e])
         numbers[blocks.CLAMPS] += move(memory[e], lever, setup, room)
         numbers[blocks.TICK] += 1.0
+        change(memory[e], drawn[e])
         look(memory[e], drawn[e], setup, work)
         show(memory[e], drawn[e], columns, e, out)
         total = 0.0
@@ -207,6 +219,7 @@ def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Arra
     """What is seen of episode `index` before its first tick; `memory` and `drawn` are its rows."""
     rest, work = scratch[9 + at.SPOOLS * (MOST_PAST + 2) :], scratch[3:9].reshape(2, 3)
     setup = setup_of(memory, drawn, rest)
+    change(memory, drawn)
     look(memory, drawn, setup, work)
     show(memory, drawn, columns, index, out)
 

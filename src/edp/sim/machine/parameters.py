@@ -64,7 +64,8 @@ def _pack_cylinders(machine: Machine, axes: Array) -> None:
     axes[:, at.STOP_STIFFNESS] = cylinders.stop_stiffness
     axes[:, at.STOP_DAMPING] = cylinders.stop_damping
     axes[:, at.PISTON_LEAK] = cylinders.piston_leakage
-    axes[:, at.SPOOL_LEAK] = cylinders.spool_leakage
+    axes[:, at.HEAD_LEAK] = axes[:, at.ROD_LEAK] = cylinders.spool_leakage
+    axes[:, at.CHECK] = valves.check_leakage
     axes[:, at.RELIEF_HEAD] = valves.port_relief_head
     axes[:, at.RELIEF_ROD] = valves.port_relief_rod
 
@@ -105,6 +106,9 @@ def _pack_valves(machine: Machine, axes: Array) -> None:
     axes[:, at.DEMAND_RETRACT] = valves.pump_demand_retract
     axes[:, at.CONFLUX_SHARE_EXTEND] = valves.conflux_extend
     axes[:, at.CONFLUX_SHARE_RETRACT] = valves.conflux_retract
+    axes[:, at.HYSTERESIS] = axes[:, at.CONFLUX_HYSTERESIS] = valves.hysteresis
+    # A sound spool reaches the end of its travel.
+    axes[:, at.WIDEST] = axes[:, at.CONFLUX_WIDEST] = 1.0
 
 
 def _pack_linkage(machine: Machine, plant: Array) -> None:
@@ -135,11 +139,11 @@ def _pack_supply(machine: Machine, plant: Array) -> None:
     thermal.set_temperature(oil.temperature, plant)
     plant[at.AIR] = oil.air_fraction
     plant[at.TANK] = oil.tank_pressure
-    plant[at.CHECK] = valves.check_leakage
+    plant[at.REGEN_CHECK] = valves.check_leakage
     plant[at.ANTI_CAVITATION] = conductance(valves.anti_cavitation)
     plant[at.PORT_SLOPE] = valves.port_relief_slope
     plant[at.MAX_FLOW] = pumps.max_flow
-    plant[at.EFFICIENCY] = pumps.volumetric_efficiency
+    plant[at.EFFICIENCY] = plant[at.EFFICIENCY_2] = pumps.volumetric_efficiency
     plant[at.POWER_LIMIT] = pumps.power_limit
     plant[at.MIN_DISPLACEMENT] = pumps.min_displacement
     plant[at.PUMP_TIME] = pumps.time_constant
@@ -148,7 +152,6 @@ def _pack_supply(machine: Machine, plant: Array) -> None:
     plant[at.RELIEF_SLOPE] = pumps.relief_slope
     plant[at.BYPASS] = conductance(pumps.bypass)
     plant[at.BYPASS_CLOSED] = pumps.bypass_closed_at
-    plant[at.HYSTERESIS] = valves.hysteresis
     plant[at.LEVER_DEAD_ZONE] = valves.lever_dead_zone
     plant[at.CONFLUX_START] = valves.conflux_start
     if valves.flow_sharing not in FLOW_SHARING:

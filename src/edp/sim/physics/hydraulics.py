@@ -98,11 +98,12 @@ def cylinder_flows(
         rod by rod, either by the other, head by pump 1 and 2, rod by pump 1 and 2.
     """
     head, rod, pump_1, pump_2 = pressures
-    check, tank = plant[at.CHECK], plant[at.TANK]
-    spool_leak = axes[i, at.SPOOL_LEAK] * plant[at.THINNING]
+    check, regeneration_check, tank = axes[i, at.CHECK], plant[at.REGEN_CHECK], plant[at.TANK]
+    head_leak = axes[i, at.HEAD_LEAK] * plant[at.THINNING]
+    rod_leak = axes[i, at.ROD_LEAK] * plant[at.THINNING]
     leak = axes[i, at.PISTON_LEAK] * plant[at.THINNING]
-    h, h_h = port_flows(head, axes[i, at.RELIEF_HEAD], spool_leak, plant)
-    r, r_r = port_flows(rod, axes[i, at.RELIEF_ROD], spool_leak, plant)
+    h, h_h = port_flows(head, axes[i, at.RELIEF_HEAD], head_leak, plant)
+    r, r_r = port_flows(rod, axes[i, at.RELIEF_ROD], rod_leak, plant)
     head_1, h_1, h_load_1 = section(opened[i, at.HEAD_IN_1], pump_1, head, highest[0], check)
     head_2, h_2, h_load_2 = section(opened[i, at.HEAD_IN_2], pump_2, head, highest[1], check)
     rod_1, r_1, r_load_1 = section(opened[i, at.ROD_IN_1], pump_1, rod, highest[0], check)
@@ -110,8 +111,8 @@ def cylinder_flows(
     # Spools open to tank have no check valve: 1.0 lets a cavitating chamber draw oil back.
     head_out, h_out = drain(opened[i, at.HEAD_OUT], head - tank, 1.0)
     rod_out, r_out = drain(opened[i, at.ROD_OUT], rod - tank, 1.0)
-    down, by_down = drain(opened[i, at.HEAD_TO_ROD], head - rod, check)
-    up, by_up = drain(opened[i, at.ROD_TO_HEAD], rod - head, check)
+    down, by_down = drain(opened[i, at.HEAD_TO_ROD], head - rod, regeneration_check)
+    up, by_up = drain(opened[i, at.ROD_TO_HEAD], rod - head, regeneration_check)
     through, across = leak * (head - rod) + down - up, leak + by_down + by_up
     flows = (h + head_1 + head_2 - head_out - through, r + rod_1 + rod_2 - rod_out + through)
     slopes = (h_h - h_load_1 - h_load_2 - h_out - across, r_r - r_load_1 - r_load_2 - r_out - across, across)

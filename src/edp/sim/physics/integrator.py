@@ -133,7 +133,7 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
     for m in range(2):
         p = w[at.PUMP + m]
         lost, lost_slope = hydraulics.pump_outflow(p, s[BYPASS + m], plant)
-        supply = plant[at.EFFICIENCY] * plant[at.MAX_FLOW] * w[at.DISPLACEMENT + m]
+        supply = plant[at.EFFICIENCY + m] * plant[at.MAX_FLOW] * w[at.DISPLACEMENT + m]
         c_pump = hydraulics.stiffness(p, plant) / plant[at.LINE_VOLUME]
         out[at.PUMP + m] = c_pump * (supply - lost - (drawn_1 if m == 0 else drawn_2))
         if jacobian:
@@ -306,7 +306,7 @@ def step(
     h, share, filters = clock
     axes, plant, work, ground = setup
     # Half steps before and after ROS2 in mirrored order: Strang splitting has order 2 only if it is symmetric.
-    valve.pilot_half_step(demand, filters, plant[at.HYSTERESIS], valves)
+    valve.pilot_half_step(demand, filters, axes, valves)
     valve.spool_half_step(filters, valves)
     pump.displacement_step(state, valves, axes, plant, share)
     for i in range(at.AXES):
@@ -327,7 +327,7 @@ def step(
         state[at.PSI + i] += 0.5 * h * state[at.RATE + i]
     pump.displacement_step(state, valves, axes, plant, share)
     valve.spool_half_step(filters, valves)
-    valve.pilot_half_step(demand, filters, plant[at.HYSTERESIS], valves)
+    valve.pilot_half_step(demand, filters, axes, valves)
     # Last: within a step the stages may pass below vacuum, and a clamp there would break the order.
     return clamp_pressures(state)
 

@@ -173,6 +173,7 @@ class Plant:
         rate_hz: logging and command rate.
         step_s: integration step; a whole number of them must fill a sample.
         ground: what the bucket digs in; None in free air.
+        spare_s: dead time that may be added while it runs, s.
 
     Raises:
         ConfigError: the step does not divide the sample time.
@@ -185,6 +186,7 @@ class Plant:
         rate_hz: float = 100.0,
         step_s: float = 1e-3,
         ground: soil.Ground | None = None,
+        spare_s: float = 0.0,
     ) -> None:
         steps = steps_per_sample(rate_hz, step_s)
         self.machine = machine
@@ -201,7 +203,7 @@ class Plant:
         self._ground = soil.no_ground() if ground is None else ground.arrays()
         self.delays = valve.dead_times(machine) * rate_hz
         # One sample more than the longest dead time: a delay between samples reads the older one.
-        self._past = int(np.ceil(self.delays.max())) + 1
+        self._past = int(np.ceil(self.delays.max() + spare_s * rate_hz)) + 1
         self._demands = np.zeros((self._past, at.SPOOLS))
         coarse, fine = ((n * steps, *integrator.clock_of(machine, step_s / n)) for n in (1, FINE))
         self.clocks = coarse, fine
@@ -218,6 +220,11 @@ class Plant:
         return self._demands
 
     @property
+    def soil_numbers(self) -> Array:
+        """Numbers of bucket and soil, live; zeros in free air."""
+        return self._ground[0]
+
+    @property
     def payload_kg(self) -> float:
         """Soil in the bucket; 0 in free air."""
         return 0.0 if self.ground is None else self.ground.payload_kg
@@ -226,8 +233,8 @@ class Plant:
     def memory(self) -> tuple[NDArray[Any], ...]:
         """Every array that changes as time goes on, live: what to copy, and to write back to, for an exact restart."""
         changing = (self.state, self.valves, self.hand, self._demands, self.axes, self.plant, self._counts)
-        # The first three (numbers, tables, course) are read only while the plant runs.
-        return (*changing, *self._ground[3:])
+        # Tables and course are read only while the plant runs.
+        return (*changing, self._ground[0], *self._ground[3:])
 
     @property
     def finite(self) -> bool:

@@ -42,7 +42,7 @@ def fill_pilots(levers: Array, full: float, axes: Array, plant: Array, demand: A
             out[k, 2 * j + 1] = -full * demand[j] if demand[j] < 0.0 else 0.0
 
 
-def _oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:
+def oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:
     """Exact transition of (error, rate) of a low-pass of damping <= 1 over one step, row by row, 4 values."""
     omega = 2.0 * math.pi * frequency_hz
     # The exact solution instead of an integration step: stable and of the same result for any step.
@@ -62,7 +62,7 @@ def spool_filters(machine: Machine, step_s: float) -> Array:
     spools = valves.spool_frequency + valves.conflux_spool_frequency
     return np.array(
         [
-            [_oscillator(pilot, PILOT_DAMPING, step_s), _oscillator(spool, SPOOL_DAMPING, step_s)]
+            [oscillator(pilot, PILOT_DAMPING, step_s), oscillator(spool, SPOOL_DAMPING, step_s)]
             for pilot, spool in zip(pilots, spools, strict=True)
         ]
     )
@@ -75,13 +75,14 @@ def dead_times(machine: Machine) -> Array:
 
 
 @inlined
-def pilot_half_step(demand: Array, filters: Array, hysteresis: float, valves: Array) -> None:
+def pilot_half_step(demand: Array, filters: Array, axes: Array, valves: Array) -> None:
     """Advance the pilots by half a step, then move the play operator's output."""
     for j in range(at.SPOOLS):
         error, rate = valves[j, at.PILOT] - demand[j], valves[j, at.PILOT_RATE]
         pilot = demand[j] + filters[j, 0, 0] * error + filters[j, 0, 1] * rate
         valves[j, at.PILOT] = pilot
         valves[j, at.PILOT_RATE] = filters[j, 0, 2] * error + filters[j, 0, 3] * rate
+        hysteresis = axes[j, at.HYSTERESIS] if j < at.AXES else axes[j - at.AXES, at.CONFLUX_HYSTERESIS]
         valves[j, at.PLAY] = max(pilot - hysteresis, min(pilot + hysteresis, valves[j, at.PLAY]))
 
 
@@ -96,9 +97,12 @@ def spool_half_step(filters: Array, valves: Array) -> None:
 
 
 @inlined
-def opening(spool: float, dead_band: float) -> float:
-    """Share of the full area behind the dead band: r (0.25 + 0.75 r), fine control near closed."""
-    r = min(max((abs(spool) - dead_band) / (1.0 - dead_band), 0.0), 1.0)
+def opening(spool: float, dead_band: float, widest: float = 1.0) -> float:
+    """Share of the full area behind the dead band: r (0.25 + 0.75 r), fine control near closed.
+
+    `widest` is the travel behind the dead band that the spool can reach, as a share; 1 for a sound one.
+    """
+    r = min(max((abs(spool) - dead_band) / (1.0 - dead_band), 0.0), widest)
     return r * (0.25 + 0.75 * r)
 
 
@@ -118,20 +122,20 @@ def open_spools(valves: Array, stroke: Array, axes: Array, out: Array) -> None:
         spool, second = valves[i, at.SPOOL], valves[i + 3, at.SPOOL]
         pump, second_pump = int(axes[i, at.PRIMARY_PUMP]), int(axes[i, at.CONFLUX_PUMP])
         if second > 0.0:
-            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_EXTEND])
+            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_EXTEND], axes[i, at.CONFLUX_WIDEST])
             out[i, at.HEAD_IN_1 + second_pump] = axes[i, at.CONFLUX_EXTEND] * area
         else:
-            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_RETRACT])
+            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_RETRACT], axes[i, at.CONFLUX_WIDEST])
             out[i, at.ROD_IN_1 + second_pump] = axes[i, at.CONFLUX_RETRACT] * area
         length, least = axes[i, at.CUSHION_LENGTH], axes[i, at.CUSHION_AREA]
         if spool > 0.0:
-            area = opening(spool, axes[i, at.DEAD_BAND_EXTEND])
+            area = opening(spool, axes[i, at.DEAD_BAND_EXTEND], axes[i, at.WIDEST])
             left = area * cushion(axes[i, at.STROKE] - stroke[i], length, least)
             out[i, at.HEAD_IN_1 + pump] = axes[i, at.IN_EXTEND] * area
             out[i, at.ROD_OUT] = axes[i, at.OUT_EXTEND] * left
             out[i, at.ROD_TO_HEAD] = axes[i, at.REGEN_EXTEND] * left
         else:
-            area = opening(spool, axes[i, at.DEAD_BAND_RETRACT])
+            area = opening(spool, axes[i, at.DEAD_BAND_RETRACT], axes[i, at.WIDEST])
             left = area * cushion(stroke[i], length, least)
             out[i, at.ROD_IN_1 + pump] = axes[i, at.IN_RETRACT] * area
             out[i, at.HEAD_OUT] = axes[i, at.OUT_RETRACT] * left

@@ -12,17 +12,23 @@ from numpy.typing import NDArray
 from edp.sim.machine import layout as at
 from edp.sim.physics import linkage, pins
 from edp.sim.physics.jit import plainly_compiled, plainly_inlined
-from edp.sim.sensors import filters, transducers
+from edp.sim.sensors import alterations, filters, transducers
 
 Array = NDArray[np.float64]
 REFERENCE_TEMPERATURE = 313.15
 """Oil temperature in K at which pressure transmitters are adjusted (40 degC)."""
 MEASURED = 24
+"""Signals of Table A.1."""
+STROKES, PUMPS, OIL = 24, 27, 29
+SENSED = 30
+"""What is shown in all: behind Table A.1 strokes, pump pressures and oil temperature, which have no noise."""
+VELOCITIES, PRESSURES, PILOTS = 0, 6, 12
 
 # drawn[tick, ...]: when the values that each ECU shows were read, in ticks; bias and errors of joint rates (rad/s),
 # errors of cylinder velocities (m/s) and pressures (Pa)
 AT_JOINTS, AT_PRESSURES, AT_VALVES, RATE_BIAS, RATE_ERROR, VELOCITY_ERROR, PRESSURE_ERROR = 0, 1, 2, 3, 6, 9, 12
 DRAWS = 18
+"""Behind them, one column a fault of the sensors: its number of the tick, see `edp.sim.sensors.alterations`."""
 # numbers[...]: sizes of one machine's sensors at one rate
 (
     NOISY, STEP_S, PILOT_FULL, DERIVATIVE, LAGGED, LAG, RANGE, QUANTUM, DRIFT, ANGLE_QUANTUM, LEVERED, PLAYING, PLAY,
@@ -36,14 +42,15 @@ SENSOR_MEMORY = 30
 # history[tick, ...]: what frames of the bus read between ticks
 VELOCITY, ANGLE, RATE, PRESSURE, TEMPERATURE, DEMAND = 0, 3, 6, 9, 15, 16
 REMEMBERED = 22
+Setup = tuple[Array, Array, Array, Array]
+"""Numbers of the sensors, `axes` and `plant` of the machine as built, and the table of faults."""
+State = tuple[Array, Array, Array, Array]
 
 
 @plainly_inlined
-def remember(
-    sample: Array, kelvin: float, tick: int, setup: tuple[Array, Array, Array], memory: Array, row: Array, work: Array
-) -> None:
+def remember(sample: Array, kelvin: float, tick: int, setup: Setup, memory: Array, row: Array, work: Array) -> None:
     """What the sensors feel at this tick into `row` of the history; `sample` is one row of the log, (1, columns)."""
-    numbers, axes, plant = setup
+    numbers, axes, plant, _ = setup
     if numbers[PLAYING] > 0.0:
         force, mass = work[0:1], work[1:2]
         pins.fill_loads(sample, axes, plant, force, mass)
@@ -87,9 +94,9 @@ def between(history: Array, position: float) -> tuple[Array, Array, float]:
 
 
 @plainly_inlined
-def read_joints(drawn: Array, setup: tuple[Array, Array, Array], history: Array, out: Array) -> None:
+def read_joints(drawn: Array, setup: Setup, history: Array, out: Array) -> None:
     """Cylinder velocities that the joints' ECU sends: v = J(measured angle) * measured rate."""
-    numbers, _, plant = setup
+    numbers, _, plant, _ = setup
     low, high, part = between(history, drawn[AT_JOINTS])
     for i in range(at.AXES):
         v = low[VELOCITY + i] + part * (high[VELOCITY + i] - low[VELOCITY + i])
@@ -147,11 +154,11 @@ def sense(
     kelvin: float,
     tick: int,
     drawn: Array,
-    setup: tuple[Array, Array, Array],
-    state: tuple[Array, Array, Array],
+    setup: Setup,
+    state: State,
     out: Array,
 ) -> None:
-    """The 24 signals of Table A.1 at one tick, shape (24,), into `out`.
+    """The 24 signals of Table A.1 at one tick and what is shown beside them, shape (SENSED,), into `out`.
 
     Ticks must be taken in order from 0, which starts everything at rest.
 
@@ -161,11 +168,11 @@ def sense(
         tick: counted from 0.
         drawn: the tick's row of `draws.draw`.
         setup: of `draws.pack_sensors`.
-        state: memory, history (a ring of ticks) and scratch of shape (2, 3).
+        state: memory, history (a ring of ticks), scratch of shape (2, 3) and memory of the faults.
         out: filled.
     """
     numbers = setup[0]
-    memory, history, work = state
+    memory, history, work, fault_memory = state
     row = history[tick % history.shape[0]]
     if numbers[NOISY] > 0.0:
         remember(sample, kelvin, tick, setup, memory, row, work)
@@ -180,6 +187,13 @@ def sense(
         for n in range(6):
             out[6 + n] = sample[0, at.HEAD + n]
         read_pilots(float(tick), numbers[PILOT_FULL], history, out)
+    for i in range(at.AXES):
+        out[STROKES + i] = sample[0, at.LOG_STROKE + i]
+    out[PUMPS], out[PUMPS + 1], out[OIL] = sample[0, at.PUMP], sample[0, at.PUMP + 1], kelvin
+    # Before the derivative, which the machine's computer takes of the velocities that it is shown.
+    full_scale, quantum = (numbers[RANGE], numbers[QUANTUM]) if numbers[NOISY] > 0.0 else (0.0, 0.0)
+    transmitter = (PRESSURES, PILOTS, full_scale, quantum)
+    alterations.alter(tick, drawn[DRAWS:], setup[3], fault_memory, transmitter, out)
     differentiate(tick, numbers, memory, out)
 
 
@@ -188,15 +202,15 @@ def sense_all(
     log: Array,
     kelvin: Array,
     drawn: Array,
-    setup: tuple[Array, Array, Array],
-    state: tuple[Array, Array, Array],
+    setup: Setup,
+    state: State,
     out: Array,
 ) -> None:
-    """`sense` at every row of a log, from rest; shapes (time, columns), (time,), (time, draws), (time, 24)."""
+    """`sense` at every row of a log, from rest; shapes (time, columns), (time,), (time, draws), (time, SENSED)."""
     for k in range(log.shape[0]):
         sense(log[k : k + 1], kelvin[k], k, drawn[k], setup, state, out[k])
 
 
-def new_state(depth: int) -> tuple[Array, Array, Array]:
-    """Memory, history of `depth` ticks, and scratch."""
-    return np.zeros(SENSOR_MEMORY), np.zeros((depth, REMEMBERED)), np.zeros((2, at.AXES))
+def new_state(depth: int, fault_memory: tuple[int, int] = (0, 2)) -> State:
+    """Memory, history of `depth` ticks, scratch, and memory of faults of this shape."""
+    return np.zeros(SENSOR_MEMORY), np.zeros((depth, REMEMBERED)), np.zeros((2, at.AXES)), np.zeros(fault_memory)

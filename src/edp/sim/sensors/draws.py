@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
-from edp.sim.sensors import can, chain, filters, transducers
+from edp.sim.sensors import alterations, can, chain, filters, transducers
 
 Array = NDArray[np.float64]
 ECUS = ("joints", "pressures", "valves")
@@ -96,13 +96,16 @@ def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     return [can.frames(samples, rate_hz, bus, phase, latency, child) for phase, latency, child in each]
 
 
-def pack_sensors(machine: Machine, rate_hz: float, noisy: bool) -> tuple[Array, Array, Array]:
-    """Numbers of the chain, and `axes` and `plant` of the machine as built: payload and oil change the plant's own.
+def pack_sensors(machine: Machine, rate_hz: float, noisy: bool, faults: Array | None = None) -> chain.Setup:
+    """Numbers of the chain, `axes` and `plant` of the machine as built, and the table of faults.
+
+    As built, since payload, oil and faults change the plant's own.
 
     Args:
         machine: whose ``[sensors]`` holds.
         rate_hz: rate of the log.
         noisy: False for the truth.
+        faults: of the sensors, a row each, see `edp.sim.sensors.alterations`.
     """
     own, step_s = machine.sensors, 1.0 / rate_hz
     numbers = np.zeros(chain.SENSOR_NUMBERS)
@@ -121,4 +124,5 @@ def pack_sensors(machine: Machine, rate_hz: float, noisy: bool) -> tuple[Array, 
     numbers[chain.PLAYING] = any(own.pin_backlash)
     numbers[chain.PLAY : chain.PLAY + 3] = own.pin_backlash
     numbers[chain.OFFSET : chain.OFFSET + 6] = instance_of(machine).pressure_offset
-    return numbers, *pack(machine)
+    axes, plant = pack(machine)
+    return numbers, axes, plant, np.zeros((0, alterations.COLUMNS)) if faults is None else faults

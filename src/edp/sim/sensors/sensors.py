@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
-from edp.sim.sensors import chain, draws
+from edp.sim.sensors import alterations, chain, draws
 
 Array = NDArray[np.float64]
 OIL = "OilTemperature"
@@ -36,9 +36,32 @@ def measured_signals(
     if oil_temperature is None:
         oil_temperature = np.full(len(log), machine.oil.temperature + 273.15)
     drawn = draws.draw(machine, len(log), rate_hz, rng)
-    setup = draws.pack_sensors(machine, rate_hz, rng is not None)
-    measured = np.empty((len(log), chain.MEASURED))
-    state = chain.new_state(draws.depth(drawn))
+    return shown_signals(log, machine, rate_hz, rng is not None, drawn, oil_temperature)[:, : chain.MEASURED]
+
+
+def shown_signals(
+    log: Array,
+    machine: Machine,
+    rate_hz: float,
+    noisy: bool,
+    drawn: Array,
+    oil_temperature: Array,
+    faults: Array | None = None,
+) -> Array:
+    """What is shown in all, shape (time, `chain.SENSED`): Table A.1, then what has no noise but may have a fault.
+
+    Args:
+        log: rows of the plant.
+        machine: whose ``[sensors]`` holds.
+        rate_hz: rate of the log.
+        noisy: False for the truth.
+        drawn: what is random, from `draws.draw`, and behind it a column a fault.
+        oil_temperature: in K, shape (time,).
+        faults: of the sensors, a row each, see `edp.sim.sensors.alterations`.
+    """
+    setup = draws.pack_sensors(machine, rate_hz, noisy, faults)
+    measured = np.empty((len(log), chain.SENSED))
+    state = chain.new_state(draws.depth(drawn), alterations.memory_shape(setup[3], drawn[:, chain.DRAWS :]))
     chain.sense_all(np.ascontiguousarray(log), np.ascontiguousarray(oil_temperature), drawn, setup, state, measured)
     return measured
 
@@ -69,3 +92,9 @@ def truth_signals(log: Array) -> dict[str, Array]:
     signals = {name: log[:, column] for name, column in truth_columns(log.shape[1]).items()}
     signals[OIL] = signals[OIL] + KELVIN
     return signals
+
+
+def shown_names() -> dict[str, int]:
+    """Where what is shown without noise lies in `shown_signals`, by the names of `EXTRA_CHANNELS`."""
+    strokes = {f"CylStroke_{i + 1}": chain.STROKES + i for i in range(at.AXES)}
+    return {**strokes, "PumpPressure_1": chain.PUMPS, "PumpPressure_2": chain.PUMPS + 1, OIL: chain.OIL}

@@ -94,7 +94,7 @@ def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
         si[a + grey.LEAST], si[a + grey.LAG] = plant[sim.MIN_DISPLACEMENT], plant[sim.PUMP_TIME]
         si[a + grey.LINE], si[a + grey.RELIEF] = plant[sim.LINE_VOLUME], plant[sim.PUMP_RELIEF]
         si[a + grey.BYPASS], si[a + grey.BYPASS_CLOSED] = plant[sim.BYPASS], plant[sim.BYPASS_CLOSED]
-    _put_circuit(si, table.circuit_at, plant, float(np.mean([parts.reach[j] for j in parts.primary])))
+    _put_circuit(si, table.circuit_at, axes, plant, float(np.mean([parts.reach[j] for j in parts.primary])))
     numbers = si / table.factor
     numbers[parts.load] = load
     return np.asarray(numbers)
@@ -112,7 +112,7 @@ def _put_cylinder(si: Doubles, a: int, axis: Doubles, plant: Doubles) -> None:
     for index, column in same.items():
         si[a + index] = axis[column]
     si[a + grey.PISTON_LEAK] = axis[sim.PISTON_LEAK] * plant[sim.THINNING]
-    si[a + grey.SPOOL_LEAK] = axis[sim.SPOOL_LEAK] * plant[sim.THINNING]
+    si[a + grey.SPOOL_LEAK] = axis[sim.HEAD_LEAK] * plant[sim.THINNING]
     si[a + grey.STATIC] = axis[sim.STATIC] - axis[sim.COULOMB]
     si[a + grey.VISCOUS] = axis[sim.VISCOUS] * plant[sim.VISCOUS_SHARE]
     si[a + grey.STOP_LOW] = si[a + grey.ASYMMETRY] = 0.0
@@ -180,7 +180,7 @@ def _lead(lags: tuple[float, float], step_s: float) -> float:
     return float(3.0 * half - third * (1.0 / first + 2.0 / second))
 
 
-def _put_circuit(si: Doubles, c: int, plant: Doubles, reach: float) -> None:
+def _put_circuit(si: Doubles, c: int, axes: Doubles, plant: Doubles, reach: float) -> None:
     same = {
         grey.BULK: sim.BULK_MODULUS, grey.AIR: sim.AIR, grey.TANK: sim.TANK, grey.MAKE_UP: sim.ANTI_CAVITATION,
         grey.PORT_SLOPE: sim.PORT_SLOPE, grey.RELIEF_SLOPE: sim.RELIEF_SLOPE,
@@ -188,5 +188,5 @@ def _put_circuit(si: Doubles, c: int, plant: Doubles, reach: float) -> None:
     for index, column in same.items():
         si[c + index] = plant[column]
     si[c + grey.POWER] = plant[sim.EFFICIENCY] * plant[sim.POWER_LIMIT]
-    si[c + grey.PLAY] = plant[sim.HYSTERESIS] / reach
+    si[c + grey.PLAY] = axes[0, sim.HYSTERESIS] / reach
     si[c + grey.DEMAND_START], si[c + grey.DEMAND_SPAN] = DEMAND_START / reach, DEMAND_SPAN / reach

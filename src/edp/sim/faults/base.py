@@ -1,0 +1,257 @@
+"""What a fault is: its kind, where it sits, how large it is, since when, and how it comes and goes."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, closest
+from edp.registry import Registry
+from edp.settings.bounds import Bound, shown, span
+from edp.sim.machine.machine import Machine
+
+Array = NDArray[np.float64]
+Units = Mapping[str, float]
+AXES = ("boom", "arm", "bucket")
+SPOOLS = (*AXES, *(f"{axis}_conflux" for axis in AXES))
+CHAMBERS = tuple(f"{axis}_{side}" for side in ("head", "rod") for axis in AXES)
+"""In the order of the state of the plant and of Table A.1: heads, then rods."""
+
+# Factors to SI units; the first unit of each is that of bounds and ladders.
+FLOW: Units = {"L/min": 1.0 / 6e4, "m^3/s": 1.0}
+PRESSURE: Units = {"bar": 1e5, "MPa": 1e6, "kPa": 1e3, "Pa": 1.0}
+SHARE: Units = {"%": 1e-2}
+FACTOR: Units = {"x": 1.0}
+TIME: Units = {"ms": 1e-3, "s": 1.0}
+MASS: Units = {"kg": 1.0, "t": 1e3}
+VELOCITY: Units = {"mm/s": 1e-3, "cm/s": 1e-2, "m/s": 1.0}
+LENGTH: Units = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+TEMPERATURE: Units = {"K": 1.0}
+NO_UNIT: Units = {}
+"""Of kinds that are there or not."""
+MOST_FAULTS = 8
+"""Of one recording: each has a channel of truth, whose names are fixed (`edp.signals.FAULT_CHANNELS`)."""
+MOST_SECONDS = 1e7
+"""Of an onset, a ramp or a pause: more than any recording lasts."""
+LEAST_SECONDS = 0.05
+"""Of the time on and off of an intermittent fault: loose contacts are faster, and are dropouts."""
+
+
+@dataclass(eq=False)
+class MachineNumbers:
+    """Numbers of a plant that a fault may change.
+
+    Attributes:
+        machine: the parameter set that they were packed from.
+        rate_hz: ticks per second.
+        half_steps_s: half of a coarse and of a fine integration step, s.
+        axes: of the cylinders, shape (3, AXIS_VALUES).
+        plant: of the rest, shape (PLANT_VALUES,).
+        delays: dead time of each spool in ticks, shape (6,).
+        coarse: transitions of pilots and spools over half a coarse step, shape (6, 2, 4).
+        fine: the same over half a fine step.
+        soil: of bucket and soil; zeros in free air.
+    """
+
+    machine: Machine
+    rate_hz: float
+    half_steps_s: tuple[float, float]
+    axes: Array
+    plant: Array
+    delays: Array
+    coarse: Array
+    fine: Array
+    soil: Array
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """What changes, in the order of `edp.sim.faults.course.BLOCKS`."""
+        return self.axes, self.plant, self.delays, self.coarse, self.fine, self.soil
+
+    def copy(self) -> MachineNumbers:
+        """The same with arrays of its own."""
+        copies = [array.copy() for array in self.arrays]
+        return MachineNumbers(self.machine, self.rate_hz, self.half_steps_s, *copies)
+
+
+class FaultKind(ABC):
+    """One kind of fault; instances are entered in `FAULTS`.
+
+    Attributes:
+        text: what is wrong, for tables and messages.
+        sites: where it can sit; empty where a machine has one such part only.
+        units: units of the size with their factors to SI; empty where it is there or not.
+        ladder: sizes from hardly visible to gross, in the first unit.
+        bound: of the size, in the first unit.
+        neutral: the size that is no fault, in the first unit.
+    """
+
+    text: ClassVar[str]
+    sites: ClassVar[tuple[str, ...]] = AXES
+    units: ClassVar[Units]
+    ladder: ClassVar[tuple[float, ...]] = ()
+    bound: ClassVar[Bound] = span(0.0, 0.0)
+    neutral: ClassVar[float] = 0.0
+
+    @property
+    def unit(self) -> str:
+        """The unit of bounds and ladder; empty where there is no size."""
+        return next(iter(self.units), "")
+
+
+class MachineFault(FaultKind):
+    """A fault of the machine: numbers of the plant change."""
+
+    @abstractmethod
+    def change(self, numbers: MachineNumbers, site: str, size: float) -> None:
+        """Put the fault into the numbers of a machine, in place.
+
+        Args:
+            numbers: of a sound machine, or of one with other faults.
+            site: one of `sites`.
+            size: in SI units, `neutral` for no fault.
+        """
+
+    def dead_time_s(self, size: float) -> float:
+        """Dead time that a fault of this size (SI units) may add to the commands: room that a plant must have."""
+        return 0.0
+
+
+class SensorFault(FaultKind):
+    """A fault of what is shown: one value of a tick changes, or two change places.
+
+    Attributes:
+        operation: what happens, one of `edp.sim.sensors.alterations`.
+    """
+
+    operation: ClassVar[int]
+
+    @abstractmethod
+    def channels(self, site: str) -> tuple[int, ...]:
+        """Which values, numbers of `edp.sim.sensors.chain.SENSED`; for noise, columns of its draws."""
+
+    def parameter(self, sizes: Array, rate_hz: float, chance: np.random.Generator) -> Array:
+        """What the operation takes at each tick, 0 for nothing, from sizes in SI units, shape (time,)."""
+        return sizes
+
+
+FAULTS: Registry[FaultKind] = Registry("kind of fault")
+
+
+@dataclass(frozen=True)
+class FaultSpec:
+    """One fault of a scenario.
+
+    Attributes:
+        kind: name in `FAULTS`.
+        site: where it sits; empty for kinds without sites.
+        size: how large it is in `unit`; None for kinds that are there or not.
+        unit: of the size.
+        onset_s: when it begins, s from the start of the recording.
+        ramp_s: time in which it grows from nothing to its size, s.
+        on_s: an intermittent fault is there for so long, s; 0 for one that stays.
+        off_s: and then away for so long, s.
+
+    Raises:
+        ConfigError: an unknown kind, site or unit (the closest is offered), or a number out of its bounds.
+    """
+
+    kind: str
+    site: str = ""
+    size: float | None = None
+    unit: str = ""
+    onset_s: float = 0.0
+    ramp_s: float = 0.0
+    on_s: float = 0.0
+    off_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        kind = FAULTS[self.kind]
+        what = f"fault '{self.kind}'"
+        if kind.sites and self.site not in kind.sites:
+            raise ConfigError(f"{what}: site {shown(self.site)} is unknown{among(str(self.site), kind.sites)}")
+        if self.site and not kind.sites:
+            raise ConfigError(f"{what}: site {shown(self.site)} must be left out; a machine has one such part")
+        _check_size(what, kind, self.size, self.unit)
+        seconds = span(0.0, MOST_SECONDS)
+        for name in ("onset_s", "ramp_s", "on_s", "off_s"):
+            value = getattr(self, name)
+            if not seconds.holds(value):
+                raise ConfigError(f"{what}: {name} = {shown(value)}; {seconds.rule(name)} must hold")
+        if self.ramp_s > 0.0 and not kind.units:
+            raise ConfigError(f"{what}: ramp_s = {self.ramp_s:g} must be 0: this kind is there or not")
+        if (self.on_s > 0.0) != (self.off_s > 0.0) or 0.0 < min(self.on_s, self.off_s) < LEAST_SECONDS:
+            raise ConfigError(
+                f"{what}: on_s = {self.on_s:g} and off_s = {self.off_s:g}; an intermittent fault needs both, "
+                f"{LEAST_SECONDS} s at least; leave both out for one that stays"
+            )
+
+    @property
+    def full(self) -> float:
+        """The size in SI units; 1 for kinds that are there or not."""
+        kind = FAULTS[self.kind]
+        return 1.0 if self.size is None else float(self.size) * kind.units[self.unit]
+
+    @property
+    def neutral(self) -> float:
+        """The size that is no fault, in SI units."""
+        kind = FAULTS[self.kind]
+        return kind.neutral * kind.units.get(kind.unit, 1.0)
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data; `FaultSpec(**fault.plain()) == fault`. What is not stated is left out."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {key: value for key, value in values.items() if key == "kind" or value not in (None, "", 0.0)} | (
+            # A size of zero is a size.
+            {} if self.size is None else {"size": self.size}
+        )
+
+
+def among(name: str, options: Iterable[str]) -> str:
+    """A suffix for messages on a name that is none of the options: the closest one, and all of them."""
+    hint = closest(name, options)
+    listed = ", ".join(options)
+    return f"{hint}; there are {listed}" if hint.startswith("; did") else f"; there are {listed}"
+
+
+def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> None:
+    if not kind.units:
+        if size is not None or unit:
+            raise ConfigError(f"{what}: size = {shown(size)} {shown(unit)} must be left out: this kind is there or not")
+        return
+    if size is None:
+        raise ConfigError(f"{what}: it needs a size, such as {kind.ladder[0]:g}{kind.unit}")
+    if isinstance(size, bool) or not isinstance(size, int | float) or not math.isfinite(size):
+        raise ConfigError(f"{what}: size = {shown(size)} must be a finite number")
+    if not isinstance(unit, str) or unit not in kind.units:
+        raise ConfigError(f"{what}: unit {shown(unit)} of the size is unknown{among(str(unit), kind.units)}")
+    in_first = size * kind.units[unit] / kind.units[kind.unit]
+    # The product may miss a bound by rounding: 900 % as a share of 9.
+    if not kind.bound.low - 1e-9 <= in_first <= kind.bound.high + 1e-9:
+        raise ConfigError(f"{what}: size = {size:g} {unit}; {kind.bound.rule('size')} {kind.unit} must hold")
+
+
+def ladder(
+    kinds: Iterable[str] | None = None, everywhere: bool = False, onset_s: float = 0.0, ramp_s: float = 0.0
+) -> Iterator[FaultSpec]:
+    """Faults of every size of every kind, the smallest of each kind first.
+
+    Args:
+        kinds: names in `FAULTS`; all by default.
+        everywhere: at each site of a kind; only at the first one by default.
+        onset_s: when all begin, s.
+        ramp_s: time in which they grow, s; kinds that are there or not do not grow.
+    """
+    for name in FAULTS if kinds is None else kinds:
+        kind = FAULTS[name]
+        for site in (kind.sites if everywhere else kind.sites[:1]) or ("",):
+            if not kind.units:
+                yield FaultSpec(name, site, onset_s=onset_s)
+            for size in kind.ladder:
+                yield FaultSpec(name, site, size, kind.unit, onset_s, ramp_s)

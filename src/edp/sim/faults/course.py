@@ -1,0 +1,167 @@
+"""Faults in time: how much of each is there at a tick, and what follows for the plant and for what is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.faults.base import FAULTS, FaultSpec, MachineFault, MachineNumbers, SensorFault
+from edp.sim.physics.plant import Plant
+from edp.sim.sensors import alterations
+
+Array = NDArray[np.float64]
+STEPS = 1024
+"""A ramp rises in so many steps: a plant's numbers change at so many ticks of it, however long it is."""
+BLOCKS = ("axes", "plant", "delays", "coarse", "fine", "soil")
+"""Arrays of `MachineNumbers` in order."""
+CHANGE = 4
+"""Numbers of a change: tick, which of `BLOCKS`, place in it, value."""
+
+
+def shares_at(faults: Sequence[FaultSpec], ticks: NDArray[np.int64], rate_hz: float) -> Array:
+    """How much of each fault is there, 0 to 1, shape (time, fault).
+
+    A fault begins at the first tick that is not before its onset. An intermittent one goes on with its ramp while it is
+    away.
+    """
+    shares = np.zeros((len(ticks), len(faults)))
+    for n, fault in enumerate(faults):
+        # 1e-6 of a tick allows for the rounding of decimal seconds.
+        since = ticks - np.ceil(fault.onset_s * rate_hz - 1e-6)
+        share = np.ones(len(ticks))
+        if fault.ramp_s > 0.0:
+            share = np.floor(np.clip(since / (fault.ramp_s * rate_hz), 0.0, 1.0) * STEPS + 1e-6) / STEPS
+        if fault.on_s > 0.0:
+            phase = np.mod(since, (fault.on_s + fault.off_s) * rate_hz)
+            share = np.where(phase < fault.on_s * rate_hz - 1e-6, share, 0.0)
+        shares[:, n] = np.where(since >= 0.0, share, 0.0)
+    return shares
+
+
+def sizes_of(fault: FaultSpec, shares: Array) -> Array:
+    """Sizes in SI units at these shares of the full one."""
+    # At share 0 exactly the neutral size: nothing may be changed by rounding.
+    return np.where(shares > 0.0, fault.neutral + shares * (fault.full - fault.neutral), fault.neutral)
+
+
+def of_machine(faults: Sequence[FaultSpec]) -> tuple[FaultSpec, ...]:
+    """Those that change numbers of the plant."""
+    return tuple(fault for fault in faults if isinstance(FAULTS[fault.kind], MachineFault))
+
+
+def spare_s(faults: Sequence[FaultSpec]) -> float:
+    """Dead time that faults may add, s: room that a plant must have for past commands."""
+    pairs = [(fault, FAULTS[fault.kind]) for fault in faults]
+    return sum(kind.dead_time_s(fault.full) for fault, kind in pairs if isinstance(kind, MachineFault))
+
+
+def numbers_of(plant: Plant) -> MachineNumbers:
+    """The numbers of a plant, live."""
+    (_, coarse_s, _, coarse), (_, fine_s, _, fine) = plant.clocks
+    halves = 0.5 * coarse_s, 0.5 * fine_s
+    return MachineNumbers(
+        plant.machine, plant.rate_hz, halves, plant.axes, plant.plant, plant.delays, coarse, fine, plant.soil_numbers
+    )
+
+
+class MachineCourse:
+    """What faults make of the numbers of one plant, tick by tick; a function of the tick alone.
+
+    Args:
+        faults: those of the scenario; faults of sensors are left out.
+        sound: the numbers of the plant before its first tick; they are copied.
+    """
+
+    def __init__(self, faults: Sequence[FaultSpec], sound: MachineNumbers) -> None:
+        self.faults = of_machine(faults)
+        self._sound = sound.copy()
+        changed = self._numbers(np.ones(len(self.faults)))
+        half = self._numbers(np.full(len(self.faults), 0.5))
+        # Only numbers that some fault changes are written: oil and load change others as time goes on.
+        self._touched = [
+            np.flatnonzero((a.ravel() != b.ravel()) | (a.ravel() != c.ravel()))
+            for a, b, c in zip(self._sound.arrays, changed.arrays, half.arrays, strict=True)
+        ]
+
+    def write(self, tick: int, live: MachineNumbers) -> None:
+        """Give a plant the numbers of a tick, in place."""
+        numbers = self._numbers(shares_at(self.faults, np.array([tick]), live.rate_hz)[0])
+        for array, new, touched in zip(live.arrays, numbers.arrays, self._touched, strict=True):
+            if len(touched):
+                array.reshape(-1)[touched] = new.reshape(-1)[touched]
+
+    def pieces(self, first: int, behind: int) -> Iterator[tuple[int, int]]:
+        """Runs of ticks, (first, one behind the last), in which no number changes."""
+        shares = shares_at(self.faults, np.arange(first, behind), self._sound.rate_hz)
+        ends = np.flatnonzero((shares[1:] != shares[:-1]).any(axis=1)) + 1
+        starts = [0, *ends.tolist(), behind - first]
+        for start, end in pairwise(starts):
+            yield first + start, first + end
+
+    def changes(self, samples: int) -> Array:
+        """Every number that changes, when, and to what, in the order of ticks, shape (changes, CHANGE)."""
+        rows: list[Array] = []
+        before = [array.ravel()[touched] for array, touched in zip(self._sound.arrays, self._touched, strict=True)]
+        shares = shares_at(self.faults, np.arange(samples), self._sound.rate_hz)
+        for tick, _ in self.pieces(0, samples):
+            numbers = self._numbers(shares[tick])
+            for block, (array, touched) in enumerate(zip(numbers.arrays, self._touched, strict=True)):
+                new = array.ravel()[touched]
+                differ = np.flatnonzero(new != before[block])
+                if len(differ):
+                    columns = (np.full(len(differ), float(tick)), np.full(len(differ), float(block)))
+                    rows.append(np.column_stack((*columns, touched[differ], new[differ])))
+                before[block] = new
+        return np.concatenate(rows) if rows else np.zeros((0, CHANGE))
+
+    def _numbers(self, shares: Array) -> MachineNumbers:
+        numbers = self._sound.copy()
+        for fault, share in zip(self.faults, shares, strict=True):
+            kind = FAULTS[fault.kind]
+            if isinstance(kind, MachineFault):
+                kind.change(numbers, fault.site, float(sizes_of(fault, np.array([share]))[0]))
+        return numbers
+
+
+class SensorCourse:
+    """What faults make of the values that are shown in one recording.
+
+    Args:
+        faults: those of the scenario; faults of the machine are left out.
+
+    Attributes:
+        table: a row a fault, see `edp.sim.sensors.alterations`.
+    """
+
+    def __init__(self, faults: Sequence[FaultSpec]) -> None:
+        pairs = [(fault, FAULTS[fault.kind]) for fault in faults]
+        self._every = [(fault, kind) for fault, kind in pairs if isinstance(kind, SensorFault)]
+        self._shown = [(fault, kind) for fault, kind in self._every if kind.operation != alterations.NOISE]
+        rows = [(kind.operation, *kind.channels(fault.site), 0)[: alterations.COLUMNS] for fault, kind in self._shown]
+        self.table = np.array(rows, dtype=float).reshape(len(rows), alterations.COLUMNS)
+
+    def drawn(self, healthy: Array, rate_hz: float, chance: np.random.Generator) -> Array:
+        """What is random in a recording, with the noise of the faults, and behind it a column a row of the table.
+
+        Args:
+            healthy: of `edp.sim.sensors.draws.draw`, shape (time, draws).
+            rate_hz: ticks per second.
+            chance: source of what is random in the faults.
+        """
+        if not self._every:
+            return healthy
+        drawn, columns = healthy.copy(), []
+        ticks = np.arange(len(healthy))
+        # A generator each: what one fault draws does not move another.
+        for (fault, kind), child in zip(self._every, chance.spawn(len(self._every)), strict=True):
+            sizes = sizes_of(fault, shares_at((fault,), ticks, rate_hz)[:, 0])
+            numbers = kind.parameter(sizes, rate_hz, child)
+            if kind.operation == alterations.NOISE:
+                for channel in kind.channels(fault.site):
+                    drawn[:, channel] *= 1.0 + numbers
+            else:
+                columns.append(numbers)
+        return np.column_stack((drawn, *columns))

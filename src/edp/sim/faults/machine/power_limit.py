@@ -1,0 +1,24 @@
+"""The engine or the regulator of the pumps gives less power."""
+
+from __future__ import annotations
+
+from edp.settings.bounds import span
+from edp.sim.faults.base import FAULTS, SHARE, MachineFault, MachineNumbers
+from edp.sim.machine import layout as at
+
+
+class PowerLimit(MachineFault):
+    """The common power limit of the pumps falls by a share of itself."""
+
+    text = "the power limit of the pumps is too low; the size is the share that is lost"
+    sites = ()
+    units = SHARE
+    ladder = (5.0, 10.0, 20.0, 40.0)
+    bound = span(0.0, 95.0)
+
+    def change(self, numbers: MachineNumbers, site: str, size: float) -> None:
+        """See `MachineFault.change`."""
+        numbers.plant[at.POWER_LIMIT] *= 1.0 - size
+
+
+FAULTS.register("power_limit")(PowerLimit())

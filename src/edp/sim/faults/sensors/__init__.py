@@ -1,0 +1,1 @@
+"""Faults of what is shown, a kind a file."""

@@ -1,0 +1,32 @@
+"""A pressure transmitter is noisy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edp.settings.bounds import span
+from edp.sim.faults.base import CHAMBERS, FACTOR, FAULTS, Array, SensorFault
+from edp.sim.sensors import alterations, chain
+
+
+class PressureNoise(SensorFault):
+    """The white noise of one transmitter grows by a factor; one without noise stays silent."""
+
+    text = "the noise of a cylinder pressure is larger by a factor"
+    sites = CHAMBERS
+    units = FACTOR
+    ladder = (3.0, 10.0)
+    bound = span(1.0, 1000.0)
+    neutral = 1.0
+    operation = alterations.NOISE
+
+    def channels(self, site: str) -> tuple[int, ...]:
+        """See `SensorFault.channels`."""
+        return (chain.PRESSURE_ERROR + CHAMBERS.index(site),)
+
+    def parameter(self, sizes: Array, rate_hz: float, chance: np.random.Generator) -> Array:
+        """See `SensorFault.parameter`."""
+        return sizes - 1.0
+
+
+FAULTS.register("pressure_noise")(PressureNoise())

@@ -1,0 +1,24 @@
+"""A stroke is shown too large or too small."""
+
+from __future__ import annotations
+
+from edp.settings.bounds import span
+from edp.sim.faults.base import AXES, FAULTS, SHARE, SensorFault
+from edp.sim.sensors import alterations, chain
+
+
+class StrokeScale(SensorFault):
+    """A share of one cylinder's stroke is added."""
+
+    text = "a stroke is shown too large by a share"
+    units = SHARE
+    ladder = (1.0, 3.0, 10.0)
+    bound = span(-100.0, 100.0)
+    operation = alterations.SCALE
+
+    def channels(self, site: str) -> tuple[int, ...]:
+        """See `SensorFault.channels`."""
+        return (chain.STROKES + AXES.index(site),)
+
+
+FAULTS.register("stroke_scale")(StrokeScale())

@@ -1,0 +1,25 @@
+"""The oil's thermometer shows too much or too little."""
+
+from __future__ import annotations
+
+from edp.settings.bounds import span
+from edp.sim.faults.base import FAULTS, TEMPERATURE, SensorFault
+from edp.sim.sensors import alterations, chain
+
+
+class TemperatureOffset(SensorFault):
+    """An offset of the oil temperature; the oil stays as warm as it is."""
+
+    text = "the oil temperature is shown with an offset"
+    sites = ()
+    units = TEMPERATURE
+    ladder = (5.0, 15.0)
+    bound = span(-100.0, 100.0)
+    operation = alterations.OFFSET
+
+    def channels(self, site: str) -> tuple[int, ...]:
+        """See `SensorFault.channels`."""
+        return (chain.OIL,)
+
+
+FAULTS.register("temperature_offset")(TemperatureOffset())
