@@ -1,11 +1,14 @@
 """``edp identify``: from logs to a machine file that ``edp simulate`` takes, and what it refuses."""
 
 import re
+import sys
 
 import numpy as np
 import pytest
 
+import edp.workflows.identify  # noqa: F401  so that its module is there to be changed
 from edp.config.twin import load_twin_experiment
+from edp.errors import ConfigError
 from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
@@ -60,7 +63,12 @@ def test_a_machine_file_is_written_that_simulates_and_says_what_is_told(edp, log
     assert edp("simulate", tmp_path / "data", "--machine", file, "--minutes", 0.05, "--recordings", 1).code == 0
 
 
-def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs, tmp_path):
+def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs, tmp_path, monkeypatch):
+    def refused(nine, guess):
+        raise ConfigError("no rigid bodies have this load")
+
+    # As after a fit as short as this one: its load may be one that no bodies have, and the guess's bodies stay.
+    monkeypatch.setattr(sys.modules["edp.workflows.identify.identify"], "realised", refused)
     for kind, file in (("greybox", "grey"), ("static", "map")):
         settings = [f"twin.kind={kind}", *(word for word in SMALL if kind == "greybox" or "twin." not in word)]
         train_twin(DataSource.of(logs), load_twin_experiment(None, settings), tmp_path / file)
@@ -68,6 +76,12 @@ def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs,
     assert ended.code == 0, ended.err
     assert re.search(r"\d+ of \d+ numbers are told by the logs", ended.out)
     assert "next: edp simulate" in ended.out
+    assert load_machine(str(tmp_path / "mine.toml")).bodies == load_machine("M22").bodies
+    facts = read_json(tmp_path / "mine.json")
+    assert "bodies are those of machine M22: no rigid bodies have this load" in facts["notes"]
+    rows = [row for row in facts["numbers"] if row["label"].startswith("bodies")]
+    assert len(rows) == 9
+    assert all(row["value"] == row["low"] == row["high"] == row["base"] and not row["excited"] for row in rows)
     ended = edp("identify", logs, "--out", tmp_path / "other.toml", "--run", tmp_path / "map")
     assert ended.code == 1
     assert "holds a twin of kind 'static'" in ended.err

@@ -175,9 +175,9 @@ def realised(base: Doubles, guess: Machine) -> Bodies:
     if not (inertia > 0.0).all():
         worst = int(np.argmin(inertia))
         raise ConfigError(
-            f"identified machine: no rigid bodies have the joint inertia and gravity torques of the logs (the inertia "
-            f"of body {worst + 1} about its centre would be {inertia[worst]:.4g} kg m^2); check that pins, lengths and "
-            "bores of --machine are those of the machine that was logged"
+            f"no rigid bodies have the joint inertia and gravity torques of the logs (the inertia of body {worst + 1} "
+            f"about its centre would be {inertia[worst]:.4g} kg m^2); check that pins, lengths and bores of --machine "
+            "are those of the machine that was logged, and that the logs move every cylinder"
         )
     return replace(own, mass=_triple(mass), com_x=_triple(x), com_y=_triple(y), inertia=_triple(inertia))
 

@@ -140,7 +140,8 @@ def identify(
     fit = _refined(base, parts, fitted, (data, settings), on_event)
     tell("asking what parts of the logs, and runs of other lengths, would say")
     spread = covariance(fit.twin, fit.tie, fit.theta, data.train, settings.training.seed)
-    machine_found, rows = _machine(fit, spread, data)
+    machine_found, rows, doubts = _machine(fit, spread, data)
+    notes += doubts
     machine_found = replace(machine_found, name=_name(target), description=_description(base))
     text = machine_text(machine_found, _head(base, rows, notes), line_comments(rows))
     try:
@@ -257,8 +258,12 @@ def _refined(
     return _Tied(end, tie, result.theta, result.information)
 
 
-def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber]]:
-    """The machine of the coordinates, those that the logs do not tell set back to the guess; and a row of each."""
+def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber], list[str]]:
+    """The machine of the coordinates, those that the logs do not tell set back to the guess; a row of each, and notes.
+
+    Where no rigid bodies have the fitted load, as after short logs, the guess's bodies stay: valves and pumps are worth
+    having without them.
+    """
     twin, tie, theta, information = fit.twin, fit.tie, fit.theta, fit.information
     count, left = len(MACHINE_NUMBERS), np.sqrt(np.diag(spread))
     # What the fit had no information of; a number that is told badly stays where the others made up for it.
@@ -280,8 +285,12 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     poses = Poses.of(machine, strokes)
     of_load = spread[count:, count:] * tie.load_width * tie.load_width[:, None]
     nine, body = body_rows(tie.base, tie.parts, load, of_load, twin.wiring.z_of, poses)
-    machine = replace(machine, bodies=realised(nine, tie.base))
-    return machine, number_rows(tie.base, machine, left[:count], excited) + body
+    numbers = number_rows(tie.base, machine, left[:count], excited)
+    try:
+        return replace(machine, bodies=realised(nine, tie.base)), numbers + body, []
+    except ConfigError as error:
+        kept = [replace(row, value=row.base, low=row.base, high=row.base, excited=False, is_told=False) for row in body]
+        return machine, numbers + kept, [f"bodies are those of machine {tie.base.name}: {error}"]
 
 
 def _check_strokes(channels: TwinChannels, data: Prepared, base: Machine) -> None:
