@@ -237,8 +237,8 @@ def main() -> None:
     given = parser(__doc__.splitlines()[0]).parse_args()
     house = measure()
     figures = (
-        ("siblings below the package", len(house.siblings), 22),
-        ("arrows between rooms", house.arrows, 142),
+        ("siblings below the package", len(house.siblings), 23),
+        ("arrows between rooms", house.arrows, 145),
         ("circles of modules", len(house.circles), 0),
         (f"functions of more than {LONG_FUNCTION} lines", len(house.long_functions), 0),
         (f"files of more than {LONG_FILE} lines", len(house.long_files), 0),

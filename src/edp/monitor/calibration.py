@@ -1,0 +1,130 @@
+"""Limits of detectors for a promised rate of false alarms, from healthy sessions that nothing was fitted to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from edp.errors import ConfigError, DataError
+from edp.monitor.detectors.base import DetectorSpec, alarms, statistics
+from edp.settings.bounds import above, shown
+
+Array = NDArray[np.float64]
+CONFIDENCE = 0.95
+LANES = 48
+"""Limits that one pass over the sessions tries; three passes place a limit to 1 in 1e5 of the range."""
+PASSES = 3
+MOST_HOURS = above(0.0, 1e6)
+
+
+@dataclass(frozen=True)
+class AlarmLimit:
+    """A limit and what is known of its false alarms.
+
+    Attributes:
+        limit: that a statistic has to pass.
+        alarms: on the healthy sessions; new ones of this kind have one more.
+        hours: of them.
+        promised_hours: operating hours to one false alarm that were asked for.
+        low_hours: shortest and `high_hours` longest mean time between false alarms that go with the count, exact for
+            independent alarms (Garwood 1936), at `CONFIDENCE`; `high_hours` is infinite where there was none.
+    """
+
+    limit: float
+    alarms: int
+    hours: float
+    promised_hours: float
+    low_hours: float
+    high_hours: float
+
+    def sentence(self) -> str:
+        """For a report."""
+        high = "any time" if math.isinf(self.high_hours) else f"{self.high_hours:.3g} h"
+        return (
+            f"{self.alarms} false alarms in {self.hours:.3g} h of healthy sessions: one in {self.low_hours:.3g} h to "
+            f"{high} ({100 * CONFIDENCE:g} %), asked for one in {self.promised_hours:.3g} h"
+        )
+
+
+def hours_between(count: int, hours: float) -> tuple[float, float]:
+    """Interval of the mean time between alarms, h, from their number (Garwood, Biometrika 28, 1936)."""
+    tail = (1.0 - CONFIDENCE) / 2.0
+    # Quantiles of chi-squared over two are those of the gamma distribution.
+    least = float(special.gammaincinv(count, tail)) if count else 0.0
+    most = float(special.gammaincinv(count + 1, 1.0 - tail))
+    return hours / most, hours / least if count else math.inf
+
+
+def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float, promised_hours: float) -> AlarmLimit:
+    """The lowest limit at which new sessions of this kind have at most one false alarm in `promised_hours`.
+
+    On these sessions it has one alarm fewer than the promise allows: the lowest limit with k alarms here has k + 1 in
+    as many new hours on average, as the largest of n values is passed by one new value of n + 1.
+
+    Sessions are whole: each begins with a reset detector, and the detector is reset at each alarm. What holds on them
+    holds elsewhere only for machines, work and weather of their kind.
+
+    Args:
+        spec: the detector.
+        sessions: white residuals of healthy sessions, shape (time, channels) each.
+        rows_per_s: rate of the rows.
+        promised_hours: operating hours to one false alarm.
+
+    Raises:
+        ConfigError: a number is out of its bounds, or there are too few hours for the promise; says for which there are
+            enough.
+        DataError: there are no sessions, or they have other numbers of residuals.
+    """
+    for name, value in (("rows_per_s", rows_per_s), ("promised_hours", promised_hours)):
+        if not MOST_HOURS.holds(value):
+            raise ConfigError(f"calibration: {name} = {shown(value)}; {MOST_HOURS.rule(name)} must hold")
+    widths = {np.asarray(session).shape[1:] for session in sessions}
+    if len(widths) != 1 or len(next(iter(widths))) != 1:
+        raise DataError(f"calibration: {len(sessions)} sessions of widths {sorted(widths)}; give all of one width")
+    hours = sum(len(session) for session in sessions) / rows_per_s / 3600.0
+    # 1e-9 allows for the rounding of the division.
+    allowed = math.floor(hours / promised_hours + 1e-9) - 1
+    if allowed < 0:
+        raise ConfigError(
+            f"calibration: {hours:.3g} h of healthy sessions are too few for one false alarm in {promised_hours:.3g} "
+            f"h; they support one in {hours:.3g} h: ask for that, or bring {promised_hours - hours:.3g} h more"
+        )
+    low, high = _range(spec, sessions)
+    for _ in range(PASSES):
+        limits = np.linspace(low, high, LANES)
+        counts = _counts(spec, sessions, limits)
+        # The last limit with too many: resets make counts fall with the limit on the whole, not at each step.
+        bad = np.flatnonzero(counts > allowed)
+        first = int(bad[-1]) + 1 if len(bad) else 0
+        limit, count = float(limits[first]), int(counts[first])
+        if first == 0:
+            break
+        low, high = float(limits[first - 1]), limit
+    return AlarmLimit(limit, count, hours, promised_hours, *hours_between(count, hours))
+
+
+def _range(spec: DetectorSpec, sessions: Sequence[Array]) -> tuple[float, float]:
+    """Least and largest statistic of all sessions; no session passes the latter."""
+    least, most = math.inf, -math.inf
+    for session in sessions:
+        if len(session):
+            values = statistics(spec.build(session.shape[1]), session[:, None, :])
+            least, most = min(least, float(values.min())), max(most, float(values.max()))
+    return least, most
+
+
+def _counts(spec: DetectorSpec, sessions: Sequence[Array], limits: Array) -> NDArray[np.int64]:
+    """False alarms of all sessions at each limit."""
+    counts = np.zeros(len(limits), dtype=np.int64)
+    for session in sessions:
+        detector = spec.build(session.shape[1], len(limits))
+        same = np.broadcast_to(
+            np.asarray(session, dtype=float)[:, None, :], (len(session), len(limits), session.shape[1])
+        )
+        counts += np.bincount([alarm.lane for alarm in alarms(detector, same, limits)], minlength=len(limits))
+    return counts
