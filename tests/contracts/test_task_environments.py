@@ -261,6 +261,24 @@ def test_references_that_are_drawn_are_never_those_that_judge(spec):
     assert LearningSpec().seeds[0] == 1_000_000
 
 
+def test_seeds_without_a_reference_are_passed_over_where_none_is_asked_for(spec, monkeypatch):
+    # Draws of a seed are few here, so that many seeds have no reference.
+    monkeypatch.setattr("edp.control.tasks.base.TRIES", 2)
+    env = TaskEnvironment(spec(options={"length_m": (2.0, 2.2)}))
+    refused = []
+    for seed in range(6):
+        try:
+            assert env.reset(seed=seed)[1]["seed"] == seed
+        except ConfigError as error:
+            refused.append(str(error))
+    assert 0 < len(refused) < 6
+    assert all("none of 2 draws can be done" in text for text in refused)
+    assert all(env.reset()[1]["seed"] >= 1_000_000 for _ in range(6))
+    never = TaskEnvironment(spec(options={"length_m": (9.0, 9.5)}))
+    with pytest.raises(ConfigError, match="none of 2 draws can be done"):
+        never.reset()
+
+
 def test_a_twin_on_disk_is_a_plant_by_one_argument(twin, tmp_path, spec):
     save_twin(TwinBundle(TWINS["static"](), twin), tmp_path / "run" / "twin")
     rows = [

@@ -9,7 +9,7 @@ from edp.control.fmu.archive import plain
 from edp.control.fmu.description import FmuDescription, FmuVariable
 from edp.control.plant import PILOTS, STROKES
 from edp.control.rest import check_plant_channels
-from edp.errors import DataError
+from edp.errors import ConfigError, DataError, closest
 from edp.networks.twin.plant import FLAG
 from edp.signals import VOCABULARY, Channel
 
@@ -69,9 +69,13 @@ def ports_of(description: FmuDescription, where: str) -> FmuPorts:
     names = [channel.name for channel in answers]
     commands = {VOCABULARY[name]: inputs[name] for name in PILOTS if name in inputs}
     change = "give an FMU with variables of these names, such as edp export makes of a twin"
-    # Without any pilot pressure the first input is the one to complain of; commands of soil or load are left alone.
-    strange = [] if commands else [plain(name) for name in inputs][:1] or ["nothing"]
-    check_plant_channels(where, [*strange, *(channel.name for channel in commands)], names, change)
+    # Other inputs, such as a load, keep what the FMU sets them to.
+    if not commands:
+        first = next(iter(inputs), "")
+        raise ConfigError(
+            f"{where} has no input of a pilot pressure, such as BmUp{closest(plain(first), PILOTS)}; {change}"
+        )
+    check_plant_channels(where, [channel.name for channel in commands], names, change)
     ports = [(inputs.get(name), inputs.get(name + FLAG)) for name in names]
     starts = [variables.get(name + START) for name in STROKES]
     measured = [(value, flag) for value, flag in ports if value is not None and flag is not None]

@@ -96,17 +96,17 @@ class TaskEpisodes:
         return {"seed": task.seed, "seconds": float(self._ends[lane] / self.plant.rate_hz)}
 
     def _drawn(self, seed: int | None, rng: np.random.Generator) -> ControlTask:
+        """The task of a seed, or of one that is drawn; the last of `DRAWS` says why none can be done."""
         low, high = self.spec.seeds
-        if seed is not None:
-            return draw_task(self._task, self.plant.geometry, self.plant.rate_hz, seed)
-        for tried in range(DRAWS):
+        for _ in range(DRAWS - 1 if seed is None else 0):
             try:
-                own = int(rng.integers(low, high + 1))
-                return draw_task(self._task, self.plant.geometry, self.plant.rate_hz, own)
+                return self._of_seed(int(rng.integers(low, high + 1)))
             except ConfigError:
-                if tried == DRAWS - 1:
-                    raise
-        raise AssertionError("unreachable")
+                continue
+        return self._of_seed(int(rng.integers(low, high + 1)) if seed is None else seed)
+
+    def _of_seed(self, seed: int) -> ControlTask:
+        return draw_task(self._task, self.plant.geometry, self.plant.rate_hz, seed)
 
     def act(self, actions: Array, going: Bools) -> tuple[Array, Bools, Bools]:
         """Hold actions, shape (lanes, 3), for `hold` ticks.
@@ -148,8 +148,7 @@ class TaskEpisodes:
 
     def _measure(self) -> Array:
         """Position errors now; returns those of the attitude (rad), shape (lanes,)."""
-        goal = self._rows.now(self.tick).tip
-        apart = goal - self._lanes.tip
+        apart = self._rows.tip(self.tick) - self._lanes.tip
         self.position_m = np.hypot(apart[:, 0], apart[:, 1])
         return np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))
 

@@ -132,6 +132,10 @@ class ReferenceRows:
         ahead = self._speeds[self._lane[:, None], ticks[:, None] + self._preview]
         return ReferenceNow(self._strokes[self._lane, ticks], self._tip[self._lane, ticks], ahead)
 
+    def tip(self, ticks: NDArray[np.int64]) -> Array:
+        """Tip poses of each lane at its tick, shape (lanes, 3)."""
+        return np.asarray(self._tip[self._lane, ticks])
+
     def judged(self, ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether each lane's tick counts, shape (lanes,)."""
         return self._judged[self._lane, ticks]
