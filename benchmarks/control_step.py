@@ -172,7 +172,7 @@ class LoopBench:
             controller = spec.build(self.plant, self.drawn.limits, models)
             result = run_loop(self.env, controller, self.drawn, 0)
             self._observed = result.recording.values[:MOST, : len(self.plant.channels)].astype(float)
-            reference = self.drawn.reference
+        reference = self.drawn.reference
         kept = KeptController(experiment, self.plant, models, twin, self._observed,
                               np.zeros((len(self._observed), 3)), reference.strokes, reference.tip)  # fmt: skip
         parts = parts_of(experiment, self.plant, models, twin)
