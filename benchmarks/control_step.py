@@ -248,25 +248,26 @@ def drawn_twin(units: int) -> TwinBundle:
     return TwinBundle(spec, twin)
 
 
-PLANS = (DEFAULT, (3, 7, 10, 20), (4, 12, 24), (3, 5, 8, 14), (3, 5, 8), (4, 8))
+SIZES = (
+    *((48, DEFAULT), (48, (3, 5, 8)), (48, (4, 8)), (32, DEFAULT), (32, (3, 5, 8)), (24, (3, 5, 8, 14))),
+    *((16, DEFAULT), (16, (3, 7, 10, 20)), (16, (4, 12, 24))),
+)
+"""Units and blocks; the short form counts the default plan of 16 units alone."""
 
 
 def sized(bench: LoopBench, root: Path, quick: bool, each: float) -> list[dict[str, Any]]:
     """Cost of a tick by width and plan."""
-    rows = []
-    for units in (16,) if quick else (16, 24, 32, 48):
-        twin = drawn_twin(units)
-        for blocks in PLANS[:1] if quick else PLANS:
-            folder = root / f"size_{units}_{len(rows)}"
-            _, parts = bench.exported(twin, blocks, folder)
-            count = m7_instructions(folder)
-            ms = count * each / (CLOCK_MHZ * 1000.0)
-            core = CORES["cortex_m7"]
-            rows.append({
-                "units": units, "blocks": blocks, "horizon": sum(blocks), "lane_ticks": plan_of(parts).lane_ticks,
-                "instructions": count, "low_ms": ms * core.low, "typical_ms": ms * core.typical, "high_ms": ms,
-            })  # fmt: skip
-            shutil.rmtree(folder)
+    rows, core = [], CORES["cortex_m7"]
+    for units, blocks in ((16, DEFAULT),) if quick else SIZES:
+        folder = root / f"size_{len(rows)}"
+        _, parts = bench.exported(drawn_twin(units), blocks, folder)
+        count = m7_instructions(folder)
+        ms = count * each / (CLOCK_MHZ * 1000.0)
+        rows.append({
+            "units": units, "blocks": blocks, "horizon": sum(blocks), "lane_ticks": plan_of(parts).lane_ticks,
+            "instructions": count, "low_ms": ms * core.low, "typical_ms": ms * core.typical, "high_ms": ms,
+        })  # fmt: skip
+        shutil.rmtree(folder)
     return rows
 
 
