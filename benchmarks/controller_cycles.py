@@ -133,8 +133,13 @@ def traced(folder: Path, ticks: int) -> tuple[int, int]:
     sources = ["ticks.c", *sources_of(folder), str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
     flags = ["-std=gnu11", "-O2", "-ffp-contract=off", *M4, "-I.", f"-DTICKS={ticks}", "-T", str(BOARD / "mps2.ld")]
     subprocess.run(["arm-none-eabi-gcc", *flags, *sources], cwd=folder, check=True, capture_output=True)
+    return traced_image(folder, QEMU)
+
+
+def traced_image(folder: Path, emulator: tuple[str, ...]) -> tuple[int, int]:
+    """Instructions and cycles of a whole run of ``image.elf``, start-up included."""
     known = disassembled(folder)
-    command = [*QEMU, *TRACE, "-kernel", "image.elf"]
+    command = [*emulator, *TRACE, "-kernel", "image.elf"]
     instructions, cycles, before, behind = 0, 0, None, False
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as running:
         for line in running.stderr or ():

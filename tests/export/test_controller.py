@@ -37,7 +37,7 @@ ALLOWED = {"memset", "memcpy", "floorf", "sqrt", "sqrtf", "expf", "logf", "fabsf
 """What a controller may ask of the C library: none of it allocates."""
 HOSTILE = ('x*/ int y; /*"\\', "??/\n#error no", "%n ${name} `id`", "\u202eesrever", "x" * 700)
 BOARD = Path(__file__).parent / "board"
-STORED = 12_580_000
+STORED = 11_450_000
 """Instructions of a tick on the M7 with GCC 12, -O2: 40 ticks in six blocks on a twin of eight units and a map."""
 SAME_LEVER = 2e-3
 """Of a tick from the same memory, a share of full."""
@@ -224,7 +224,7 @@ def test_any_bits_of_inputs_break_no_rule_of_c(c, kind, request, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["recurrent", "static", "arx"])
-def test_lanes_have_the_bits_of_the_exported_network(c, name, tmp_path):
+def test_lanes_have_the_numbers_of_the_exported_network(c, name, tmp_path):
     c.need("gcc")
     spec = Recurrent(units=37, members=1) if name == "recurrent" else TWINS[name]()
     bundle = plant_bundle(TwinBundle(spec, sample_twin(spec)[0]))
@@ -233,7 +233,9 @@ def test_lanes_have_the_bits_of_the_exported_network(c, name, tmp_path):
     for file, text in model.files().items():
         (tmp_path / file).write_text(text)
     lanes = 7
-    (tmp_path / "both.c").write_text(BOTH.replace("MANY", f"{lanes}u"))
+    (tmp_path / "both.c").write_text(
+        BOTH.replace("MANY", f"{lanes}u").replace("NEAR", "1e-4f" if name == "recurrent" else "0.0f")
+    )
     sources = ["both.c", "predictor.c", *model.sources]
     c.run("gcc", *c.flags, "-O2", *sources, "-lm", "-o", "both", folder=tmp_path)
     rows = np.stack([random_inputs(plant, 60, seed) for seed in range(lanes)], axis=1)
@@ -243,8 +245,9 @@ def test_lanes_have_the_bits_of_the_exported_network(c, name, tmp_path):
 BOTH = """
 #include "predictor.h"
 #include "lanes.h"
+#include <math.h>
 #include <stdio.h>
-#include <string.h>
+#define LAST_PORTS (LANES_INPUTS - LANES_ANSWERS)
 static predictor_state states[MANY];
 static lanes_memory memories[MANY];
 static float works[MANY][LANES_WORK];
@@ -256,14 +259,24 @@ int main(void) {
         lanes_forget(&memories[k]);
     }
     while (fread(rows, sizeof rows, 1u, stdin) == 1u) {
-        if (!lanes_step(memories, (const float(*)[LANES_INPUTS])rows, works, answers, MANY)) {
+        bool measured = false;
+        for (uint32_t i = LAST_PORTS; i < LANES_INPUTS; i++) {
+            for (uint32_t k = 0; k < MANY; k++) {
+                measured = measured || (rows[k][i] > 0.0f);
+            }
+        }
+        if (!(measured ? lanes_step : lanes_run)(memories, (const float(*)[LANES_INPUTS])rows, works, answers, MANY)) {
             return 2;
         }
         for (uint32_t k = 0; k < MANY; k++) {
             predictor_output out;
             (void)predictor_step(&states[k], rows[k], &out);
-            if (memcmp(&out, answers[k], sizeof out) != 0) {
-                return 3;
+            for (uint32_t i = 0; i < LANES_ANSWERS; i++) {
+                const float exact = out.prediction[0][i];
+                /* Gates are those of another function in the last places; without gates the bits are the same. */
+                if ((fabsf(answers[k][i] - exact) > NEAR * (1.0f + fabsf(exact)))) {
+                    return 3;
+                }
             }
         }
     }

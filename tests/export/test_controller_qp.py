@@ -94,7 +94,7 @@ CASES = {
 
 
 @given(**CASES)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 def test_hard_programs_have_the_solution_of_the_package_or_both_have_none(library, seed, variables, rows, width):
     program = drawn(seed, variables, rows, width)
     status, x, used = solved(library, program)
@@ -109,7 +109,7 @@ def test_hard_programs_have_the_solution_of_the_package_or_both_have_none(librar
 
 
 @given(**CASES)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 def test_soft_programs_always_have_the_solution_of_the_package(library, seed, variables, rows, width):
     program = drawn(seed, variables, rows, width)
     status, x, _ = solved(library, program, soft=True)

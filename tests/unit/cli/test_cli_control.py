@@ -55,6 +55,28 @@ def test_the_controller_may_use_a_twin(edp, tmp_path, twin_run):
     assert ended.json["controller"]["kind"] == "inversion"
 
 
+def test_a_controller_that_was_run_is_exported(edp, tmp_path, twin_run):
+    run = tmp_path / "run"
+    assert edp("control", run, "--seeds", 1, *LINE).code == 0
+    ended = edp("export", run, "--to", "controller", "--out", tmp_path / "c")
+    assert ended.code == 0
+    assert "read machine_control.h first" in ended.out
+    assert "next: cmake" in ended.out
+    assert (tmp_path / "c" / "machine_control_golden.h").is_file()
+    named = edp("export", run, "--to", "controller", "--out", tmp_path / "d", "--name", "grader", "--json")
+    assert any(file.endswith("grader_control.c") for file in named.json["files"])
+    assert "controller: C99" in edp("export", run, "--to", "c", "--out", run, "--forms").out
+    for words, text in (
+        ((run, "--w8a16", run), "single precision"),
+        ((run, "--set", "tangent=true"), "no such option"),
+        ((twin_run,), "run edp control again"),
+    ):
+        refused = edp("export", *words, "--to", "controller", "--out", tmp_path / "e")
+        assert refused.code
+        assert text in " ".join(refused.err.split())
+    assert not (tmp_path / "e").exists()
+
+
 def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, twin_run):
     run = tmp_path / "tuned"
     words = ("--on", twin_run, "--trials", 3, "--loops", 1, "--seeds", 1)

@@ -23,6 +23,8 @@ from edp.networks.twin import TwinPlant
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_lanes.h", "edp_lanes.c")
+PORTS, FED = "ports.", "ports.fed"
+"""Layers of a plant that choose between measured values and last answers, and what they choose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,7 @@ class LaneModel:
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
-        texts = {f"{self.name}.{end}": self._filled(f"plant.{end}.in") for end in ("h", "c")}
+        texts: dict[str, str] = {f"{self.name}.{end}": self._filled(f"plant.{end}.in") for end in ("h", "c")}
         texts[f"{self.name}_weights.h"] = self.model.weights()
         for file in self.model.runtime:
             texts[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
@@ -91,15 +93,23 @@ class LaneModel:
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
             "mean": filled(map(number, np.asarray(twin.scales.answer_offset))),
-            "compute": indented(self._computed()),
+            "compute": indented(self._computed(free=False)),
+            "run": indented(self._computed(free=True)),
             "result": Code(f" + {at}" if at else ""),
         }
         return fill(text, values)
 
-    def _computed(self) -> Iterator[str]:
-        """Statements of a tick; neighbouring layers without products share one loop over the lanes."""
+    def _computed(self, free: bool) -> Iterator[str]:
+        """Statements of a tick; neighbouring layers without products share one loop over the lanes.
+
+        Args:
+            free: where no port is measured, what they read is the last answers, and the layers between are left out.
+        """
         calls, together = Calls(self.model.graph, self.model.plan), list[str]()
         for layer in self.model.graph.layers:
+            if free and layer.name.startswith(PORTS):
+                together += self._fed(calls, layer)
+                continue
             whole = self._whole(calls, layer)
             if whole is None:
                 together += [describe(layer), *calls.of(layer)]
@@ -108,6 +118,13 @@ class LaneModel:
             yield from (describe(layer), whole)
             together = []
         yield from _loop(self.name, together)
+
+    def _fed(self, calls: Calls, layer: Layer) -> list[str]:
+        """What a layer of the ports leaves to do where all of them run free."""
+        if layer.name != FED:
+            return []
+        last = next(x for x in self.model.graph.layers if isinstance(x, memory.Feedback))
+        return [describe(layer), call("edp_copy", slot(last, "last"), last.size, calls.value(FED))]
 
     def _whole(self, calls: Calls, layer: Layer) -> str | None:
         """The call that computes a layer for all lanes; None where there is none."""
@@ -127,9 +144,9 @@ class LaneModel:
         return None
 
 
-def _first(place: str) -> str:
+def _first(location: str) -> str:
     """A place in the work memory of the first lane."""
-    return place.replace("work", "works[0]", 1)
+    return location.replace("work", "works[0]", 1)
 
 
 def _loop(name: str, statements: list[str]) -> Iterator[str]:

@@ -57,9 +57,9 @@ def export_controller(
         EdpError: not such a run, a controller or twin without a form in C, a name or an option that cannot be.
     """
     iterations = _iterations(options or {})
-    kept = load_kept(run)
-    parts = parts_of(kept.experiment, kept.plant, kept.models, kept.twin, iterations)
-    return write_controller(replace(parts, golden=_golden(parts, kept)), name, Path(folder))
+    stored = load_kept(run)
+    parts = parts_of(stored.experiment, stored.plant, stored.models, stored.twin, iterations)
+    return write_controller(replace(parts, golden=golden_loop(parts, stored)), name, Path(folder))
 
 
 def parts_of(
@@ -90,7 +90,8 @@ def parts_of(
         )
     valves = models.needed_map(CONTROLLERS.name_of(spec))
     loop = spec if isinstance(spec, ProportionalIntegral) else ProportionalIntegral()
-    plan, reads = None, STROKES
+    plan: PlanParts | None = None
+    reads: tuple[str, ...] = STROKES
     low, high = np.full(AXES, -FARTHEST_M), np.full(AXES, FARTHEST_M)
     if isinstance(spec, PredictiveControl):
         if twin is None:
@@ -100,7 +101,8 @@ def parts_of(
         reads = controller.reads
         plan = _plan(spec, plant, limits, valves, twin, (reads, iterations))
         ends = input_limits(plan.plant.predictor)
-        low, high = (values[[plan.plant.predictor.sizes[0] + port for port in plan.ports]] for values in ends)
+        commands = len(twin.twin.channels.commands)
+        low, high = (np.asarray(values)[[commands + port for port in plan.ports]] for values in ends)
     channels = {channel.name: channel for channel in plant.channels}
     table = TipTable(plant.geometry)
     return ControllerParts(
@@ -205,33 +207,33 @@ def _check_pilots(plan: PlanParts, plant: PlantInterface) -> None:
             )
 
 
-def _golden(parts: ControllerParts, kept: KeptController) -> GoldenLoop | None:
+def golden_loop(parts: ControllerParts, stored: KeptController) -> GoldenLoop | None:
     """The kept stretch up to the first tick at which an input was missing; None where that is the first."""
-    columns = kept.plant.columns(tuple(channel.name for channel in parts.inputs))
-    measured = kept.observed[:, columns]
-    good = np.isfinite(measured).all(axis=1)
+    columns = stored.plant.columns(tuple(channel.name for channel in parts.inputs))
+    measured = stored.observed[:, columns]
+    good: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=1))
     ticks = len(good) if good.all() else int(np.argmin(good))
     if not ticks:
         return None
     ahead = parts.lead if parts.plan is None else max(parts.lead, sum(parts.plan.blocks))
     # Two more rows: slopes are central.
     rows = slice(0, ticks + ahead + 2)
-    before, levers = _replayed(kept, ticks)
-    return GoldenLoop(measured[:ticks], before, levers, kept.strokes[rows], kept.tip[rows])
+    before, levers = _replayed(stored, ticks)
+    return GoldenLoop(measured[:ticks], before, levers, stored.strokes[rows], stored.tip[rows])
 
 
-def _replayed(kept: KeptController, ticks: int) -> tuple[Array, Array]:
+def _replayed(stored: KeptController, ticks: int) -> tuple[Array, Array]:
     """Memory before each tick and levers of the controller, told the observations that were kept."""
-    experiment = kept.experiment
-    controller = experiment.controller.build(kept.plant, experiment.task.limits, kept.models)
+    experiment = stored.experiment
+    controller = experiment.controller.build(stored.plant, experiment.task.limits, stored.models)
     if not isinstance(controller, PiController | NmpcController):
         raise ExportError("the controller has no form in C; these have: pi, nmpc")
-    judged = np.ones(len(kept.strokes), dtype=bool)
-    controller.reset(kept.observed[0], TipReference(kept.plant.rate_hz, kept.strokes, kept.tip, judged))
+    judged = np.ones(len(stored.strokes), dtype=bool)
+    controller.reset(stored.observed[0], TipReference(stored.plant.rate_hz, stored.strokes, stored.tip, judged))
     before, levers = [], []
     for tick in range(ticks):
         before.append(np.concatenate((controller.before, controller.memory)))
-        levers.append(controller.step(kept.observed[tick], tick))
+        levers.append(controller.step(stored.observed[tick], tick))
     return np.array(before), np.array(levers)
 
 

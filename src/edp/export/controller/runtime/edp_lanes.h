@@ -8,13 +8,10 @@
 
 #include "edp_runtime.h"
 
-/* y += W x; see edp_product. */
-void edp_product_lanes(const float *x, uint32_t x_stride, const float *weight, uint32_t out, uint32_t in, float *y,
-                       uint32_t y_stride, uint32_t lanes);
 /* See edp_dense, of one row. */
 void edp_dense_lanes(const float *x, uint32_t x_stride, const float *weight, const float *bias, uint32_t out, uint32_t in,
                      float *y, uint32_t y_stride, uint32_t lanes);
-/* See edp_gru; x, gates and y have the stride of the work memory. */
+/* See edp_gru, but for the last bits of its gates; x, gates and y have the stride of the work memory. */
 void edp_gru_lanes(const float *x, const edp_gru_weights *w, uint32_t in, uint32_t units, float *h, uint32_t h_stride,
                    float *gates, float *y, uint32_t stride, uint32_t lanes);
 
