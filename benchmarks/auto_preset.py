@@ -163,6 +163,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             continue
         print(f"{entry['settings']} ...", file=sys.stderr, flush=True)
         found, notes[entry["title"]] = run_set(entry, seeds, QUICK if chosen.quick else (), not chosen.quick)
+        show(found, {entry["title"]: notes[entry["title"]]})
+        print(flush=True)
         tasks += found
     show(tasks, notes)
     kept = {"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}

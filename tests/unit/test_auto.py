@@ -15,7 +15,7 @@ from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
 from edp.training import load_bundle
 from edp.workflows.auto import load_auto, train_auto
-from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half, tree_plan
+from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_of, tree_plan
 from edp.workflows.auto.promise import Promise, choose
 from edp.workflows.train_evaluate import DataSource, evaluate, trained_run
 
@@ -238,9 +238,10 @@ def test_candidates_that_left_out_fewer_blocks_are_compared_on_those():
 
 def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     amount = Amount(rows=100_000, shortest=100_000, features=5, outputs=2, horizon=10, minutes=5.0)
-    assert spans_by_half(amount) == [1, 2, 3, 4, 6, 8, 12, 16, 24, 32]
-    assert spans_by_half(replace(amount, horizon=100))[-1] == 256
-    assert spans_by_half(replace(amount, shortest=80))[-1] == 8
+    assert spans_of(amount).lags == [1, 2, 3, 4, 6, 8, 12, 16, 24, 32]
+    assert spans_of(amount).smoothed == [4, 8, 16, 32]
+    assert spans_of(replace(amount, horizon=100)).lags[-1] == 256
+    assert spans_of(replace(amount, shortest=80)).lags[-1] == 8
     assert CANDIDATES["recurrent"].tables(replace(amount, rows=5000)) is None
     assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140)) is not None
     assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140, horizon=100)) is None
@@ -258,7 +259,7 @@ def test_the_budget_of_long_recordings_goes_to_the_recurrent_network():
     kinds = ("perceptrons", "trees", "recurrent")
     for amount, most in ((short, "trees"), (long, "recurrent")):
         seconds = {kind: amount.seconds(kind) for kind in kinds}
-        assert sum(seconds.values()) == pytest.approx(300.0)
+        assert 240.0 < sum(seconds.values()) < 300.0  # the rest is for linear models and radial basis functions
         assert seconds[most] >= max(seconds.values())
 
 
@@ -267,15 +268,22 @@ def test_trees_of_many_outputs_keep_most_of_the_rows():
     amount = Amount(rows=31_000, shortest=1_000, features=12, outputs=24, horizon=10, minutes=5.0)
     plan = tree_plan(amount)
     assert plan.rows >= 15_000
-    assert plan.trees >= 80
-    assert plan.folds == 2
+    assert plan.rounds >= 40
+    assert (plan.models, plan.folds) == (2, 2)
     assert 0.1 < plan.rate <= 0.2
     small = tree_plan(replace(amount, rows=1_000, outputs=3))
-    assert (small.trees, small.folds, small.rate) == (200, 5, 0.1)
-    plans = [tree_plan(replace(amount, minutes=minutes)) for minutes in (0.01, 1.0, 5.0, 20.0, 100.0)]
+    assert (small.trees, small.models, small.folds, small.rate) == (300, 3, 5, 0.1)
+    plans = [tree_plan(replace(amount, minutes=minutes)) for minutes in (0.01, 1.0, 5.0, 20.0, 200.0)]
     assert plans[0].trees == 0
     assert [one.rows for one in plans[1:]] == sorted(one.rows for one in plans[1:])
-    assert (plans[-1].trees, plans[-1].folds, plans[-1].rows) == (200, 5, 30_000)
+    assert (plans[-1].trees, plans[-1].folds, plans[-1].rows) == (300, 5, 30_000)
+
+
+def test_many_channels_get_fewer_spans():
+    amount = Amount(rows=60_000, shortest=60_000, features=12, outputs=2, horizon=10, minutes=5.0)
+    wide = [spans_of(replace(amount, features=features)) for features in (12, 60, 100, 1000)]
+    assert [len(one.lags) for one in wide] == [10, 6, 6, 3]
+    assert [len(one.smoothed) for one in wide] == [4, 4, 0, 0]
 
 
 def scores(network, **others):

@@ -76,6 +76,7 @@ class Oddity:
         settings: the task.
         factor: the test error may be so many times that of the better of the rivals.
         lost: ticks that the logger lost, as pairs of first and last.
+        missing: ticks at which the channel p has no value, likewise.
     """
 
     logs: Callable[[], Sequence[Columns]]
@@ -84,6 +85,7 @@ class Oddity:
     factor: float = 1.1
     kinds: Mapping[str, str] = field(default_factory=lambda: KINDS)
     lost: Sequence[tuple[int, int]] = ()
+    missing: Sequence[tuple[int, int]] = ()
 
 
 def encoder() -> Columns:
@@ -98,7 +100,55 @@ def of_sizes() -> Columns:
     return {"u": columns["u"], "small": 1e-6 * columns["v"], "large": 10 * columns["p"]}
 
 
+def moves_late() -> Columns:
+    """A channel that says nothing, and stands still until the test part."""
+    columns = rig(13, 60, 50)
+    late = np.where(np.arange(3000) < 2600, 3.7, 3.7 + np.random.default_rng(13).normal(size=3000))
+    return columns | {"k": late}
+
+
+def two_rates() -> Columns:
+    """A pressure that its own clock samples 7.3 times a second, the other channels 50 times."""
+    columns = rig(14, 60, 50)
+    read = (np.floor(np.arange(3000) * 7.3 / 50) * 50 / 7.3).astype(int)
+    return columns | {"p": columns["p"][read]}
+
+
+def wide() -> Columns:
+    """Sixty channels of which most drift about."""
+    columns = rig(15, 40, 50)
+    drift = 0.05 * np.cumsum(np.random.default_rng(15).normal(size=(2000, 56)), axis=0)
+    return columns | {f"c{number}": drift[:, number] for number in range(56)}
+
+
+def many_outputs() -> Columns:
+    """Eight speeds, each of which follows the lever later than the one before."""
+    columns = rig(16, 60, 50)
+    noise = 0.005 * np.random.default_rng(16).normal(size=(3000, 7))
+    later = {f"v{number + 1}": np.roll(columns["v"], 2 * number + 2) + noise[:, number] for number in range(7)}
+    return {name: columns[name] for name in ("u", "v", "p")} | later
+
+
 ODDITIES = {
+    "a channel that first moves in the test part": Oddity(
+        lambda: [moves_late()], 50, ["task.targets=['v']", "task.horizons=[5]"]
+    ),
+    "channels of two rates": Oddity(lambda: [two_rates()], 50, ["task.targets=['v', 'p']", "task.horizons=[5]"]),
+    "missing values": Oddity(
+        lambda: [rig(17, 60, 50)],
+        50,
+        ["task.targets=['v']", "task.horizons=[5]", BY_TIME],
+        missing=((300, 340), (1000, 1200), (2700, 2705)),
+    ),
+    "sixty channels": Oddity(lambda: [wide()], 50, ["task.targets=['v']", "task.horizons=[5]"]),
+    "twenty-four outputs": Oddity(
+        lambda: [many_outputs()],
+        50,
+        [
+            *("task.targets=['v', 'v1', 'v2', 'v3', 'v4', 'v5', 'v6', 'v7']", "task.horizons=[1, 4, 10]"),
+            "task.features={name='speeds', channels=['u', 'v', 'p', 'v1', 'v2', 'v3', 'v4', 'v5', 'v6', 'v7']}",
+        ],
+    ),
     "half a minute": Oddity(lambda: [rig(1, 30, 100)], 100, ["task.targets=['v']", "task.horizons=[10]"], 1.15),
     "5 Hz": Oddity(
         lambda: [rig(seed, 200, 5, hold_s=2) for seed in range(4)], 5, ["task.targets=['v']", "task.horizons=[2]"]
@@ -159,7 +209,9 @@ def write(folder: Path, oddity: Oddity) -> DataSource:
         table = np.column_stack([np.arange(len(columns["u"])) / oddity.rate, *columns.values()])
         for first, last in oddity.lost:
             table[first:last] = np.nan
-        rows = table[np.isfinite(table).all(axis=1)]
+        for first, last in oddity.missing:
+            table[first:last, 1 + list(columns).index("p")] = np.nan
+        rows = table[np.isfinite(table[:, 0])]
         head = ",".join(("time", *columns))
         np.savetxt(folder / "logs" / f"{number:02d}.csv", rows, "%.9g", ",", header=head, comments="")
     entries = ['time = "time"']
@@ -167,7 +219,8 @@ def write(folder: Path, oddity: Oddity) -> DataSource:
         kind = oddity.kinds.get(name, "generic")
         entries.append(f'[channels.{name}]\ncolumn = "{name}"\nkind = "{kind}"\nunit = "{UNITS[kind]}"')
     (folder / "map.toml").write_text("\n".join(entries) + "\n")
-    repair = build(Repair, {"gaps": "cut"}, "test") if oddity.lost else None
+    mended = {"gaps": "cut"} if oddity.lost else {"nan": "hold"} if oddity.missing else None
+    repair = None if mended is None else build(Repair, mended, "test")
     return DataSource.of(folder / "logs", folder / "map.toml", repair)
 
 

@@ -315,6 +315,24 @@ def test_the_bank_gives_changes_over_its_spans():
     assert not y[0, 0, 2:].any()
 
 
+def test_the_bank_gives_changes_of_means_over_its_smoothed_spans():
+    bank, x = LagBank(2, (1, 2, 3, 4), (2, 4)), torch.randn(1, 12, 2, dtype=torch.float64)
+    y, _ = bank(x, bank.initial_state(1, x))
+    assert (y.shape[-1], bank.columns, bank.reach) == (14, 14, 7)
+    for tick in range(bank.reach, 12):
+        means = [x[0, tick - m + 1 : tick + 1].mean(0) - x[0, tick - 2 * m + 1 : tick - m + 1].mean(0) for m in (2, 4)]
+        torch.testing.assert_close(y[0, tick, 10:], torch.cat(means), rtol=0, atol=1e-12)
+    assert not y[0, 0, 2:].any()
+    stays, _ = bank(torch.ones_like(x), bank.initial_state(1, x))
+    assert not stays[..., 2:].any()
+
+
+@pytest.mark.parametrize("smoothed", [(1,), (3,), (4, 2), (2, 2)])
+def test_impossible_smoothed_spans_are_refused(smoothed):
+    with pytest.raises(ConfigError, match="smoothed"):
+        CommitteeSpec(lags=(1, 2, 4), smoothed=smoothed)
+
+
 @pytest.mark.parametrize("lags", [(), (0, 1), (2, 1), (1, 1), (5000,)])
 def test_impossible_spans_are_refused(lags):
     with pytest.raises(ConfigError, match="lags"):

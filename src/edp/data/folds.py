@@ -35,6 +35,11 @@ class Folds:
         """Rows that `fold` is judged by."""
         return np.flatnonzero(self.owner == fold)
 
+    def thinned(self, stride: int) -> Folds:
+        """The folds of every `stride`-th row."""
+        training = tuple(rows[rows % stride == 0] // stride for rows in self.training)
+        return Folds(self.owner[::stride], training)
+
 
 def blocked_folds(lengths: Sequence[int], folds: int, gap: int) -> Folds:
     """Contiguous folds with nearly equal shares of the rows of all stretches, laid end to end.

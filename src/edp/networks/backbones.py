@@ -19,7 +19,7 @@ from edp.networks.cells.base import check_cell
 from edp.networks.committee import NON_LINEAR, Committee, Members
 from edp.networks.convolution import ConvolutionStack, receptive_field
 from edp.networks.initial import InitialSpec, ZeroState
-from edp.networks.lag_bank import LagBank, check_lags
+from edp.networks.lag_bank import LagBank, check_lags, check_smoothed
 from edp.networks.pooling import AttentionPooling
 from edp.networks.radial import MOST_CENTRES, RadialFeatures
 from edp.networks.streaming import Chain, Cost, State, Streaming
@@ -246,6 +246,7 @@ class CommitteeSpec:
 
     Attributes:
         lags: spans in ticks, rising.
+        smoothed: spans among `lags` over which the mean of as many ticks also gives its change.
         members: perceptrons for each activation.
         units: hidden units of each layer of a member.
         layers: hidden layers of a member.
@@ -259,6 +260,7 @@ class CommitteeSpec:
 
     # Spans in powers of two cover 0.01 to 0.32 s at 100 Hz with few columns.
     lags: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    smoothed: tuple[int, ...] = ()
     members: int = 10
     units: int = 64
     layers: int = 2
@@ -271,6 +273,7 @@ class CommitteeSpec:
     def __post_init__(self) -> None:
         check_count("backbone", "lags", self.lags, MOST_LEVELS, least=1)
         check_lags(self.lags)
+        check_smoothed(self.lags, self.smoothed)
         check_count("backbone", "activations", self.activations, len(NON_LINEAR))
         check_bounds("backbone", self, members=integer(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
         check_bounds("backbone", self, trees=integer(0, MOST_TREES), tree_depth=integer(1, MOST_DEPTH))
@@ -284,10 +287,10 @@ class CommitteeSpec:
 
     def conflicts(self, model: object, task: Task) -> str | None:
         """Trees that read more columns than their tables can name."""
-        columns = len(task.features.features) * (1 + len(self.lags))
+        columns = len(task.features.features) * (1 + len(self.lags) + len(self.smoothed))
         if self.trees and columns > MOST_INDEX + 1:
             return (
-                f"committee: trees would read {columns:,} columns (features times 1 + lags); at most "
+                f"committee: trees would read {columns:,} columns (features times 1 + lags + smoothed); at most "
                 f"{MOST_INDEX + 1:,} must hold: give fewer channels or lags, or trees = 0"
             )
         return None
@@ -302,7 +305,7 @@ class CommitteeSpec:
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """The bank of changes, and the members and trees on it."""
-        bank = LagBank(features, self.lags)
+        bank = LagBank(features, self.lags, self.smoothed)
         groups = [
             Members(bank.columns, self.members, self.units, self.layers, name, self.dropout)
             for name in self.activations

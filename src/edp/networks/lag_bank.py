@@ -30,34 +30,64 @@ def check_lags(lags: Sequence[int]) -> None:
         )
 
 
+def check_smoothed(lags: Sequence[int], smoothed: Sequence[int]) -> None:
+    """Refuse spans of smoothed changes that `LagBank` cannot make.
+
+    Raises:
+        ConfigError: one that is no span of `lags`, one of 1, or spans that do not rise.
+    """
+    if list(smoothed) != sorted(set(smoothed)) or any(span < 2 or span not in lags for span in smoothed):
+        raise ConfigError(
+            f"smoothed: {shown(smoothed)}; spans that rise, each of 2 ticks or more and among lags = {shown(lags)}, "
+            "must hold"
+        )
+
+
 class LagBank(Streaming):
-    """``[x[t] ; gain_l (x[t] - x[t - l]) for each lag l]``: ``(batch, time, width)`` to ``width (1 + lags)`` columns.
+    """``[x[t] ; gain_l (x[t] - x[t - l]) for each lag l ; gain_m (x_m[t] - x_m[t - m]) for each smoothed span m]``.
+
+    ``(batch, time, width)`` to ``width (1 + lags + smoothed)`` columns; ``x_m`` is the mean of x over the last m ticks.
+    The change of such means (the Haar wavelet) has one m-th of the variance that noise gives to the change itself.
 
     The change over l ticks is l times the mean of the last l changes from tick to tick. In the first l ticks of a
     stream it is l times the mean of those seen, the first of which is 0: the change that would be if the stream had
-    gone on like this before. State: the input before, whether there was one, and the changes that each mean needs.
+    gone on like this before. The change of means over m is the mean of the last m changes over m. State: the input
+    before, whether there was one, and the changes that each mean needs.
 
     Attributes:
-        gain: what each change is multiplied by, ``(lag, width)``; a trainer sets one over its standard deviation.
+        gain: what each change is multiplied by, ``(lag + smoothed, width)``; a trainer sets one over its deviation.
     """
 
     gain: Tensor
 
-    def __init__(self, width: int, lags: Sequence[int]) -> None:
+    def __init__(self, width: int, lags: Sequence[int], smoothed: Sequence[int] = ()) -> None:
         super().__init__()
         check_lags(lags)
-        self.width, self.lags = width, tuple(lags)
+        check_smoothed(lags, smoothed)
+        self.width, self.lags, self.smoothed = width, tuple(lags), tuple(smoothed)
         # A mean of one is the change itself, and would carry a ring without rows.
         self.means = nn.ModuleList(StreamingTrailingMean(width, lag) for lag in self.lags if lag > 1)
-        self.register_buffer("gain", torch.ones(len(self.lags), width))
+        self.means_of_means = nn.ModuleList(StreamingTrailingMean(width, span) for span in self.smoothed)
+        self.register_buffer("gain", torch.ones(len(self.spans), width))
+
+    @property
+    def spans(self) -> tuple[int, ...]:
+        """Ticks of each change, in the order of the columns behind the present values."""
+        return (*self.lags, *self.smoothed)
 
     @property
     def columns(self) -> int:
         """Numbers that it gives at a tick."""
-        return self.width * (1 + len(self.lags))
+        return self.width * (1 + len(self.spans))
+
+    @property
+    def reach(self) -> int:
+        """Ticks that the oldest value which a column reads lies back."""
+        return max(self.lags[-1], *(2 * span - 1 for span in self.smoothed), 1)
 
     def _means(self) -> list[StreamingTrailingMean]:
-        return [mean for mean in self.means if isinstance(mean, StreamingTrailingMean)]
+        """Means of changes, then means of some of these."""
+        return [mean for mean in (*self.means, *self.means_of_means) if isinstance(mean, StreamingTrailingMean)]
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         rings = tuple(mean.initial_state(batch, like) for mean in self._means())
@@ -67,22 +97,31 @@ class LagBank(Streaming):
         previous, age, rings = state
         first = torch.where(age > 0.5, previous, x[:, :1])
         change = x - torch.cat([first, x[:, :-1]], dim=1)
-        results = [mean(change, ring) for mean, ring in zip(self._means(), rings, strict=True)]
-        values, new = [value for value, _ in results], [after for _, after in results]
-        if self.lags[0] == 1:
-            values.insert(0, change)
-        parts = [x, *(value * (lag * gain) for lag, gain, value in zip(self.lags, self.gain, values, strict=True))]
+        values, new = ([change] if self.lags[0] == 1 else []), []
+        for mean, ring in zip(self._means(), rings, strict=True):
+            source = change if len(values) < len(self.lags) else values[self._smooths(len(values))]
+            value, after = mean(source, ring)
+            values.append(value)
+            new.append(after)
+        parts = [x, *(value * (span * gain) for span, gain, value in zip(self.spans, self.gain, values, strict=True))]
         return torch.cat(parts, dim=-1), (x[:, -1:], torch.ones_like(age), tuple(new))
+
+    def _smooths(self, span: int) -> int:
+        """Number of the change whose mean the change with the number `span` is."""
+        return self.lags.index(self.spans[span])
 
     def lower(self, build: Builder, x: str) -> str:
         one = torch.ones(self.width)
         change = build.add(Difference, "change", x, factor=one, from_zero=False)
-        means = [mean.lower(build, change) for mean in self._means()]
-        joined = build.join("changes", x, *([change] if self.lags[0] == 1 else []), *means)
-        spans = torch.tensor(self.lags, dtype=self.gain.dtype, device=self.gain.device)
+        values = [change] if self.lags[0] == 1 else []
+        for mean in self._means():
+            source = change if len(values) < len(self.lags) else values[self._smooths(len(values))]
+            values.append(mean.lower(build, source))
+        joined = build.join("changes", x, *values)
+        spans = torch.tensor(self.spans, dtype=self.gain.dtype, device=self.gain.device)
         gain = torch.cat([one.to(self.gain), (spans[:, None] * self.gain).flatten()])
         return build.add(ScaleShift, "scaled_changes", joined, gain=gain, shift=torch.zeros_like(gain))
 
     def costs(self) -> list[Cost]:
         """Differences and sums only: no multiply-accumulates."""
-        return [Cost(f"changes over {len(self.lags)} spans", 0, width_in=self.width, width_out=self.columns)]
+        return [Cost(f"changes over {len(self.spans)} spans", 0, width_in=self.width, width_out=self.columns)]

@@ -12,7 +12,10 @@ from edp.data.task import Task
 MOST_PARAMETERS = 50_000_000
 # Numbers that a stream carries from tick to tick: 0.4 GB as float32, and a training has a stream for each lane.
 MOST_STATE = 100_000_000
-NO_WIDTHS = ("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations", "lags")
+NO_WIDTHS = (
+    *("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations"),
+    *("lags", "smoothed"),
+)
 """Options that are integers, but not the width of anything."""
 
 
@@ -31,7 +34,7 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
         return max((value for key, value in options if key == name), default=1)
 
     width = max([features, *(value for key, value in options if key not in NO_WIDTHS)])
-    spans = sum(key == "lags" for key, _ in options)
+    spans = sum(key in ("lags", "smoothed") for key, _ in options)
     if spans:  # the representation of a committee: changes over each span, and all members
         # Two groups of members at most: one for each of the two activations.
         width = features * (1 + spans) + 2 * most("members") * most("units") + targets * len(task.horizons)

@@ -1,9 +1,11 @@
 """Boosted regression trees as learners of a committee: steps and switches that smooth learners round off.
 
-Two models, each with half of the trees: one of what the linear model leaves, and one of the targets themselves, which
-does not run away with the linear model where the machine goes beyond what was recorded. How many trees, left-out rows
-say; the trees of the network are then grown on all rows. Trees may leave out several neighbouring folds at a time: how
-well trees on fewer rows predict says enough about how many of them to take and how to weigh them, and costs less.
+Up to three models with as many trees each: one of what the linear model leaves, and two of the targets themselves,
+which do not run away with the linear model where the machine goes beyond what was recorded. The first of these reads
+only present values and changes over powers of two ticks, as the baseline does, the second all columns. How many trees,
+left-out rows say; the trees of the network are then grown on all rows. Trees may leave out several neighbouring folds
+at a time: how well trees on fewer rows predict says enough about how many of them to take and how to weigh them, and
+costs less.
 """
 
 from __future__ import annotations
@@ -18,8 +20,10 @@ from numpy.typing import NDArray
 
 from edp.data.folds import Folds
 from edp.data.lags import DoubleArray
+from edp.networks.lag_bank import LagBank
 from edp.networks.trees import Trees
 from edp.training.bagging.learner import FoldFit, HeadPart
+from edp.training.bagging.table import committee_of
 from edp.training.outcome import TrainingProgress
 from edp.training.tree_tables import Tables, complete_tables, stacked_tables
 
@@ -46,12 +50,27 @@ class _Boosted:
     tables: Tables | None
 
 
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """What the trees of a model learn.
+
+    Attributes:
+        direct: the targets themselves, or what the linear model leaves of them.
+        columns: that they read, ``(column,)``.
+    """
+
+    direct: bool
+    columns: NDArray[np.int64]
+
+
 class TreeLearner:
-    """Fits the trees of a committee, half of them to residuals and half to the targets."""
+    """Fits the trees of a committee: to residuals, to the targets by few columns, and to the targets by all columns."""
 
     def __init__(self, work: FoldFit, trees: Trees) -> None:
         self.work, self.trees = work, trees
-        self.rounds = max(1, trees.trees // 2)
+        models = min(work.bagging.tree_models, trees.trees)
+        self.kinds = _kinds(committee_of(work.net).bank)[:models]
+        self.rounds = trees.trees // models
         self.models: list[list[_Boosted]] = []
         rng = np.random.default_rng(work.spec.seed)
         most, folds = work.bagging.tree_rows, work.table.folds
@@ -62,19 +81,18 @@ class TreeLearner:
         self.every = _sample(np.arange(len(work.table.columns)), most, rng)
 
     def fit(self) -> None:
-        """Every output of both models; progress after each."""
+        """Every output of all models; progress after each."""
         began, outputs = time.perf_counter(), self.work.table.targets.shape[1]
-        kinds = 2 if self.trees.trees > 1 else 1
-        for kind in range(kinds):
+        total = len(self.kinds) * outputs
+        for number, kind in enumerate(self.kinds):
             self.models.append([])
             for output in range(outputs):
-                self.models[-1].append(self._boost(direct=kind == 1, output=output))
-                done, seconds = kind * outputs + output + 1, time.perf_counter() - began
+                self.models[-1].append(self._boost(kind, output))
+                done, seconds = number * outputs + output + 1, time.perf_counter() - began
                 rate = done * len(self.every) / max(seconds, 1e-9)
-                left = (kinds * outputs - done) * seconds / done
-                self.work.tell(TrainingProgress(1, 1, done, kinds * outputs, rate, left))
+                self.work.tell(TrainingProgress(1, 1, done, total, rate, (total - done) * seconds / done))
 
-    def _boost(self, direct: bool, output: int) -> _Boosted:
+    def _boost(self, kind: _Kind, output: int) -> _Boosted:
         table = self.work.table
         # Single precision: a hundred predictions of every row are the most that this takes.
         staged = np.zeros((self.rounds, len(table.columns)), dtype=np.float32)
@@ -83,22 +101,25 @@ class TreeLearner:
             for fold in part.tolist():
                 # What is left of a row is judged by the line that did not see it, whichever line the trees start from.
                 own = table.folds.left_out(fold)
-                truth[own] = self._target(own, fold, direct)[:, output]
+                truth[own] = self._target(own, fold, kind.direct)[:, output]
             judged = np.flatnonzero(np.isin(table.folds.owner, part))
-            stages = self._grown(rows, self._target(rows, int(part[0]), direct)[:, output], self.rounds, judged)
+            target = self._target(rows, int(part[0]), kind.direct)[:, output]
+            stages = self._grown(rows, target, kind.columns, judged)
             for number, predicted in enumerate(stages):
                 staged[number, judged] = predicted
                 squared[number] += np.square(predicted - truth[judged]).sum()
         count = int(squared.argmin()) + 1
         if squared[count - 1] >= np.square(truth).sum():
             return _Boosted(0, np.zeros(len(truth)), None)
-        target = self._target(self.every, None, direct)[:, output]
-        model = self._regressor(count).fit(self._on_grid(self.every), target)
-        return _Boosted(count, staged[count - 1].astype(np.float64), complete_tables(model, self.trees.depth))
+        target = self._target(self.every, None, kind.direct)[:, output]
+        model = self._regressor(count).fit(self._on_grid(self.every, kind.columns), target)
+        feature, threshold, leaf = complete_tables(model, self.trees.depth)
+        return _Boosted(count, staged[count - 1].astype(np.float64), (kind.columns[feature], threshold, leaf))
 
-    def _on_grid(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Columns of some rows, rounded to `GRID`."""
-        return np.asarray(np.round(self.work.table.columns[rows] / np.float32(GRID)) * np.float32(GRID))
+    def _on_grid(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Some columns of some rows, rounded to `GRID`."""
+        part = self.work.table.columns[rows][:, columns]
+        return np.asarray(np.round(part / np.float32(GRID)) * np.float32(GRID))
 
     def _target(self, rows: NDArray[np.int64], fold: int | None, direct: bool) -> DoubleArray:
         """What the trees of a fold, or those on all rows, are to predict, ``(row, output)``."""
@@ -111,11 +132,11 @@ class TreeLearner:
         return np.asarray(targets - self.work.table.columns[rows] @ weight - intercept)
 
     def _grown(
-        self, rows: NDArray[np.int64], target: DoubleArray, rounds: int, judged: NDArray[np.int64]
+        self, rows: NDArray[np.int64], target: DoubleArray, columns: NDArray[np.int64], judged: NDArray[np.int64]
     ) -> Iterator[DoubleArray]:
         """Predictions of the judged rows after each tree."""
-        model = self._regressor(rounds).fit(self._on_grid(rows), target)
-        return iter(model.staged_predict(self.work.table.columns[judged]))
+        model = self._regressor(self.rounds).fit(self._on_grid(rows, columns), target)
+        return iter(model.staged_predict(self.work.table.columns[judged][:, columns]))
 
     def _regressor(self, rounds: int):  # type: ignore[no-untyped-def]  # scikit-learn has no types
         # Imported here: it takes over a second, and trainings without trees do not need it.
@@ -134,9 +155,10 @@ class TreeLearner:
         )
 
     def left_out(self) -> Sequence[DoubleArray]:
-        """Both models' predictions, those of the second less the linear model's, in whose stead they come."""
-        residual, *direct = [np.stack([model.left_out for model in models], axis=1) for models in self.models]
-        return [residual, *(predicted - self.work.linear.left_out for predicted in direct)]
+        """All models' predictions, those of the targets less the linear model's, in whose stead they come."""
+        every = [np.stack([model.left_out for model in models], axis=1) for models in self.models]
+        linear = self.work.linear.left_out
+        return [one - linear if kind.direct else one for kind, one in zip(self.kinds, every, strict=True)]
 
     def write(self, shares: DoubleArray) -> HeadPart:
         """The trees with their shares into the network; the head passes their sums on."""
@@ -145,11 +167,11 @@ class TreeLearner:
             [_weighted(models[output].tables, share[output]) for models, share in zip(self.models, shares, strict=True)]
             for output in range(outputs)
         ]
-        grown = [[one for one in both if one is not None] for both in tables]
+        grown = [[one for one in each if one is not None] for each in tables]
         empty = self._empty()
-        joined = [tuple(np.concatenate(part) for part in zip(*both, strict=True)) if both else empty for both in grown]
+        joined = [tuple(np.concatenate(part) for part in zip(*each, strict=True)) if each else empty for each in grown]
         self.trees.set_tables(*stacked_tables(joined, self.trees.trees))  # type: ignore[arg-type]
-        taken_away = shares[1] if len(shares) > 1 else np.zeros(outputs)
+        taken_away = sum((own for kind, own in zip(self.kinds, shares, strict=True) if kind.direct), np.zeros(outputs))
         return HeadPart(np.eye(outputs), np.zeros(outputs), np.asarray(taken_away))
 
     def _empty(self) -> Tables:
@@ -159,6 +181,15 @@ class TreeLearner:
             np.zeros((0, nodes), dtype=np.float32),
             np.zeros((0, nodes + 1), dtype=np.float32),
         )
+
+
+def _kinds(bank: LagBank) -> list[_Kind]:
+    """The models; without the last one where it would read all columns."""
+    powers = [0, *(span for span, lag in enumerate(bank.lags, start=1) if lag & (lag - 1) == 0)]
+    sparse = (np.array(powers)[:, None] * bank.width + np.arange(bank.width)).ravel()
+    every = np.arange(bank.columns)
+    kinds = [_Kind(False, every), _Kind(True, sparse), _Kind(True, every)]
+    return kinds if len(sparse) < len(every) else kinds[:2]
 
 
 def _trained_by_all(folds: Folds, part: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -107,9 +107,10 @@ def fit_in_folds(
 
 
 def _fit_linear(net: Predictor, table: Table) -> FoldRidge:
-    """The linear models: present values alone, then with changes over more and more spans."""
+    """The linear models: present values alone, then with changes over more and more spans, then all columns."""
     bank = committee_of(net).bank
-    sets = [np.arange(bank.width * (1 + spans)) for spans in range(len(bank.lags) + 1)]
+    counts = [*range(len(bank.lags) + 1), *([len(bank.spans)] if bank.smoothed else [])]
+    sets = [np.arange(bank.width * (1 + spans)) for spans in counts]
     return fold_ridge(table.columns, table.targets, table.folds, sets)
 
 

@@ -9,6 +9,7 @@ from edp.networks.trees import MOST_DEPTH
 from edp.settings.bounds import MOST_BATCH, MOST_EPOCHS, MOST_ROWS, MOST_WEIGHT, above, check_bounds, integer, span
 
 MOST_FOLDS = 100
+MOST_TREE_MODELS = 3
 MOST_RATE = 1.0
 
 
@@ -30,6 +31,8 @@ class BaggingSpec:
         tree_rate: share of each boosted tree's leaves that is added.
         tree_leaf: rows of a leaf at least.
         tree_leaves: leaves of a tree at most, the ones that lower the error most; 0 for as many as the depth allows.
+        tree_models: models of each output that share its trees: of what the linear model leaves, of the target by few
+            columns (present values and changes over powers of two ticks), of the target by all columns.
         tree_folds: parts that trees leave out, each a run of neighbouring folds; fewer parts than `folds` take less
             time, for trees are grown anew for each.
         tree_rows: rows that trees are grown on at most, drawn at random.
@@ -50,6 +53,7 @@ class BaggingSpec:
     tree_rate: float = 0.1
     tree_leaf: int = 20
     tree_leaves: int = 31  # scikit-learn's
+    tree_models: int = 3
     tree_folds: int = 5
     tree_rows: int = 30_000
 
@@ -68,6 +72,7 @@ class BaggingSpec:
             tree_rate=above(0.0, MOST_RATE),
             tree_leaf=integer(1, MOST_ROWS),
             tree_leaves=integer(0, 2**MOST_DEPTH),
+            tree_models=integer(1, MOST_TREE_MODELS),
             tree_folds=integer(2, MOST_FOLDS),
             tree_rows=integer(100, MOST_ROWS),
         )

@@ -115,8 +115,8 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
         for group in committee_of(net).members:
             # No gradient reaches these weights: random ones would answer a channel that moves later for the first time.
             group.weights[0][:, still] = 0.0
-    # Rows within the longest lag and the largest horizon of a fold share samples with it.
-    gap = math.ceil((bank.lags[-1] + reach) / stride)
+    # Rows within the bank's reach and the largest horizon of a fold share samples with it.
+    gap = math.ceil((bank.reach + reach) / stride)
     lengths = [len(of) for of in chosen]
     gap = min(gap, max(1, sum(lengths) // (4 * spec.folds)))
     starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), skips, strict=True)

@@ -67,7 +67,7 @@ def imitates(teachers: Sequence[Predictor], model: ModelSpec) -> bool:
         plain
         and isinstance(own, CommitteeSpec)
         and isinstance(theirs, CommitteeSpec)
-        and own.lags == theirs.lags
+        and (own.lags, own.smoothed) == (theirs.lags, theirs.smoothed)
         and bool(own.activations)
     )
 
