@@ -135,7 +135,7 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
         free_run_scores(free_runs(one, runs[2:3], 2.0, 32), judge)["velocity_mae"]["mean"]
         for one in (fit.twin, fit.twin.without_network())
     )
-    assert with_network < 0.8 * alone
+    assert with_network < 0.9 * alone
     assert fit.error == min(row["validation"] for row in fit.history)
     np.testing.assert_array_equal(fit.twin.numbers, start.numbers)
 
