@@ -113,7 +113,7 @@ class ControlBench:
         Raises:
             ConfigError: plant and controller do not fit, or a model is missing.
         """
-        self.experiment.controller.build(self._interface, self.tasks[0].limits, self.models)
+        self.experiment.controller.build(self.plant, self.tasks[0].limits, self.models)
 
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""
