@@ -144,11 +144,11 @@ static float small_log1p(float x) {
 static float natural_log(float x) {
     const float value = (x < 1.17549435e-38f) ? 1.17549435e-38f : x;
     uint32_t bits;
-    memcpy(&bits, &value, sizeof bits);
+    (void)memcpy(&bits, &value, sizeof bits);
     int32_t n = (int32_t)(bits >> 23) - 127;
     bits = (bits & 0x7fffffu) | 0x3f800000u;
     float mantissa;
-    memcpy(&mantissa, &bits, sizeof mantissa);
+    (void)memcpy(&mantissa, &bits, sizeof mantissa);
     /* Between 0.71 and 1.41 the logarithm of a number near 1 keeps its digits; the series holds there, too. */
     if (mantissa > 1.41421354f) {
         mantissa *= 0.5f;
