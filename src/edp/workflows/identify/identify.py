@@ -289,7 +289,9 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     try:
         return replace(machine, bodies=realised(nine, tie.base)), numbers + body, []
     except ConfigError as error:
-        guessed_rows = [replace(row, value=row.base, low=row.base, high=row.base, excited=False, is_told=False) for row in body]
+        guessed_rows = [
+            replace(row, value=row.base, low=row.base, high=row.base, excited=False, is_told=False) for row in body
+        ]
         return machine, numbers + guessed_rows, [f"bodies are those of machine {tie.base.name}: {error}"]
 
 
