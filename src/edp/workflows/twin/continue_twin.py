@@ -35,7 +35,7 @@ UNLIKE = 30.0
 
 
 @dataclass(frozen=True, eq=False)
-class TwinStart:
+class BaseTwin:
     """A trained twin to begin with.
 
     Attributes:
@@ -49,7 +49,7 @@ class TwinStart:
     digest: str
 
     @staticmethod
-    def of(folder: str | Path) -> TwinStart:
+    def of(folder: str | Path) -> BaseTwin:
         """The twin of a run folder.
 
         Raises:
@@ -62,7 +62,7 @@ class TwinStart:
                 f"--from {folder}: the twin is of kind '{kind}', which has no training that could go on; begin with a "
                 "recurrent one, or fit this kind to the recordings anew, without --from"
             )
-        return TwinStart(Path(folder), bundle, twin_hash(folder))
+        return BaseTwin(Path(folder), bundle, twin_hash(folder))
 
     @property
     def twin(self) -> RecurrentTwin:
@@ -147,7 +147,7 @@ class ContinuedTwin:
     """
 
     fit: TwinFit
-    start: TwinStart
+    start: BaseTwin
     run: KeyedRun
 
     def best(self) -> tuple[FittedFormulation, list[TwinCandidate]]:

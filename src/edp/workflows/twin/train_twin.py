@@ -26,7 +26,7 @@ from edp.training.blas import one_blas_thread
 from edp.training.free_run import FittedTwin, FreeRunProgress
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
-from edp.workflows.twin.continue_twin import ContinuedTwin, TwinStart
+from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
 from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
@@ -79,7 +79,7 @@ def train_twin(
     """
     tell = on_step or (lambda text: None)
     tell("reading recordings")
-    base = None if start is None else TwinStart.of(start)
+    base = None if start is None else BaseTwin.of(start)
     if base is not None:
         experiment = base.settled(experiment)
     recordings = source.read()
@@ -119,7 +119,7 @@ def _helpers(workers: int) -> int:
     return min(workers or os.cpu_count() or 1, MOST_MEMBERS)
 
 
-def _chosen(fit: TwinFit, run: KeyedRun, base: TwinStart | None) -> FittedFormulation:
+def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
     """The twin that the settings ask for, or the one that goes on; a choice is kept in ``candidates.json``."""
     spec = fit.experiment.twin
     if base is not None:
