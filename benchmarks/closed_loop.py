@@ -67,6 +67,7 @@ QUICK = Size(
 def main() -> None:
     arguments_of = parser(__doc__ or "")
     arguments_of.add_argument("--part", choices=["all", *PARTS], default="all")
+    arguments_of.add_argument("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines, in part nmpc")
     arguments = arguments_of.parse_args()
     size = QUICK if arguments.quick else FULL
     verdicts: list[Verdict] = []
@@ -79,7 +80,8 @@ def main() -> None:
             verdicts.extend(line_verdicts(rows, arguments.quick))
         models = Models(folder, models_of.QUICK if arguments.quick else models_of.FULL, arguments.seed)
         if "nmpc" in parts:
-            details["nmpc"], answers = predictive(models, arguments.quick, arguments.seed)
+            of_loops = nmpc_of.QUICK if arguments.quick else replace(nmpc_of.FULL, draws=arguments.draws)
+            details["nmpc"], answers = predictive(models, of_loops, arguments.quick, arguments.seed)
             verdicts.extend(answers)
         for part, of in {"o4": tuning_of.tuning, "o4_other": tuning_of.tuning_other}.items():
             if part in parts:
@@ -93,12 +95,11 @@ def main() -> None:
     finish(name, verdicts, arguments.seed, details)
 
 
-def predictive(models: Models, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
+def predictive(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
     """Figures of part nmpc, and its verdicts."""
-    size = nmpc_of.QUICK if quick else nmpc_of.FULL
     ahead = models_of.ahead_errors(models, models.twin())
     rows = nmpc_of.loops(models, size, seed)
-    times = nmpc_of.solve_times(models, size.lines)
+    times = nmpc_of.solve_times(models, min(2, size.lines))
     verdicts = nmpc_of.loop_verdicts(rows, quick)
     verdicts.append(verdict("nmpc, processor time of a tick, p99", times["p99"], 2.0, "<= 1", "ms", quick))
     for ticks, goal in ((20, 2.0), (50, 4.0)):
