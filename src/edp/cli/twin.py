@@ -24,7 +24,7 @@ def twin(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     start: Annotated[
-        Path | None, typer.Option("--from", help="Run folder of a recurrent twin that goes on with these recordings.")
+        Path | None, typer.Option(help="Run folder of a recurrent twin that goes on with these recordings.")
     ] = None,
     workers: Annotated[int, typer.Option(min=0, help="Parallel trainings; 0: one for each core.")] = 0,
     minutes: Annotated[
@@ -39,7 +39,7 @@ def twin(
     one. Judged on held-out recordings beside a static valve map and ARX. Ends with exit code 4 where the training
     diverged.
 
-    With --from a recurrent twin goes on, such as with minutes of another machine's logs; free runs of the validation
+    With --start a recurrent twin goes on, such as with minutes of another machine's logs; free runs of the validation
     part say for how long, or that it is better as it is.
 
     Example: `edp twin data/m22 --out runs/twin`

@@ -354,7 +354,7 @@ def test_a_log_of_positions_alone_of_two_kinds_has_a_table_an_actuator(edp, tmp_
 
 def test_a_twin_goes_on_with_other_logs_and_shows_what_was_tried(edp, logs, trained, tmp_path):
     training = [word for change in SMALL if not change.startswith("twin.") for word in ("--set", change)]
-    ended = edp("twin", logs, "--from", trained, "--out", tmp_path / "run", *training, "--json")
+    ended = edp("twin", logs, "--start", trained, "--out", tmp_path / "run", *training, "--json")
     assert ended.code == 0
     assert ended.json["candidates"][0]["label"] == "the twin as it is"
     provenance = read_object(tmp_path / "run" / "twin" / "twin.json")["provenance"]

@@ -1,4 +1,4 @@
-"""A recurrent twin that goes on with the recordings of another machine: `edp twin LOGS --from RUN`."""
+"""A recurrent twin that goes on with the recordings of another machine: `edp twin LOGS --start RUN`."""
 
 from dataclasses import replace
 
@@ -187,5 +187,5 @@ def test_settings_of_another_twin_are_refused(base, other, tmp_path, changes, te
 def test_a_twin_without_training_is_refused(other, tmp_path):
     settings = ("twin.kind=static", "twin.prefix_ticks=20", "judge.seconds=4", "judge.at_s=[1, 4]", "judge.floors=[]")
     train_twin(other, load_twin_experiment(None, settings), tmp_path / "static")
-    with pytest.raises(ConfigError, match=r"kind .static..*without --from"):
+    with pytest.raises(ConfigError, match=r"kind .static..*without --start"):
         gone_on(other, tmp_path / "static", tmp_path / "run")

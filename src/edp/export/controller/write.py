@@ -241,7 +241,7 @@ class ControllerFiles:
         names = c_names((channel.name for channel in self.parts.inputs), C_SIGNIFICANT - len(f"{upper}_CONTROL_IN_"))
         return Code(
             "\n".join(
-                f"    {upper}_CONTROL_IN_{own} = {i}, /* {c_comment(f'{channel.unit}; {channel.description}')} */"
+                f"    {upper}_CONTROL_IN_{own} = {i}, /* {c_comment('; '.join((channel.unit, channel.description)))} */"
                 for i, (own, channel) in enumerate(zip(names, self.parts.inputs, strict=True))
             )
         )

@@ -59,8 +59,8 @@ class BaseTwin:
         if not isinstance(bundle.twin, RecurrentTwin):
             kind = TWINS.name_of(bundle.spec)
             raise ConfigError(
-                f"--from {folder}: the twin is of kind '{kind}', which has no training that could go on; begin with a "
-                "recurrent one, or fit this kind to the recordings anew, without --from"
+                f"--start {folder}: the twin is of kind '{kind}', which has no training that could go on; begin with a "
+                "recurrent one, or fit this kind to the recordings anew, without --start"
             )
         return BaseTwin(Path(folder), bundle, twin_hash(folder))
 
@@ -81,11 +81,11 @@ class BaseTwin:
         names = TwinChannelSettings(**{part: tuple(c.name for c in getattr(channels, part)) for part in parts})
         if experiment.twin not in (AutoTwin(), self.bundle.spec):
             raise ConfigError(
-                f"[twin] with --from {self.folder}: the formulation is that of the twin there; leave out its settings"
+                f"[twin] with --start {self.folder}: the formulation is that of the twin there; leave out its settings"
             )
         if experiment.channels not in (TwinChannelSettings(), names):
             raise ConfigError(
-                f"[channels] with --from {self.folder}: the channels are those of the twin there; leave them out, or "
+                f"[channels] with --start {self.folder}: the channels are those of the twin there; leave them out, or "
                 "rename those of the recordings by a signal map"
             )
         return replace(experiment, twin=self.bundle.spec, channels=names)
@@ -99,13 +99,13 @@ class BaseTwin:
         before = self.twin.channels
         if channels.rate_hz != before.rate_hz:
             raise DataError(
-                f"the recordings have {channels.rate_hz:g} Hz, the twin of --from {self.folder} {before.rate_hz:g} Hz; "
+                f"the recordings have {channels.rate_hz:g} Hz, that of --start {self.folder} {before.rate_hz:g} Hz; "
                 "its memory counts ticks: record at that rate, or train a twin anew"
             )
         for ours, theirs in zip((*channels.commands, *channels.answers), (*before.commands, *before.answers)):
             if ours.kind is not theirs.kind:
                 raise DataError(
-                    f"'{ours.name}' is of kind {ours.kind} in the recordings, {theirs.kind} in the twin of --from "
+                    f"'{ours.name}' is of kind {ours.kind} in the recordings, {theirs.kind} in the twin of --start "
                     f"{self.folder}; correct the signal map"
                 )
         self._check_sizes(channels, train)
@@ -125,8 +125,8 @@ class BaseTwin:
             if not 1.0 / UNLIKE < ratio < UNLIKE:
                 name = getattr(channels, part)[int(np.argmax(now))].name
                 raise DataError(
-                    f"{part} of the recordings (largest: '{name}') are {ratio:.3g} times those that the twin of --from "
-                    f"{self.folder} knows; {1.0 / UNLIKE:.2g} to {UNLIKE:g} must hold: check units and scales in the "
+                    f"{part} of the recordings (largest: '{name}') are {ratio:.3g} times those that the twin of "
+                    f"--start {self.folder} knows; {1.0 / UNLIKE:.2g} to {UNLIKE:g} must hold: check units and scales in the "
                     "signal map"
                 )
 
