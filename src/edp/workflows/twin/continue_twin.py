@@ -126,8 +126,8 @@ class BaseTwin:
                 name = getattr(channels, part)[int(np.argmax(now))].name
                 raise DataError(
                     f"{part} of the recordings (largest: '{name}') are {ratio:.3g} times those that the twin of "
-                    f"--start {self.folder} knows; {1.0 / UNLIKE:.2g} to {UNLIKE:g} must hold: check units and scales in the "
-                    "signal map"
+                    f"--start {self.folder} knows; {1.0 / UNLIKE:.2g} to {UNLIKE:g} must hold: check units and "
+                    "scales in the signal map"
                 )
 
     def provenance(self) -> dict[str, Any]:
