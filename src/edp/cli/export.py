@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out
 from edp.cli.train import MapOption, RepairOption, source_of
-from edp.errors import ConfigError
+from edp.errors import ConfigError, closest
 
 CONTROLLER, CONTROLLER_NAME = "controller", "machine"
 """The form of a run of edp control, and the name of what it holds unless one is given."""
@@ -54,7 +54,11 @@ def export(
     Example: `edp export runs/first --to c --out firmware/predictor`
     """
     from edp.workflows.deployment import export_bundle, unheld_adaptation
+    from edp.workflows.deployment import forms as registered_forms
 
+    known = (CONTROLLER, *registered_forms())
+    if to not in known:
+        raise ConfigError(f"unknown export target '{to}'{closest(to, known)}; known: {', '.join(sorted(known))}")
     name = name or (CONTROLLER_NAME if to == CONTROLLER else "predictor")
     options = dict(map(_option, changes or []))
     if to == CONTROLLER:
