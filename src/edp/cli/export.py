@@ -56,9 +56,9 @@ def export(
     from edp.workflows.deployment import export_bundle, unheld_adaptation
     from edp.workflows.deployment import forms as registered_forms
 
-    known = (CONTROLLER, *registered_forms())
-    if to not in known:
-        raise ConfigError(f"unknown export target '{to}'{closest(to, known)}; known: {', '.join(sorted(known))}")
+    names = (CONTROLLER, *registered_forms())
+    if to not in names:
+        raise ConfigError(f"unknown export target '{to}'{closest(to, names)}; known: {', '.join(sorted(names))}")
     name = name or (CONTROLLER_NAME if to == CONTROLLER else "predictor")
     options = dict(map(_option, changes or []))
     if to == CONTROLLER:
