@@ -27,8 +27,8 @@ def house(benchmark):
 def test_rooms_are_few_and_imports_go_down(house):
     # 22 before the room of monitoring, which stands beside that of closed loops: neither knows the other.
     assert len(house.siblings) <= 23, house.siblings
-    # 130 before the rooms of closed loops, which imports eight and is imported by three, and of monitoring, which imports
-    # three.
+    # 130 before the rooms of closed loops, which imports eight and is imported by three, and of monitoring, which
+    # imports three.
     assert house.arrows <= 141
     assert house.circles == []
 
