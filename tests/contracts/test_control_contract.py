@@ -43,8 +43,19 @@ def built(name, env, models, limits=LIMITS):
     return CONTROLLERS[name]().build(interface_of(env), limits, models)
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
-@pytest.mark.parametrize("task", TASKS)
+def needs_a_model(name):
+    return any("twin" in need for need in CONTROLLERS[name].needs)
+
+
+# Of all tasks but the first the quick check runs the controllers that cost milliseconds a tick in `make test` alone.
+@pytest.mark.parametrize(
+    ("task", "name"),
+    [
+        pytest.param(task, name, marks=[pytest.mark.training] * (number > 0 and needs_a_model(name)))
+        for number, task in enumerate(TASKS)
+        for name in CONTROLLERS
+    ],
+)
 def test_limits_hold_and_the_loop_repeats_itself(name, task, env, models):
     drawn = draw_task(TASKS[task](limits=LIMITS, **SHORT[task]), interface_of(env).geometry, 100.0, 1)
     controller = built(name, env, models)
