@@ -129,7 +129,8 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     spec = replace(SPEC, updates=(200,))
     fit = fit_residual(start, spec, runs[:2], runs[2:3], FreeRunSpec(validation_s=2.0))
     assert fit.helps
-    assert fit.error < fit.grey_error
+    # What is fitted; how much of it is velocities differs with the rounding of the machine.
+    assert fit.error < 0.8 * fit.grey_error
     judge = FreeRunJudgeSpec(at_s=(2.0,))
     with_network, alone = (
         free_run_scores(free_runs(one, runs[2:3], 2.0, 32), judge)["velocity_mae"]["mean"]

@@ -15,7 +15,7 @@ from edp.control.learning.spec import LearningSpec, learning_spec
 from edp.errors import ConfigError
 from edp.settings.bounds import shown
 from edp.sim.environment.library import gymnasium
-from edp.sim.environment.start import checked_seed
+from edp.sim.environment.start import checked_mask, checked_seed
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -93,7 +93,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
             ConfigError: an option or the number of seeds is not possible.
         """
         options = dict(options or {})
-        mask = self._mask(options.pop("reset_mask", None))
+        mask = checked_mask(self.num_envs, options.pop("reset_mask", None))
         check_options(options)
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
@@ -151,14 +151,3 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv[Rows, Rows, NDArray[Any]]
         infos = self._begin(ended, [None] * self.num_envs, infos)
         infos |= {"final_obs": last, "_final_obs": ended, "final_info": closing, "_final_info": ended.copy()}
         return infos
-
-    def _mask(self, mask: Any) -> Bools:
-        if mask is None:
-            return np.ones(self.num_envs, dtype=np.bool_)
-        array = np.asarray(mask)
-        if array.shape != (self.num_envs,) or array.dtype != np.bool_ or not array.any():
-            raise ConfigError(
-                f"reset: reset_mask of shape {array.shape} and type {array.dtype}; give {self.num_envs} booleans, "
-                "of which one at least is True"
-            )
-        return array

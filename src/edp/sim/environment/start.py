@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import shown
@@ -63,6 +64,23 @@ def episode_start(
         facts["faults"] = "; ".join(map(fault_text, spec.faults))
     mass_t = known_mass(machine.name)
     return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
+
+
+def checked_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
+    """Which lanes begin anew, shape ``(lanes,)``; all of them where no mask is given.
+
+    Raises:
+        ConfigError: another shape or type, or no lane at all.
+    """
+    if mask is None:
+        return np.ones(lanes, dtype=np.bool_)
+    array = np.asarray(mask)
+    if array.shape != (lanes,) or array.dtype != np.bool_ or not array.any():
+        raise ConfigError(
+            f"reset: reset_mask of shape {array.shape} and type {array.dtype}; give {lanes} booleans, of which one at "
+            "least is True"
+        )
+    return array
 
 
 def checked_seed(seed: Any) -> int | None:

@@ -16,7 +16,7 @@ from edp.sim.environment.model import NominalMachine
 from edp.sim.environment.rehearsal import rehearse_episodes
 from edp.sim.environment.single import spaces
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
-from edp.sim.environment.start import MOST_SEED, checked_seed, episode_start
+from edp.sim.environment.start import MOST_SEED, checked_mask, checked_seed, episode_start
 from edp.sim.environment.truth import Truth
 from edp.sim.episodes.episodes import Episodes, Moment
 from edp.sim.machine import layout as at
@@ -102,7 +102,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
             ConfigError: an option or the number of seeds is not possible.
         """
         options = dict(options or {})
-        mask = self._mask(options.pop("reset_mask", None))
+        mask = checked_mask(self.num_envs, options.pop("reset_mask", None))
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + i for i in range(self.num_envs)]
@@ -189,17 +189,6 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         infos["final_obs"], infos["_final_obs"] = last_observations, truncated.copy()
         infos["final_info"], infos["_final_info"] = {"truth": last_truth}, truncated.copy()
         return infos
-
-    def _mask(self, mask: Any) -> Bools:
-        if mask is None:
-            return np.ones(self.num_envs, dtype=np.bool_)
-        array = np.asarray(mask)
-        if array.shape != (self.num_envs,) or array.dtype != np.bool_ or not array.any():
-            raise ConfigError(
-                f"reset: reset_mask of shape {array.shape} and type {array.dtype}; give {self.num_envs} booleans, "
-                "of which one at least is True"
-            )
-        return array
 
     def _enter(self, index: int) -> None:
         """Take note of an episode's machine and soil."""
