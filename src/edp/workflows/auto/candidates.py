@@ -9,6 +9,7 @@ from edp.registry import Registry
 from edp.settings.tree import Table
 from edp.training.bagging.radial import JUDGED_ROWS, LENGTHS
 from edp.training.bagging.spec import BaggingSpec
+from edp.workflows.auto.foundation import Foundation
 
 LEAST_SPAN = 32
 """Ticks that changes reach back at least, as far as the data allow: at 100 Hz a third of a second."""
@@ -90,6 +91,7 @@ class Amount:
         minutes: processor time.
         seed: of all random choices.
         threads: CPU threads.
+        foundation: a pretrained network to begin with; None for none.
     """
 
     rows: int
@@ -100,6 +102,7 @@ class Amount:
     minutes: float
     seed: int = 0
     threads: int = 1
+    foundation: Foundation | None = None
 
     @property
     def span(self) -> int:
@@ -119,7 +122,7 @@ class Amount:
     @property
     def window(self) -> int:
         """W of every candidate, so that all of them are cut from the recordings in the same way."""
-        return min(WINDOW, self.span + 1)
+        return min(WINDOW, self.span + 1) if self.foundation is None else self.foundation.window
 
 
 @dataclass(frozen=True)
@@ -279,7 +282,8 @@ def _recurrent(amount: Amount) -> Table | None:
         return None
     epochs = 12
     tick = PASSES * RECURRENT_TICK * RECURRENT_LANES * RECURRENT_CHUNK
-    affordable = amount.seconds("recurrent") * OPERATIONS_PER_S / (tick * epochs)
+    trained = 1 if amount.foundation is None else 2
+    affordable = amount.seconds("recurrent") / trained * OPERATIONS_PER_S / (tick * epochs)
     useful = ROW_PASSES * amount.rows // (RECURRENT_LANES * RECURRENT_CHUNK * epochs)
     return {
         "model": {
@@ -310,3 +314,17 @@ def _recurrent(amount: Amount) -> Table | None:
 
 
 CANDIDATES.register("recurrent")(Candidate("the recurrent network", _recurrent))
+
+
+def _foundation(amount: Amount) -> Table | None:
+    """A pretrained network, all of it trained on."""
+    start = amount.foundation
+    if start is None:
+        return None
+    trained = 1 if _recurrent(amount) is None else 2
+    seconds = amount.seconds("recurrent") / trained
+    affordable = seconds * OPERATIONS_PER_S / (PASSES * start.weights * start.ticks)
+    return start.tables(amount.rows, affordable, amount.seed, amount.threads)
+
+
+CANDIDATES.register("foundation")(Candidate("the pretrained network", _foundation))

@@ -102,14 +102,17 @@ def promise_of(predicted: Sequence[DoubleArray], truth: Sequence[DoubleArray], b
 def standard_truth(predictor: Predictor, data: Prepared) -> list[DoubleArray]:
     """Change or value to be predicted at each tick of the training stretches, then of the validation stretches.
 
-    Standardised, ``(tick, output)`` each.
+    Standardised by the predictor's scaling, ``(tick, output)`` each.
     """
     return [standard_targets(predictor, part)[0].flatten(1).numpy() for part in (*data.train, *data.validation)]
 
 
 def promise_of_validation(predictor: Predictor, data: Prepared, blocks: Sequence[Block], judged: int) -> Promise:
-    """Errors of a network that trained on the training part alone: on the last `judged` of the blocks."""
-    scale = predictor.code.width.double().numpy()
+    """Errors of a network that trained on the training part alone: on the last `judged` of the blocks.
+
+    Standardised by the data, as every candidate's: a pretrained network has a scaling of its own.
+    """
+    scale = np.asarray(data.scaler().target_scale, dtype=np.float64)
     squared = [np.zeros((0, scale.size))] * len(data.train)
     for values, part in zip(stream_predictions(predictor, data.validation), data.validation, strict=True):
         ticks = part.samples - data.task.max_horizon
@@ -147,10 +150,11 @@ def choose(promises: Mapping[str, Promise]) -> PortfolioChoice:
     return PortfolioChoice(name, best, excess, doubt)
 
 
-def in_report_units(error: DoubleArray, predictor: Predictor, data: Prepared) -> dict[str, dict[str, float]]:
-    """Root-mean-square errors by horizon and target, in report units."""
+def in_report_units(error: DoubleArray, data: Prepared) -> dict[str, dict[str, float]]:
+    """Root-mean-square errors, standardised by the data, by horizon and target in report units."""
     factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
-    values = (error.reshape(len(data.task.horizons), -1) * predictor.code.width.double().numpy()) * factors
+    scale = np.asarray(data.scaler().target_scale, dtype=np.float64)
+    values = error.reshape(len(data.task.horizons), -1) * scale * factors
     return {
         str(horizon): dict(zip(data.task.targets, map(float, row), strict=True))
         for horizon, row in zip(data.task.horizons, values, strict=True)

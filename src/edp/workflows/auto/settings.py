@@ -34,17 +34,25 @@ class Portfolio:
         minutes: processor time to spend on training; sizes of networks and lengths of trainings follow from it, so
             that equal settings and data give equal results on every machine.
         candidates: names of registered candidates, the simplest first; none takes all of them.
+        foundation: run folder or bundle of a pretrained network, which is trained on as one more candidate; empty for
+            none.
         seed: of all random choices.
         threads: CPU threads of a training; another count gives other bits.
     """
 
     minutes: float = 5.0
     candidates: tuple[str, ...] = ()
+    foundation: str = ""
     seed: int = 0
     threads: int = 1
 
     def __post_init__(self) -> None:
         check_bounds("auto", self, minutes=above(0.0, MOST_MINUTES), seed=SEED, threads=integer(0, MOST_THREADS))
+        if self.candidates and ("foundation" in self.candidates) != bool(self.foundation):
+            raise ConfigError(
+                f"auto.candidates = {list(self.candidates)} and auto.foundation = '{self.foundation}': the candidate "
+                "'foundation' and the run that it begins with go together; give both or neither"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

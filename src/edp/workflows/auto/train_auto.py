@@ -16,7 +16,7 @@ from edp.data.scaling import least_spread
 from edp.data.splits import ByRecording, ByTime
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.source import DataSource
-from edp.networks.predictor import Predictor
+from edp.networks.predictor import build_model
 from edp.recording import FloatArray, Recording
 from edp.report.run.choice import FILE, read_choice
 from edp.signals import Kind
@@ -27,6 +27,7 @@ from edp.training.bagging.fit import fit_bagged
 from edp.training.blas import one_blas_thread
 from edp.training.fit import fit
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
+from edp.workflows.auto.foundation import Foundation, read_foundation
 from edp.workflows.auto.promise import (
     Block,
     PortfolioChoice,
@@ -94,9 +95,14 @@ def train_auto(
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
     """
     once = _ReadOnce(source)
+    foundation = read_foundation(settings.auto.foundation)
+    if foundation is not None:
+        foundation.check_recordings(once.read())
     settings = _of_one_recording(once, _of_these_channels(once, settings))
-    data, amount = _prepare(once, settings)
-    key = run_key({"auto": plain_tree(settings)}, data.digest)
+    data, amount = _prepare(once, settings, foundation)
+    if foundation is not None:
+        foundation.check_task(data)
+    key = _key(settings, data, foundation)
     folder = make_folder(out)
     finished = _finished(folder, key)
     if finished is not None:
@@ -110,7 +116,7 @@ def train_auto(
         if on_candidate is not None:
             on_candidate(CANDIDATES[name].label, number, len(experiments))
         try:
-            trained[name] = _train(name, experiment, data, folder, on_event, (blocks, judged))
+            trained[name] = _train(name, experiment, data, folder, on_event, (blocks, judged), foundation)
         except Diverged as end:
             failed[name] = str(end)
     if not trained:
@@ -122,6 +128,12 @@ def train_auto(
     write_json(folder / FILE, facts)
     bundle = keep_fitted(folder, source, winner.experiment, data, winner.fitted, {"auto": facts["sentence"]})
     return AutoResult(bundle, facts)
+
+
+def _key(settings: AutoSettings, data: Prepared, foundation: Foundation | None) -> str:
+    """Of the run: everything that decides its result."""
+    begun = {} if foundation is None else {"foundation": foundation.facts}
+    return run_key({"auto": plain_tree(settings), **begun}, data.digest)
 
 
 def _finished(folder: Path, key: str) -> AutoResult | None:
@@ -190,7 +202,7 @@ def _of_one_recording(source: _ReadOnce, settings: AutoSettings) -> AutoSettings
     return replace(settings, split=ByTime(validation_share=split.validation_share, test_share=split.test_share))
 
 
-def _prepare(source: _ReadOnce, settings: AutoSettings) -> tuple[Prepared, Amount]:
+def _prepare(source: _ReadOnce, settings: AutoSettings, foundation: Foundation | None) -> tuple[Prepared, Amount]:
     """The data cut for the candidates' common window, and what there is of it."""
 
     def cut(window: int) -> tuple[Prepared, Amount]:
@@ -218,6 +230,7 @@ def _prepare(source: _ReadOnce, settings: AutoSettings) -> tuple[Prepared, Amoun
             minutes=auto.minutes,
             seed=auto.seed,
             threads=auto.threads,
+            foundation=foundation,
         )
 
     try:
@@ -284,8 +297,10 @@ def _train(
     folder: Path,
     on_event: Callable[[TrainingProgress], None] | None,
     pieces: tuple[Sequence[Block], int],
+    foundation: Foundation | None,
 ) -> _Trained:
     blocks, judged = pieces
+    strategy = foundation.strategy() if foundation is not None and name == "foundation" else None
     if experiment.training.bagging is not None:
         bagged = fit_bagged(data, experiment.model, experiment.training, on_event)
         net = bagged.fitted.predictor
@@ -293,9 +308,10 @@ def _train(
         return _Trained(experiment, bagged.fitted, promise_of(bagged.at_every_tick(truth), truth, blocks))
     with RunFolder(folder / "candidates" / name) as run:  # a stop is gone on from
         settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
-        key = run_key(settings, data.digest)
+        begun = {} if foundation is None or strategy is None else {"foundation": foundation.facts}
+        key = run_key(settings | begun, data.digest)
         run.claim(key, experiment_toml(experiment))
-        fitted = fit(data, experiment.model, experiment.training, KeyedRun(run, key), on_event)
+        fitted = fit(data, experiment.model, experiment.training, KeyedRun(run, key), on_event, strategy)
     return _Trained(experiment, fitted, promise_of_validation(fitted.predictor, data, blocks, judged))
 
 
@@ -314,12 +330,12 @@ def _facts(
             "label": CANDIDATES[name].label,
             "seconds": round(one.fitted.seconds, 2),
             "parameters": sum(parameter.numel() for parameter in one.fitted.predictor.parameters()),
-            "promise": in_report_units(one.promise.error(), one.fitted.predictor, data),
+            "promise": in_report_units(one.promise.error(), data),
         }
         for name, one in trained.items()
     }
-    net, promise = trained[choice.name].fitted.predictor, trained[choice.name].promise
-    unchanged = in_report_units(_persistence(net, data, amount).last(len(promise.rows)).error(), net, data)
+    rows = trained[choice.name].promise.rows
+    unchanged = in_report_units(_persistence(settings, data, amount).last(len(rows)).error(), data)
     return {
         "schema": 1,
         "key": key,
@@ -333,8 +349,11 @@ def _facts(
     }
 
 
-def _persistence(net: Predictor, data: Prepared, amount: Amount) -> Promise:
+def _persistence(settings: AutoSettings, data: Prepared, amount: Amount) -> Promise:
     """Errors of the present value, or of the mean in absolute mode."""
+    # Any network with the scaling of the data: the kept one may have that of other machines.
+    model = settings.experiment(CANDIDATES["linear"].tables(amount) or {}).model
+    net = build_model(data.task, model, data.scaler(), 0)
     truth = standard_truth(net, data)  # zero is no change, or in absolute mode the mean
     blocks, _ = blocks_of(data, amount.window)
     return promise_of([np.zeros_like(one) for one in truth], truth, blocks)

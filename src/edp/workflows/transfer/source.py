@@ -68,8 +68,12 @@ class SourceModel:
         return {"weights": weights_digest(self.predictor), "recordings": digest}
 
 
-def read_source(path: str | Path) -> SourceModel:
+def read_source(path: str | Path, recordings: bool = True) -> SourceModel:
     """The source of a run folder, of the run that a bundle lies in, or of a bundle alone.
+
+    Args:
+        path: of the folder.
+        recordings: read what it was trained on, too.
 
     Raises:
         BundleError: not a bundle, or one of an integer network (W8A16).
@@ -89,6 +93,8 @@ def read_source(path: str | Path) -> SourceModel:
             bundle, load_experiment(), None, f"'{path}' is a bundle without the run that it was trained in"
         )
     experiment = load_experiment(folder / "config.toml", None)
+    if not recordings:
+        return SourceModel(bundle, experiment, None, "its recordings were not asked for")
     try:
         return SourceModel(bundle, experiment, trained_run(folder)[3])
     # Missing or changed recordings do not prevent a transfer; methods that need them are left out.
