@@ -26,7 +26,7 @@ from edp.networks.backbones import BACKBONES, CommitteeSpec, GruSpec, HybridSpec
 from edp.networks.blocks import BLOCKS
 from edp.networks.blocks.base import OUTPUT_SLOTS, SHARED_SLOTS
 from edp.networks.cells import CELLS
-from edp.networks.heads import HEADS, GluHead, MlpHead
+from edp.networks.heads import HEADS, GluHead, LinearHead, MlpHead
 from edp.networks.initial import INITIAL_STATES
 from edp.networks.integer import IntegerPredictor
 from edp.networks.outputs import OUTPUTS, Point
@@ -62,6 +62,7 @@ SMALL = {
     "squeeze_excitation": [BLOCKS["squeeze_excitation"](reduction=2)],
     "mlp": [MlpHead(hidden=6), MlpHead(hidden=5, layers=2)],
     "glu": [GluHead(hidden=4), GluHead(hidden=4, layers=2)],
+    "linear": [LinearHead(dead_band=True)],
     "linear_bypass": [BLOCKS["linear_bypass"](taps=4), BLOCKS["linear_bypass"](taps=1, trained=False)],
 }
 FORMS = [

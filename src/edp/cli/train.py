@@ -44,6 +44,9 @@ def train(
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example training.epochs=10.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    workers: Annotated[
+        int, typer.Option(min=0, help="Of the preset auto: parallel trainings; 0: one for each core.")
+    ] = 0,
     as_json: JsonFlag = False,
 ) -> None:
     """Train a causal network on recordings and write a bundle.
@@ -59,7 +62,8 @@ def train(
     source = source_of(data, signal_map, repair)
     preset = preset or usual_preset(config, changes)
     if preset == AUTO:
-        _train_auto(source, folder, config, changes, minutes, as_json)
+        own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
+        _train_auto(source, folder, config, [*changes, *own], workers, as_json)
         return
     if minutes is not None:
         raise ConfigError(f"--minutes came with the preset '{preset}'; only the preset auto has a budget: leave it out")
@@ -81,16 +85,15 @@ def train(
 
 
 def _train_auto(
-    source: DataSource, folder: Path, config: Path | None, changes: Sequence[str], minutes: float | None, quiet: bool
+    source: DataSource, folder: Path, config: Path | None, changes: Sequence[str], workers: int, quiet: bool
 ) -> None:
     """Train the portfolio with a progress display, and say what was chosen."""
     from edp.workflows.auto import load_auto, train_auto
 
-    own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
-    settings = load_auto(config, [*changes, *own])
+    settings = load_auto(config, changes)
     with progress(quiet) as shown:
         display = TrainingDisplay(shown, Steps(quiet))
-        result = train_auto(source, settings, folder, display.on_event, display.on_candidate)
+        result = train_auto(source, settings, folder, display.on_event, display.on_candidate, workers)
     facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.facts}
 
     def show() -> None:

@@ -12,7 +12,7 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from edp.ir import Builder
-from edp.ir.layers import Activate, Dense, Function, Glu, GroupedDense
+from edp.ir.layers import Activate, BinaryOperation, Clip, Dense, Function, Glu, GroupedDense, ScaleShift
 from edp.networks.streaming import Cost, Operation, State, Streaming
 from edp.registry import Registry
 from edp.settings.bounds import MOST_LAYERS, MOST_UNITS, check_bounds, integer
@@ -97,7 +97,13 @@ class LinearHead:
     """``y_c = w_c h + b_c`` for each output c: no hidden layer.
 
     A block that mixes the hidden features of outputs has nothing to mix, and is refused.
+
+    Attributes:
+        dead_band: small predictions become zero, of changes no change at all, within a width of each output that
+            training on folds chooses (`DeadBand`).
     """
+
+    dead_band: bool = False
 
     @property
     def hidden(self) -> int:
@@ -106,6 +112,8 @@ class LinearHead:
 
     def conflicts(self, model: Any, task: Any) -> str | None:
         """A block on the hidden features of outputs, of which there are none."""
+        if self.dead_band and model.output.values > 1:
+            return "a dead band is one of predictions, and this output says more; take model.output = 'point'"
         mixing = [type(block).__name__ for block in model.blocks if getattr(block, "slot", None) == "mix"]
         if mixing:
             return f"the head 'linear' has no hidden features for the block {mixing[0]}; take the head 'mlp' or 'glu'"
@@ -113,7 +121,37 @@ class LinearHead:
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
         """Heads of one linear layer."""
-        return Heads(width, outputs, values, [], 1, mix)
+        return Heads(width, outputs, values, [], 1, mix, DeadBand(values, outputs) if self.dead_band else None)
+
+
+class DeadBand(nn.Module):
+    """``y - 2 clip(y, -b, b) + clip(y, -2b, 2b)``: zero up to b, twice as steep as y up to 2b, then y itself.
+
+    Attributes:
+        width: b of each number, ``(value, output)``, not negative; at first 0, which changes no bit of y.
+    """
+
+    width: Tensor
+
+    def __init__(self, values: int, outputs: int) -> None:
+        super().__init__()
+        self.register_buffer("width", torch.zeros(values, outputs))
+
+    def forward(self, y: Tensor) -> Tensor:
+        """Of ``(..., value, output)``."""
+        b = self.width
+        return y - 2.0 * torch.clamp(y, -b, b) + torch.clamp(y, -2.0 * b, 2.0 * b)
+
+    def lower(self, build: Builder, y: str) -> str:
+        """Add it to a graph, behind numbers of which values vary slowest; nothing where no width is above 0."""
+        b = self.width.flatten()
+        if not bool(b.any()):
+            return y
+        inner = build.add(Clip, "band.inner", y, low=-b, high=b)
+        taken = build.add(ScaleShift, "band.taken", inner, gain=torch.full_like(b, -2.0), shift=torch.zeros_like(b))
+        outer = build.add(Clip, "band.outer", y, low=-2.0 * b, high=2.0 * b)
+        beyond = build.combine("band.beyond", BinaryOperation.ADD, y, taken)
+        return build.combine("band", BinaryOperation.ADD, beyond, outer)
 
 
 @dataclass(frozen=True)
@@ -153,6 +191,7 @@ class Heads(Streaming):
         units: Sequence[GatedUnit],
         hidden: int,
         mix: Streaming | None = None,
+        band: DeadBand | None = None,
     ) -> None:
         super().__init__()
         self.outputs, self.units = outputs, tuple(units)
@@ -169,7 +208,7 @@ class Heads(Streaming):
                 bound = 1.0 / math.sqrt(weight.shape[1])
                 weight.uniform_(-bound, bound)
                 bias.uniform_(-bound, bound)
-        self.mix = mix
+        self.mix, self.band = mix, band
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         return () if self.mix is None else self.mix.initial_state(batch, like)
@@ -182,7 +221,8 @@ class Heads(Streaming):
         else:
             y = self._layer(0, x)
         if not self.units:
-            return y.transpose(2, 3), state
+            y = y.transpose(2, 3)
+            return y if self.band is None else self.band(y), state
         y = self.units[0].apply(y)
         for layer, unit in enumerate(self.units[1:], start=1):
             y = unit.apply(self._layer(layer, y))
@@ -214,7 +254,8 @@ class Heads(Streaming):
             x = build.add(GroupedDense, last, x, weight=weights[-1], bias=self.biases[-1])
         values = self.widths[-1]
         # Values vary slowest in the results, so that the first block of numbers is the prediction of all outputs.
-        return build.pick("by_value", x, [c * values + v for v in range(values) for c in range(self.outputs)])
+        x = build.pick("by_value", x, [c * values + v for v in range(values) for c in range(self.outputs)])
+        return x if self.band is None else self.band.lower(build, x)
 
     def costs(self) -> list[Cost]:
         own = Cost(

@@ -22,6 +22,7 @@ from edp.data.prepared import Prepared
 from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.storage.runs import RunFolder
 from edp.training.bagging.boosting import TreeLearner
+from edp.training.bagging.dead_band import band, dead_bands
 from edp.training.bagging.learner import FoldFit, HeadPart, Learner
 from edp.training.bagging.perceptrons import PerceptronLearner, losses_of, record
 from edp.training.bagging.radial import RadialLearner
@@ -145,7 +146,7 @@ def _combine(work: FoldFit, learners: Sequence[Learner]) -> DoubleArray:
         first += len(own)
     _write_head(work, parts)
     weighted = (one * share for one, share in zip(every, shares, strict=True))
-    return np.asarray(work.linear.left_out + sum(weighted, np.zeros_like(residual)))
+    return _write_band(work, np.asarray(work.linear.left_out + sum(weighted, np.zeros_like(residual))))
 
 
 def _write_head(work: FoldFit, parts: Sequence[HeadPart]) -> None:
@@ -160,6 +161,16 @@ def _write_head(work: FoldFit, parts: Sequence[HeadPart]) -> None:
     with torch.no_grad():
         heads.weights[0].copy_(torch.from_numpy(full.reshape(shape).transpose(2, 0, 1).copy()))
         heads.biases[0].copy_(torch.from_numpy(bias.reshape(shape[1:]).T.copy()))
+
+
+def _write_band(work: FoldFit, left_out: DoubleArray) -> DoubleArray:
+    """The dead bands into the head, where it has them; predictions of rows that were left out behind them."""
+    dead_band = work.net.heads.band
+    if dead_band is None:
+        return left_out
+    widths = dead_bands(left_out, work.table.targets, work.table.folds.owner)
+    dead_band.width.copy_(torch.from_numpy(widths).view_as(dead_band.width))
+    return band(left_out, widths)
 
 
 def _record_linear(work: FoldFit) -> None:

@@ -92,6 +92,7 @@ class Amount:
         seed: of all random choices.
         threads: CPU threads.
         foundation: a pretrained network to begin with; None for none.
+        changes: whether changes are predicted, of which zero is none.
     """
 
     rows: int
@@ -103,6 +104,7 @@ class Amount:
     seed: int = 0
     threads: int = 1
     foundation: Foundation | None = None
+    changes: bool = True
 
     @property
     def span(self) -> int:
@@ -258,7 +260,7 @@ def _tables(amount: Amount, parts: Table, bagging: Table) -> Table:
         "model": {
             "window": amount.window,
             "backbone": {**backbone, **parts},
-            "head": {"kind": "linear"},
+            "head": {"kind": "linear", "dead_band": amount.changes},
             "activation": {"kind": "identity"},
         },
         "training": {

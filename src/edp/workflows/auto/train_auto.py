@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from edp.config.experiment import Experiment, experiment_toml, plain_tree
+from edp.config.experiment import Experiment, plain_tree
 from edp.data.features import FEATURE_SETS
 from edp.data.prepared import Prepared
 from edp.data.scaling import least_spread
 from edp.data.splits import ByRecording, ByTime
+from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
@@ -21,26 +22,23 @@ from edp.recording import FloatArray, Recording
 from edp.report.run.choice import FILE, read_choice
 from edp.signals import Kind
 from edp.storage import make_folder, read_object, write_json
-from edp.storage.runs import KeyedRun, RunFolder, run_key
-from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
-from edp.training.bagging.fit import fit_bagged
+from edp.storage.runs import run_key
+from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.blas import one_blas_thread
-from edp.training.fit import fit
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
 from edp.workflows.auto.foundation import Foundation, read_foundation
 from edp.workflows.auto.promise import (
-    Block,
     PortfolioChoice,
     Promise,
     blocks_of,
     choose,
     in_report_units,
     promise_of,
-    promise_of_validation,
     standard_truth,
     to_json,
 )
 from edp.workflows.auto.settings import AutoSettings
+from edp.workflows.auto.train_candidates import CandidateTraining, TrainedCandidate, train_all
 from edp.workflows.train_evaluate import keep_fitted, prepare_data
 
 USUAL = "FG2"
@@ -67,13 +65,6 @@ class AutoResult:
         return str(self.facts["sentence"])
 
 
-@dataclass(frozen=True, eq=False)
-class _Trained:
-    experiment: Experiment
-    fitted: Fitted
-    promise: Promise
-
-
 @one_blas_thread()
 def train_auto(
     source: DataSource,
@@ -81,6 +72,7 @@ def train_auto(
     out: str | Path,
     on_event: Callable[[TrainingProgress], None] | None = None,
     on_candidate: Callable[[str, int, int], None] | None = None,
+    workers: int = 1,
 ) -> AutoResult:
     """Train every candidate that suits the data, choose, and write the winner's run folder.
 
@@ -90,6 +82,8 @@ def train_auto(
         out: run folder; a finished one of the same settings and data is read, not made again.
         on_event: called with progress of the training at work.
         on_candidate: called with a candidate's label, how many are done and of how many.
+        workers: processes that train candidates side by side; 0 for one a core. The run has the same bits with any
+            number.
 
     Raises:
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
@@ -108,17 +102,10 @@ def train_auto(
     if finished is not None:
         return finished
     _check_moving(data)
-    experiments = _experiments(settings, amount)
-    blocks, judged = blocks_of(data, amount.window)
-    trained: dict[str, _Trained] = {}
-    failed: dict[str, str] = {}
-    for number, (name, experiment) in enumerate(experiments.items()):
-        if on_candidate is not None:
-            on_candidate(CANDIDATES[name].label, number, len(experiments))
-        try:
-            trained[name] = _train(name, experiment, data, folder, on_event, (blocks, judged), foundation)
-        except Diverged as end:
-            failed[name] = str(end)
+    jobs = _jobs(_experiments(settings, amount), data, amount, folder)
+    outcomes = {job.name: one for job, one in zip(jobs, train_all(jobs, workers, on_event, on_candidate), strict=True)}
+    trained = {name: one for name, one in outcomes.items() if isinstance(one, TrainedCandidate)}
+    failed = {name: one for name, one in outcomes.items() if isinstance(one, str)}
     if not trained:
         raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
     choice = choose({name: one.promise for name, one in trained.items()})
@@ -231,6 +218,7 @@ def _prepare(source: _ReadOnce, settings: AutoSettings, foundation: Foundation |
             seed=auto.seed,
             threads=auto.threads,
             foundation=foundation,
+            changes=data.task.mode is TargetMode.DELTA,
         )
 
     try:
@@ -290,34 +278,19 @@ def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment
     return experiments
 
 
-def _train(
-    name: str,
-    experiment: Experiment,
-    data: Prepared,
-    folder: Path,
-    on_event: Callable[[TrainingProgress], None] | None,
-    pieces: tuple[Sequence[Block], int],
-    foundation: Foundation | None,
-) -> _Trained:
-    blocks, judged = pieces
-    strategy = foundation.strategy() if foundation is not None and name == "foundation" else None
-    if experiment.training.bagging is not None:
-        bagged = fit_bagged(data, experiment.model, experiment.training, on_event)
-        net = bagged.fitted.predictor
-        truth = standard_truth(net, data)
-        return _Trained(experiment, bagged.fitted, promise_of(bagged.at_every_tick(truth), truth, blocks))
-    with RunFolder(folder / "candidates" / name) as run:  # a stop is gone on from
-        settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
-        begun = {} if foundation is None or strategy is None else {"foundation": foundation.facts}
-        key = run_key(settings | begun, data.digest)
-        run.claim(key, experiment_toml(experiment))
-        fitted = fit(data, experiment.model, experiment.training, KeyedRun(run, key), on_event, strategy)
-    return _Trained(experiment, fitted, promise_of_validation(fitted.predictor, data, blocks, judged))
+def _jobs(experiments: dict[str, Experiment], data: Prepared, amount: Amount, folder: Path) -> list[CandidateTraining]:
+    """The trainings of the candidates, judged on the same blocks."""
+    blocks, judged = blocks_of(data, amount.window)
+    begun = {"foundation": amount.foundation}
+    return [
+        CandidateTraining(name, experiment, data, folder / "candidates" / name, blocks, judged, begun.get(name))
+        for name, experiment in experiments.items()
+    ]
 
 
 def _facts(
     choice: PortfolioChoice,
-    trained: dict[str, _Trained],
+    trained: dict[str, TrainedCandidate],
     failed: dict[str, str],
     data: Prepared,
     settings: AutoSettings,
@@ -359,7 +332,7 @@ def _persistence(settings: AutoSettings, data: Prepared, amount: Amount) -> Prom
     return promise_of([np.zeros_like(one) for one in truth], truth, blocks)
 
 
-def sentence(choice: PortfolioChoice, trained: dict[str, _Trained], amount: Amount, data: Prepared) -> str:
+def sentence(choice: PortfolioChoice, trained: dict[str, TrainedCandidate], amount: Amount, data: Prepared) -> str:
     """What was chosen and why, for a person."""
     label = CANDIDATES[choice.name].label
     minutes = amount.rows / data.task.rate_hz / 60

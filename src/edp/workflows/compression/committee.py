@@ -33,4 +33,6 @@ def committee_start(teacher: Predictor, model: ModelSpec, data: Prepared, seed: 
         heads.weights[0].zero_()
         heads.weights[0][:, :columns] = taught.weights[0][:, :columns]
         heads.biases[0].copy_(taught.biases[0])
+        if heads.band is not None and taught.band is not None:
+            heads.band.width.copy_(taught.band.width)
     return net

@@ -73,7 +73,7 @@ def imitates(teachers: Sequence[Predictor], model: ModelSpec) -> bool:
 
 
 def predict_rows(net: Predictor, rows: Tensor) -> Tensor:
-    """What a committee with a linear head says of rows of its bank.
+    """What a committee with a linear head says of rows of its bank, before any dead band: a student has the same one.
 
     Args:
         net: its settings satisfy `imitates`.
@@ -267,7 +267,10 @@ def _write(net: Predictor, last: Tensor, linear_bias: Tensor) -> None:
 
 def _judge(net: Predictor, rows: Tensor, truth: Tensor, data: Prepared) -> dict[str, Any]:
     """The student's error on recorded rows, all of which it learns from."""
-    error = predict_rows(net, rows[: len(truth)]) - truth
+    said = predict_rows(net, rows[: len(truth)])
+    if net.heads.band is not None:
+        said = net.heads.band(said.unflatten(1, net.heads.band.width.shape)).flatten(1)
+    error = said - truth
     factors = np.tile([KINDS[kind].report_factor for kind in data.target_kinds], len(data.task.horizons))
     each = error.abs().mean(dim=0).numpy() * net.code.width.flatten().numpy() * factors
     return {
