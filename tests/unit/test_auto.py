@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
@@ -152,6 +153,29 @@ def test_a_network_with_a_validation_part_of_its_own_is_compared_on_that_part(tm
     # A network of a few updates hardly beats the mean change; the linear model does.
     assert facts["chosen"] == "linear"
     assert linear < recurrent < 3 * facts["persistence"]["4"]["y"]
+
+
+@pytest.mark.processes
+def test_candidates_side_by_side_give_the_same_bits(tmp_path, monkeypatch):
+    monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
+    source = write(tmp_path / "logs", ticks=1500)
+    settings = load_auto(None, [*SET, "auto.candidates=['linear', 'recurrent']"])
+    shown, runs = [], []
+    for workers in (1, 2):
+        folder = tmp_path / f"run{workers}"
+        train_auto(source, settings, folder, None, lambda *event: shown.append(event), workers)
+        runs.append(folder)
+        left = sorted(path.name for path in (folder / "candidates").iterdir())
+        assert left == ["recurrent"]  # whose checkpoint a stopped run goes on from
+        assert not (folder / "candidates" / "recurrent" / "progress.json").exists()
+    facts = [json.loads((folder / "auto.json").read_text()) for folder in runs]
+    for each in facts:
+        for candidate in each["candidates"].values():
+            del candidate["seconds"]
+    assert facts[0] == facts[1]
+    assert [event[1:] for event in shown[:2]] == [(0, 2), (1, 2)]
+    states = [load_bundle(folder).predictor.state_dict() for folder in runs]
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
 
 
 def test_page_and_file_show_every_model_on_left_out_data_and_on_the_test_part(result, tmp_path):
