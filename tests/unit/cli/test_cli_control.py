@@ -133,6 +133,17 @@ def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):
     assert (run / "results.json").read_bytes() == before
 
 
+@pytest.mark.parametrize("command", ["control", "tune"])
+def test_a_folder_with_other_files_is_left_as_it_is(edp, tmp_path, command):
+    kept = tmp_path / "thesis.txt"
+    kept.write_text("mine")
+    ended = edp(command, tmp_path, "--seeds", 1, *LINE)
+    assert ended.code == 1
+    assert "is not empty and holds no run ('thesis.txt'); nothing was changed" in " ".join(ended.err.split())
+    assert [file.name for file in tmp_path.iterdir()] == [kept.name]
+    assert "is a file" in " ".join(edp(command, kept, "--seeds", 1, *LINE).err.split())
+
+
 @pytest.mark.parametrize(
     "words",
     [
