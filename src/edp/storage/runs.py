@@ -146,8 +146,8 @@ def check_free(path: str | Path, what: str) -> None:
     others = sorted(entry.name for entry in folder.iterdir() if entry.name not in LEFT)
     if others:
         raise StorageError(
-            f"folder '{folder}' is not empty and holds no run ('{others[0][:60]}'); nothing was changed. Choose a new or "
-            f"empty folder for {what}"
+            f"folder '{folder}' is not empty and holds no run ('{others[0][:60]}'); nothing was changed. Choose a new "
+            f"or empty folder for {what}"
         )
 
 
