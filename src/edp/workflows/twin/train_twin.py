@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import MOST_MEMBERS
+from edp.recording import Recording
 from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
 from edp.storage import write_bytes, write_json
@@ -32,6 +33,8 @@ from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
 FOLDER = "twin"
+STROKES = "full_strokes_m"
+"""Of the metadata of simulated recordings, and of the provenance of a twin that learned from them."""
 DATASHEET = "datasheet"
 """Numbers of a grey box with units and intervals, as JSON and as text."""
 
@@ -103,7 +106,7 @@ def train_twin(
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         tell("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
-        provenance = _provenance(source, experiment, data, fitted) | result.facts
+        provenance = _provenance(source, experiment, data, fitted) | _machine(recordings) | result.facts
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
         write_scores(run.path, scores, runs, intervals)
@@ -145,6 +148,12 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
         "seconds": round(fitted.seconds, 2),
         "data": {"source": str(source.path), "reader": source.to_plain(), "digest": data.digest, "names": parts},
     }
+
+
+def _machine(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
+    said = {tuple(recording.meta[STROKES]) for recording in recordings if STROKES in recording.meta}
+    return {STROKES: list(said.pop())} if len(said) == 1 else {}
 
 
 __all__ = ["FOLDER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]
