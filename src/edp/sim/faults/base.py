@@ -87,6 +87,7 @@ class FaultKind(ABC):
         text: what is wrong, for tables and messages.
         part: what a mechanic would look at; ``{site}``, ``{axis}``, ``{side}`` and ``{pair}`` are words of a site.
         words: how a fault is reported, with these, ``{size}`` and, for either sign, ``{high}`` or ``{large}``.
+        grave: whether a load may fall or a movement may not stop.
         sites: where it can sit; empty where a machine has one such part only.
         units: units of the size with their factors to SI; empty where it is there or not.
         ladder: sizes from hardly visible to gross, in the first unit.
@@ -97,6 +98,7 @@ class FaultKind(ABC):
     text: ClassVar[str]
     part: ClassVar[str]
     words: ClassVar[str]
+    grave: ClassVar[bool] = False
     sites: ClassVar[tuple[str, ...]] = AXES
     units: ClassVar[Units]
     ladder: ClassVar[tuple[float, ...]] = ()

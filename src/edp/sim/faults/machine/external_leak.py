@@ -16,6 +16,7 @@ class ExternalLeak(MachineFault):
     text = "oil leaves a chamber or its hose"
     part = "{axis} cylinder"
     words = "the {site} of the cylinder or its hose leaks outward: {size} at 200 bar"
+    grave = True
     sites = CHAMBERS
     units = FLOW
     ladder = (0.3, 1.0, 3.0, 10.0)

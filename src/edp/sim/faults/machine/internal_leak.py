@@ -16,6 +16,7 @@ class InternalLeak(MachineFault):
     text = "oil passes the seals of the piston"
     part = "{axis} cylinder"
     words = "the {axis} cylinder leaks inside: {size} at 200 bar"
+    grave = True
     units = FLOW
     ladder = (0.3, 1.0, 3.0, 10.0)
     bound = span(0.0, 100.0)

@@ -15,6 +15,7 @@ class StuckSpool(MachineFault):
     text = "a spool sticks before it is open; the size is the share of the opening that is lost"
     part = "{axis} valve"
     words = "the {site} spool sticks: {size} of its opening are lost"
+    grave = True
     sites = SPOOLS
     units = SHARE
     ladder = (10.0, 25.0, 50.0, 80.0)
