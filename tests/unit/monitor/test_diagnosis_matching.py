@@ -8,7 +8,7 @@ import pytest
 
 from edp.errors import DataError, StorageError
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, FaultClass
-from edp.monitor.diagnosis.evidence import Scatter, mean_features
+from edp.monitor.diagnosis.evidence import ONSET, Scatter, mean_features, parts_of
 from edp.monitor.diagnosis.learning import SimulatedFault, fit_dictionary
 from edp.monitor.diagnosis.matching import causes_of, match
 from edp.monitor.diagnosis.signatures import load_dictionary, save_dictionary
@@ -45,10 +45,12 @@ def sessions():
         for owner, fault in enumerate(CLASSES):
             for size in fault.sizes or (0.0,):
                 seed = int(chance.integers(1_000_000))
-                with_fault = mean_features(effect(owner, size, 80, np.random.default_rng(seed)))
+                rows = effect(owner, size, 80, np.random.default_rng(seed))
                 twin = np.random.default_rng(seed)
-                sound = mean_features(twin.normal(size=(80, 6)) + 0.2 * twin.normal(size=6))
-                faults.append(SimulatedFault(draw, owner, size, with_fault - sound, {"Pump": np.array([float(owner)])}))
+                sound = twin.normal(size=(80, 6)) + 0.2 * twin.normal(size=6)
+                pairs = zip(parts_of(rows), parts_of(sound), strict=True)
+                change = np.stack([mean_features(one) - mean_features(other) for one, other in pairs])
+                faults.append(SimulatedFault(draw, owner, size, change, {"Pump": np.array([float(owner)])}))
     return faults
 
 
@@ -90,6 +92,23 @@ def test_what_no_fault_explains_is_none_of_these(dictionary):
     assert causes[0].kind == NONE_OF_THESE
     assert causes[0].probability > 0.5
     assert match(dictionary, rows + 1.2 * DIRECTIONS[0]).none < 0.5
+
+
+def test_a_step_at_the_onset_is_known_by_its_onset():
+    step = FaultClass("stroke", "boom", "sensor of stroke", "sensor", "", (), 0.0, False, "jumps")
+    chance = np.random.default_rng(4)
+    faults = sessions()
+    for draw in range(3):
+        change = 0.05 * chance.normal(size=(2, 12))
+        change[0, 5] += 3.0
+        faults.append(SimulatedFault(draw, len(CLASSES), 0.0, change, {"Pump": np.zeros(1)}))
+    dictionary = fit_dictionary(SUMMARIES, (*CLASSES, step), faults, healthy(), {})
+    rows = chance.normal(size=(60, 6))
+    rows[:ONSET, 5] += 3.0
+    assert causes_of(dictionary, match(dictionary, rows))[0].kind == "stroke"
+    # Without an onset there is nothing of it.
+    later = match(dictionary, rows[ONSET:] + DIRECTIONS[0], fresh=False)
+    assert causes_of(dictionary, later)[0].kind == "bias"
 
 
 def test_missing_summaries_count_as_healthy(dictionary):

@@ -16,6 +16,8 @@ SHORT, LONG = 8, 40
 SHRUNK = 0.2
 """Share of the identity in the correlations: there are fewer healthy sessions than summaries."""
 LEAST_SESSIONS = 4
+ONSET = 6
+"""Blocks from the onset on that are looked at apart: a step of a sensor shows in them only."""
 
 
 def features(rows: Array) -> Array:
@@ -35,6 +37,18 @@ def mean_features(rows: Array) -> Array:
     counts = there.sum(axis=0)
     sums = np.where(there, values, 0.0).sum(axis=0)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+def parts_of(rows: Array, fresh: bool = True) -> tuple[Array | None, Array | None]:
+    """Rows at the onset and those after it; None where there are none.
+
+    Args:
+        rows: conditioned rows since the onset, shape (blocks, summaries).
+        fresh: whether they begin at an onset, not at an earlier alarm of a fault that has stayed.
+    """
+    if not fresh:
+        return None, rows
+    return rows[:ONSET], rows[ONSET:] if len(rows) > ONSET else None
 
 
 @dataclass(frozen=True, eq=False)

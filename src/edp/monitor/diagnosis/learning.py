@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.monitor.diagnosis.causes import FaultClass
-from edp.monitor.diagnosis.evidence import Scatter, mean_features
-from edp.monitor.diagnosis.matching import match_directions
+from edp.monitor.diagnosis.evidence import ONSET, Scatter, mean_features
+from edp.monitor.diagnosis.matching import Seen, match_directions
 from edp.monitor.diagnosis.signatures import Dictionary, signatures_of
 from edp.monitor.diagnosis.structure import confusions
 
@@ -36,7 +36,7 @@ class SimulatedFault:
         draw: of the session.
         owner: place of the fault in the classes.
         size: of the fault.
-        change: mean features after the onset less those of the sound twin, shape (features,).
+        change: mean features at the onset and after it, less those of the sound twin, shape (2, features).
         sensors: what further channels show, less what they show of the sound twin, by name; standardised.
     """
 
@@ -86,7 +86,7 @@ class _Judged:
 
     without: Dictionary
     fault: SimulatedFault
-    seen: Array
+    seen: tuple[Seen, Seen]
 
 
 def _dictionary(
@@ -112,8 +112,8 @@ def _left_out(
 ) -> list[_Judged]:
     """Sessions whose change is large enough to be found, each on top of a healthy stretch."""
     chance = np.random.default_rng([seed, 23])
-    noise = np.sqrt(scatter.variance(WINDOW))
-    long = [session for session in healthy if len(session) >= WINDOW]
+    noise = [scatter.variance(blocks) for blocks in (ONSET, WINDOW)]
+    long = [session for session in healthy if len(session) >= ONSET + WINDOW]
     judged = []
     for draw in sorted({fault.draw for fault in faults}):
         others = [fault for fault in faults if fault.draw != draw]
@@ -121,13 +121,21 @@ def _left_out(
             continue
         without = _dictionary(summaries, classes, others, scatter, {})
         for fault in faults:
-            if fault.draw == draw and float(np.max(np.abs(fault.change @ scatter.matrix) / noise)) > LEAST_CHANGE:
-                session = long[int(chance.integers(len(long)))]
-                first = int(chance.integers(len(session) - WINDOW + 1))
-                mean = mean_features(session[first : first + WINDOW])
-                judged.append(_Judged(without, fault, scatter.directions(mean + fault.change)))
+            if fault.draw != draw or not _would_be_found(fault.change @ scatter.matrix, noise):
+                continue
+            session = long[int(chance.integers(len(long)))]
+            first = int(chance.integers(len(session) - ONSET - WINDOW + 1))
+            ends = first, first + ONSET, first + ONSET + WINDOW
+            means = [mean_features(session[ends[part] : ends[part + 1]]) for part in (0, 1)]
+            at, after = ((scatter.directions(means[part] + fault.change[part]), noise[part]) for part in (0, 1))
+            judged.append(_Judged(without, fault, (at, after)))
     keep = chance.permutation(len(judged))[:MOST_JUDGED]
     return [judged[place] for place in sorted(keep.tolist())]
+
+
+def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
+    """Whether a direction is far enough off at the onset or after it."""
+    return any(float(np.max(change[part] ** 2 / noise[part])) > LEAST_CHANGE**2 for part in (0, 1))
 
 
 def _chosen(judged: Sequence[_Judged], whole: Dictionary) -> dict[str, float]:
@@ -135,13 +143,12 @@ def _chosen(judged: Sequence[_Judged], whole: Dictionary) -> dict[str, float]:
     best: tuple[float, dict[str, float]] = (np.inf, {})
     if not judged:
         return {}
-    noise = whole.scatter.variance(WINDOW)
     for changing in CHANGING:
         for temperature in TEMPERATURES:
             numbers = {"changing": changing, "temperature": temperature, "strange": 1e6}
             loss, misfits = 0.0, []
             for case in judged:
-                found = match_directions(replace(case.without, **numbers), case.seen, noise)
+                found = match_directions(replace(case.without, **numbers), case.seen)
                 loss -= float(np.log(max(found.probabilities[case.fault.owner], 1e-6)))
                 misfits.append(found.misfit)
             if loss < best[0]:
@@ -156,11 +163,10 @@ def _confusions(judged: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]
         return ()
     place = {name: n for n, name in enumerate(names)}
     columns = np.array([place[_name(fault)] for fault in whole.classes])
-    noise = whole.scatter.variance(WINDOW)
     probabilities = np.zeros((len(judged), len(names)))
     for row, case in enumerate(judged):
         numbers = {"changing": whole.changing, "temperature": whole.temperature, "strange": 1e6}
-        found = match_directions(replace(case.without, **numbers), case.seen, noise)
+        found = match_directions(replace(case.without, **numbers), case.seen)
         np.add.at(probabilities[row], columns, found.probabilities)
     truth = np.array([columns[case.fault.owner] for case in judged])
     further = sorted(judged[0].fault.sensors)

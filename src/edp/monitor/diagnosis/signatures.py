@@ -30,7 +30,8 @@ class Dictionary:
         summaries: names of the monitor's summaries, in order.
         classes: the faults.
         scatter: of healthy sessions.
-        signatures: mean change of the directions by a fault of a size, shape (signatures, features).
+        signatures: mean change of the directions by a fault of a size, at its onset and after it, shape
+            (2, signatures, features).
         owner: place of the fault of each signature in `classes`, shape (signatures,).
         sizes: of each signature in the unit of its class, shape (signatures,).
         changing: share of a signature by which it differs from session to session, as a variance over its square.
@@ -67,7 +68,8 @@ def signatures_of(
         classes: the faults.
         owner: place of the fault of each session.
         sizes: of each session.
-        changes: directions of each session less those of its sound twin, shape (sessions, features).
+        changes: directions of each session less those of its sound twin, at the onset and after it, shape
+            (sessions, 2, features).
 
     Returns:
         Signatures, owner and size of each.
@@ -77,7 +79,7 @@ def signatures_of(
     means = [changes[(places == place) & (of_session == size)].mean(axis=0) for place, size in keys]
     if {place for place, _ in keys} != set(range(len(classes))):
         raise DataError("a fault of the dictionary has no session; simulate all of one draw")
-    return np.array(means), np.array([k for k, _ in keys]), np.array([s for _, s in keys])
+    return np.array(means).swapaxes(0, 1), np.array([k for k, _ in keys]), np.array([s for _, s in keys])
 
 
 def save_dictionary(dictionary: Dictionary, folder: Path) -> None:
@@ -100,7 +102,7 @@ def save_dictionary(dictionary: Dictionary, folder: Path) -> None:
         "schema": SCHEMA,
         "summaries": list(dictionary.summaries),
         "classes": [fault.plain() for fault in dictionary.classes],
-        "signatures": len(dictionary.signatures),
+        "signatures": len(dictionary.owner),
         **{name: getattr(dictionary, name) for name in NUMBERS},
         "confusions": [asdict(pair) for pair in dictionary.confusions],
         "provenance": dict(dictionary.provenance),
@@ -145,7 +147,7 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
     if set(owner.tolist()) != set(range(len(classes))):
         raise StorageError(f"{where}: signatures are not those of its classes; fit the monitor again")
     numbers = {name: _positive(header.get(name), f"{where}: {name}") for name in NUMBERS}
-    signatures = shaped(arrays, "signatures", (count, width), where)
+    signatures = shaped(arrays, "signatures", (2, count, width), where)
     sizes = shaped(arrays, "sizes", (count,), where)
     provenance = header.get("provenance")
     return Dictionary(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError
-from edp.monitor.diagnosis.evidence import mean_features
+from edp.monitor.diagnosis.evidence import ONSET, mean_features, parts_of
 from edp.monitor.diagnosis.learning import SimulatedFault, fit_dictionary
 from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.monitor import Monitor
@@ -140,10 +140,12 @@ def _draw(
 
 
 def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
-    """Mean features of the blocks after an onset."""
+    """Mean features of the blocks at an onset and of those after it, shape (2, features)."""
     rows = monitor.conditioned_rows(recording)
-    # The block in which it begins is half of each.
-    return mean_features(rows[int(onset_s / monitor.block_s) + 1 :])
+    at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
+    if at is None or after is None:
+        raise ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {monitor.block_s:g} s")
+    return np.stack([mean_features(at), mean_features(after)])
 
 
 def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
