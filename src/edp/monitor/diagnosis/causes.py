@@ -71,13 +71,13 @@ class Cause:
     """
 
     kind: str
-    site: str
-    component: str
-    place: Place
-    size: float | None
-    unit: str
-    probability: float
-    words: str
+    site: str = ""
+    component: str = ""
+    place: Place = "none"
+    size: float | None = None
+    unit: str = ""
+    probability: float = 0.0
+    words: str = ""
     grade: float | None = None
     grave: bool = False
 
