@@ -5,28 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from edp.monitor.diagnosis.causes import Cause
+
 SEVERITIES = ("note", "warning", "stop")
-
-
-@dataclass(frozen=True)
-class Cause:
-    """What may be wrong.
-
-    Attributes:
-        kind: of the fault.
-        site: where it sits.
-        size: estimate of it, in `unit`; None where there is none.
-        unit: of the size.
-        probability: 0 to 1.
-        place: ``sensor`` or ``machine``; empty where that is not known.
-    """
-
-    kind: str
-    site: str = ""
-    size: float | None = None
-    unit: str = ""
-    probability: float = 0.0
-    place: str = ""
 
 
 @dataclass(frozen=True)
