@@ -68,7 +68,7 @@ NUISANCES = {
 COUNTS = {
     "training": {"healthy": 360, "faulty": 0, "nuisance": 0},
     "validation": {"healthy": 120, "faulty": 1, "nuisance": 6},
-    "test": {"healthy": 210, "faulty": 3, "nuisance": 30},
+    "test": {"healthy": 190, "faulty": 3, "nuisance": 15},
 }
 """Healthy sessions; draws of each kind and size of fault; sessions of each nuisance set."""
 
@@ -305,10 +305,15 @@ def write_sessions(plans: Sequence[SessionPlan], folder: Path, workers: int) -> 
 
 def read_session(folder: Path, name: str) -> Session:
     """A session by its name, such as ``healthy_000``."""
-    facts = read_json(folder / f"{name}.json")
-    plan = SessionPlan(**facts["plan"])
+    plan, moving = session_facts(folder, name)
     values = np.load(folder / f"{name}.npy", allow_pickle=False)
-    return Session(plan, _recording(plan, values), np.array(facts["moving"]))
+    return Session(plan, _recording(plan, values), moving)
+
+
+def session_facts(folder: Path, name: str) -> tuple[SessionPlan, NDArray[np.int64]]:
+    """What only the simulator knows of a session: its plan, and ticks of each second in which it moved."""
+    facts = read_json(folder / f"{name}.json")
+    return SessionPlan(**facts["plan"]), np.array(facts["moving"])
 
 
 def session_names(folder: Path, group: str) -> list[str]:
