@@ -1,13 +1,13 @@
 """Does the monitor find the faults of an M22, at the rate of false alarms that it promises, and name them?
 
-A monitor is fitted by `edp.workflows.monitor` to healthy sessions (`benchmarks/monitor_sessions.py`) and watches sessions of
-unseen seeds: healthy ones, every kind and size of fault at drawn sites, and healthy ones that must stay silent. Its rivals
-are fitted to the same sessions and get their limits from the same ones, for the same rate. PyOD's two were the best of ten
-on the validation part (`--choose`).
+A monitor is fitted by `edp.workflows.monitor` to healthy sessions (`benchmarks/monitor_sessions.py`) and watches
+sessions of unseen seeds: healthy ones, every kind and size of fault at drawn sites, and healthy ones that must stay
+silent. Its rivals are fitted to the same sessions and get their limits from the same ones, for the same rate. PyOD's two
+were the best of ten on the validation part (`--choose`).
 
 A fault is found by an alarm after its onset; an alarm before it is a false one. Delays are seconds in which the machine
 moved. The promise: 20 fits of conditioning, whitening and limit to other healthy sessions each, with the same residuals
-(their networks take hours), measured on the sessions that were left out.
+(their networks take longer), measured on the sessions that were left out.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ GOALS = {
 LARGE = (0, 1)
 """Ranks of the two largest sizes."""
 FITS, FIT_SESSIONS, PROMISE_H = 20, 120, 2.0
-"""Of the promise: fits, sessions of each, and hours to a false alarm. A promise of 2 h shows in the hours there are what
-one of 8 h would need four times as many for."""
+"""Of the promise: fits, sessions of each, and hours to a false alarm. A promise of 2 h shows in the hours there are
+what one of 8 h would need four times as many for."""
 QUICK_COUNTS = {"training": (16, 0), "test": (6, 1)}
 """Healthy sessions, and those of each nuisance set."""
 QUICK_SECONDS, QUICK_HOURS = 60.0, 0.1

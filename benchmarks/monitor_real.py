@@ -1,12 +1,12 @@
 """Does the monitor find real faults, and faults of sensors laid over real recordings, beside its rivals?
 
 a) The hydraulic rig of UCI 447 (Helwig et al. 2015): cycles of 60 s with graded faults of cooler, valve, pump and
-accumulator. Fitted to stable healthy cycles alone; of these there are ten, in one stretch of ten minutes. They are held out
-in blocks of two; area under the detection curve of each grade (cycles in which nothing else is wrong) against them. Ten
-cycles cannot show 1 % false alarms: what is found is told at the highest score of a held-out healthy one. All grades stand
-hours away from the healthy stretch, so that a detector of *other times* would score as high as one of faults. Therefore a
-control: the eleven healthy cycles of two other times, which are marked as not yet stable, judged like faulty ones. A
-detector that tells faults apart has a high area against those, too.
+accumulator. Fitted to stable healthy cycles alone; of these there are ten, in one stretch of ten minutes. They are held
+out in blocks of two; area under the detection curve of each grade (cycles in which nothing else is wrong) against them.
+Ten cycles cannot show 1 % false alarms: what is found is told at the highest score of a held-out healthy one. All grades
+stand hours away from the healthy stretch, so that a detector of *other times* would score as high as one of faults.
+Therefore a control: the area against the eleven healthy cycles of two other times, which are marked as not yet stable. A
+detector that tells faults from other times has a high area there, too.
 
 b) Public recordings (`examples/real`): the first 60 % are healthy logs, in the rest one channel gets an offset, a wrong
 scale, noise, a delay, or stays. The promise is what the healthy part supports.
@@ -16,6 +16,7 @@ The recordings are no part of the repository: their folder is given by --shared 
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -266,7 +267,7 @@ def divided(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Reco
         cut = round(HEALTHY_SHARE * recording.samples)
         healthy.append(recording.rows(0, cut))
         edges = np.linspace(cut, recording.samples, SEGMENTS + 1).astype(int).tolist()
-        test += [recording.rows(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        test += [recording.rows(a, b) for a, b in itertools.pairwise(edges)]
     return healthy, test
 
 
