@@ -2,8 +2,8 @@
 
 A monitor is fitted by `edp.workflows.monitor` to healthy sessions (`benchmarks/monitor_sessions.py`) and watches
 sessions of unseen seeds: healthy ones, every kind and size of fault at drawn sites, and healthy ones that must stay
-silent. Its rivals are fitted to the same sessions and get their limits from the same ones, for the same rate. PyOD's two
-were the best of ten on the validation part (`--choose`).
+silent. Its rivals are fitted to the same sessions and get their limits from the same ones, for the same rate. PyOD's
+two were the best of ten on the validation part (`--choose`).
 
 A fault is found by an alarm after its onset; an alarm before it is a false one. Delays are seconds in which the machine
 moved. The promise: 20 fits of conditioning, whitening and limit to other healthy sessions each, with the same residuals
@@ -12,28 +12,32 @@ moved. The promise: 20 fits of conditioning, whitening and limit to other health
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from common import Verdict, finish, in_folder, parser, table, verdict
 from edp.config.monitor import load_monitor_experiment
-from edp.monitor.detectors.base import alarms
+from edp.monitor.alarms import MonitorAlarm
+from edp.monitor.chain import Chain, ChainState
 from edp.monitor.fitting import SessionBlocks, blocks_of, fit_from_blocks
+from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.sim.faults import FAULTS, parse_fault
 from edp.sim.plan import ordered
-from edp.storage import make_folder, read_json, write_json
+from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.workflows.monitor import fit_to_recordings
 from monitor_metrics import (
     Case,
     curves,
     false_alarm_rate,
+    finite,
     judged,
     median_delay,
     share_found,
@@ -41,6 +45,7 @@ from monitor_metrics import (
 from monitor_rivals import CHARTS, PYOD, Rival, has_pyod, limit_of, raised, rivals_of
 from monitor_sessions import (
     COUNTS,
+    DURATION_S,
     NUISANCES,
     plans_of,
     read_session,
@@ -49,6 +54,7 @@ from monitor_sessions import (
     write_sessions,
 )
 
+Floats = NDArray[np.float64]
 BEST_PYOD = ("KNN", "GMM")
 """Of ten on the validation part."""
 GOALS = {
@@ -71,6 +77,8 @@ QUICK_COUNTS = {"training": (16, 0), "test": (6, 1)}
 """Healthy sessions, and those of each nuisance set."""
 QUICK_SECONDS, QUICK_HOURS = 60.0, 0.1
 QUICK_FAULTS = 12
+NEVER_H = 1e9
+"""In place of infinity, which JSON lacks."""
 
 
 @dataclass(frozen=True)
@@ -103,34 +111,82 @@ class _Job:
     folder: Path
     name: str
     monitor: Path
+    cache: Path
     label: str
 
 
+class FromBlocks(Chain):
+    """A chain that takes summaries and operating points in place of residuals and raw rows.
+
+    The networks of a session run once; what comes behind them is judged anew as often as it changes. `same_alarms`
+    holds this way to `Monitor.run`.
+    """
+
+    def conditioned(self, residuals: Floats, rows: Floats, state: ChainState) -> tuple[Floats, ChainState]:
+        """See `Chain.conditioned`; whole sessions only."""
+        z = self.conditioning(residuals, rows)
+        z[: self.settle] = np.nan
+        z, drift = self.drift.run(z, state.drift)
+        return z, replace(state, drift=drift, blocks=len(z))
+
+
 @lru_cache(maxsize=1)
-def _monitor(folder: Path) -> Any:
+def _monitor(folder: Path) -> Monitor:
     return load_monitor(folder)
 
 
-def _watch(job: _Job) -> dict[str, Any]:
-    """Alarms of a session: when, and what is said of their causes."""
-    session, began = read_session(job.folder, job.name), time.process_time()
-    rows = []
-    for alarm in _monitor(job.monitor).run(session.recording):
-        causes = [[c.kind, c.site, c.probability, c.place] for c in alarm.causes]
-        rows.append({"raised_s": alarm.raised_s, "since_s": alarm.since_s, "causes": causes})
-    return {"name": job.name, "alarms": rows, "seconds": time.process_time() - began}
+def _summarise(job: _Job) -> str:
+    monitor, recording = _monitor(job.monitor), read_session(job.folder, job.name).recording
+    part = blocks_of(monitor.chain.summaries, monitor.sources, monitor.channels, recording)
+    buffer = BytesIO()
+    np.savez(buffer, summaries=part.summaries, points=part.points)
+    write_bytes(job.cache, buffer.getvalue())
+    return job.name
 
 
-def watched(plan: Plan, group: str, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Alarms of the sessions of a group by name; what an earlier run found is read."""
-    folder, cache = plan.data / "test", make_folder(plan.monitor / "alarms")
-    missing = [name for name in names if not (cache / f"{name}.json").exists()]
-    jobs = [_Job(folder, name, plan.monitor, name) for name in missing]
-    for number, row in enumerate(ordered(_watch, jobs, plan.workers) if jobs else (), start=1):
-        write_json(cache / f"{row['name']}.json", row)
+def blocks(plan: Plan, part: str, names: Sequence[str]) -> list[SessionBlocks]:
+    """Summaries of sessions; those of an earlier run of the same monitor are read."""
+    cache = make_folder(plan.monitor / "blocks" / part)
+    jobs = [
+        _Job(plan.data / part, name, plan.monitor, cache / f"{name}.npz", name)
+        for name in names
+        if not (cache / f"{name}.npz").exists()
+    ]
+    for number, name in enumerate(ordered(_summarise, jobs, plan.workers) if jobs else (), start=1):
         if number % 20 == 0:
-            print(f"{group}: {number} of {len(jobs)} watched", flush=True)
-    return {name: read_json(cache / f"{name}.json") for name in names}
+            print(f"{part}: {number} of {len(jobs)} summarised, {name}", flush=True)
+    result = []
+    for name in names:
+        with np.load(cache / f"{name}.npz", allow_pickle=False) as arrays:
+            result.append(SessionBlocks(name, arrays["summaries"], arrays["points"]))
+    return result
+
+
+def alarms_of(monitor: Monitor, part: SessionBlocks, chain: Chain | None = None) -> list[MonitorAlarm]:
+    """Alarms of a session, as `Monitor.run` gives them; of another chain where one is given."""
+    source = monitor.chain if chain is None else chain
+    names = [field.name for field in fields(Chain)]
+    own = FromBlocks(**{name: getattr(source, name) for name in names})
+    verdicts, _ = own.run(part.summaries, part.points, own.initial_state())
+    judging = replace(monitor, chain=own)
+    return [judging.alarm(verdict, part.name) for verdict in verdicts if verdict.alarm is not None]
+
+
+def watched(plan: Plan, names: Sequence[str]) -> dict[str, list[MonitorAlarm]]:
+    """Alarms of test sessions by name."""
+    monitor = load_monitor(plan.monitor)
+    return {part.name: alarms_of(monitor, part) for part in blocks(plan, "test", names)}
+
+
+def same_alarms(plan: Plan, found: dict[str, list[MonitorAlarm]], count: int = 6) -> tuple[int, int]:
+    """Of how many sessions with alarms `Monitor.run` raises the same ones, and of how many; and seconds a session."""
+    monitor = load_monitor(plan.monitor)
+    names = [name for name, alarms in found.items() if alarms][:count]
+    same = 0
+    for name in names:
+        direct = monitor.run(read_session(plan.data / "test", name).recording)
+        same += [alarm.raised_s for alarm in direct] == [alarm.raised_s for alarm in found[name]]
+    return same, len(names)
 
 
 def fitted(plan: Plan) -> dict[str, Any]:
@@ -149,7 +205,7 @@ def fitted(plan: Plan) -> dict[str, Any]:
             {
                 "seconds": result.seconds,
                 "promise": monitor.limit.sentence(),
-                "limit": asdict(monitor.limit) | {"high_hours": min(monitor.limit.high_hours, 1e9)},
+                "limit": asdict(monitor.limit) | {"high_hours": min(monitor.limit.high_hours, NEVER_H)},
                 "residuals": list(monitor.residual_names),
                 "provenance": dict(monitor.provenance),
                 "doubtful": list(result.doubtful),
@@ -168,31 +224,30 @@ def parts_of(plan: Plan) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in set(limits)], list(limits)
 
 
-def our_cases(plan: Plan, names: Sequence[str]) -> tuple[list[Case], list[dict[str, Any]]]:
-    """What was found of the faulty sessions, and the alarms."""
-    rows = watched(plan, "faulty", names)
+def our_cases(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> list[Case]:
+    """What was found of the faulty sessions."""
     cases = []
-    for name in names:
+    for name, alarms in found.items():
         session, moving = session_facts(plan.data / "test", name)
-        cases.append(judged(session.fault, moving, [a["raised_s"] for a in rows[name]["alarms"]]))
-    return cases, [rows[name] for name in names]
+        cases.append(judged(session.fault, moving, [alarm.raised_s for alarm in alarms]))
+    return cases
 
 
-def naming(plan: Plan, names: Sequence[str], rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+def naming(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> dict[str, float]:
     """Shares of the found faults whose first alarm names the component, kind and site, among three, and the place."""
     hits: dict[str, list[bool]] = {key: [] for key in ("component", "top_three", "kind_and_site", "place")}
-    for name, row in zip(names, rows, strict=True):
+    for name, alarms in found.items():
         fault = parse_fault(session_facts(plan.data / "test", name)[0].fault)
-        after = [alarm for alarm in row["alarms"] if alarm["raised_s"] > fault.onset_s]
+        after = [alarm for alarm in alarms if alarm.raised_s > fault.onset_s]
         if not after:
             continue
-        causes = after[0]["causes"]
-        told = [component(kind, site) for kind, site, *_ in causes]
+        causes = after[0].causes
+        parts = [component(cause.kind, cause.site) for cause in causes]
         right = component(fault.kind, fault.site)
-        hits["component"].append(told[:1] == [right])
-        hits["top_three"].append(right in told[:3])
-        hits["kind_and_site"].append([*causes[:1]] != [] and causes[0][:2] == [fault.kind, fault.site])
-        hits["place"].append([*causes[:1]] != [] and causes[0][3] == place_of(fault.kind))
+        hits["component"].append(parts[:1] == [right])
+        hits["top_three"].append(right in parts[:3])
+        hits["kind_and_site"].append([(c.kind, c.site) for c in causes[:1]] == [(fault.kind, fault.site)])
+        hits["place"].append([cause.place for cause in causes[:1]] == [place_of(fault.kind)])
     return {key: float(np.mean(values)) if values else float("nan") for key, values in hits.items()}
 
 
@@ -253,57 +308,37 @@ def summary(cases: Sequence[Case]) -> dict[str, Any]:
 def promise(plan: Plan, seed: int) -> dict[str, Any]:
     """Fits of all behind the residuals to other healthy sessions each, and what they raise on the others."""
     monitor = load_monitor(plan.monitor)
-    pool = [("training", name) for name in parts_of(plan)[1]]
-    pool += [("validation", name) for name in session_names(plan.data / "validation", "healthy")]
-    summaries, channels = monitor.chain.summaries, monitor.channels
-    parts = []
-    for part, name in pool:
-        recording = read_session(plan.data / part, name).recording
-        parts.append(blocks_of(summaries, monitor.sources, channels, recording))
-    fits = 2 if plan.quick else FITS
-    count = len(parts) // 2 if plan.quick else min(FIT_SESSIONS, len(parts) // 2)
-    hours = QUICK_HOURS / 4 if plan.quick else PROMISE_H
-    rows = []
+    parts = blocks(plan, "test", session_names(plan.data / "test", "healthy"))
+    if not plan.quick:
+        parts += blocks(plan, "validation", session_names(plan.data / "validation", "healthy"))
+    fits, hours = (2, QUICK_HOURS / 4) if plan.quick else (FITS, PROMISE_H)
+    count, rows = min(FIT_SESSIONS, len(parts) // 2), []
     for number in range(fits):
         order = np.random.default_rng([seed, number]).permutation(len(parts))
         chosen, others = ([parts[i] for i in some] for some in (order[:count], order[count:]))
         rows.append(_one_fit(plan, monitor, chosen, others, hours))
         print(f"promise {number + 1}: {rows[-1]}", flush=True)
-    kept = sum(row["low_hours"] <= row["measured_hours"] <= row["high_hours"] for row in rows)
-    at_least = sum(row["measured_hours"] >= hours for row in rows)
-    return {"fits": rows, "within": kept, "of": fits, "as_promised": at_least, "promised_hours": hours}
+    within = sum(row["low_hours"] <= row["measured_hours"] <= row["high_hours"] for row in rows)
+    as_promised = sum(row["measured_hours"] >= hours for row in rows)
+    return {"fits": rows, "within": within, "of": fits, "as_promised": as_promised, "promised_hours": hours}
 
 
 def _one_fit(
-    plan: Plan, monitor: Any, chosen: Sequence[SessionBlocks], others: Sequence[SessionBlocks], hours: float
+    plan: Plan, monitor: Monitor, chosen: Sequence[SessionBlocks], others: Sequence[SessionBlocks], hours: float
 ) -> dict[str, Any]:
-    spec = load_monitor_experiment(None, plan.settings, {}).chain
-    old = monitor.chain
+    spec, old = load_monitor_experiment(None, plan.settings, {}).chain, monitor.chain
     result = fit_from_blocks(spec, old.summaries, chosen, monitor.rate_hz, old.settle, hours)
-    count, seconds = 0, 0.0
-    for part in others:
-        count += len(alarms_of_blocks(result.chain, part))
-        seconds += len(part.summaries) * monitor.block_s
-    # Zero alarms in H hours: H is the least that the mean can be said to be.
-    measured = seconds / 3600.0 / max(count, 1)
+    count = sum(len(alarms_of(monitor, part, result.chain)) for part in others)
+    measured = sum(len(part.summaries) for part in others) * monitor.block_s / 3600.0
     limit = result.limit
     return {
         "low_hours": limit.low_hours,
-        "high_hours": min(limit.high_hours, 1e9),
-        "measured_hours": measured,
+        "high_hours": min(limit.high_hours, NEVER_H),
+        # No alarm in H hours: the mean is H at least.
+        "measured_hours": measured / max(count, 1),
         "alarms": count,
-        "hours": seconds / 3600.0,
+        "hours": measured,
     }
-
-
-def alarms_of_blocks(chain: Any, part: SessionBlocks) -> list[int]:
-    """Blocks at which a chain raises an alarm, from the summaries of a session: what `Monitor.run` does behind them."""
-    z = chain.conditioning(part.summaries, part.points)
-    z[: chain.settle] = np.nan
-    z, _ = chain.drift.run(z, np.zeros(z.shape[1]))
-    white = chain.bank.white(z[chain.settle :])
-    found = alarms(chain.bank.build(white.shape[1]), white[:, None], chain.limit)
-    return [chain.settle + alarm.row + 1 for alarm in found]
 
 
 def prepared(plan: Plan) -> tuple[list[str], list[str]]:
@@ -326,21 +361,18 @@ def measure(plan: Plan, seed: int) -> dict[str, Any]:
     """Everything of one run."""
     healthy, faulty = prepared(plan)
     found: dict[str, Any] = {"fit": fitted(plan)}
-    calm = watched(plan, "healthy", healthy)
-    seconds = QUICK_SECONDS if plan.quick else 480.0
-    count = sum(len(row["alarms"]) for row in calm.values())
+    calm, wrong = watched(plan, healthy), watched(plan, faulty)
+    seconds = QUICK_SECONDS if plan.quick else DURATION_S
+    count = sum(len(alarms) for alarms in calm.values())
     found["healthy"] = false_alarm_rate(count, len(calm) * seconds / 3600.0)
-    found["seconds_a_session"] = float(np.mean([row["seconds"] for row in calm.values()]))
-    cases, rows = our_cases(plan, faulty)
-    found["ours"] = summary(cases)
-    found["naming"] = naming(plan, faulty, rows)
-    found["curves"] = curves(cases)
-    found["nuisance"] = {}
+    cases = our_cases(plan, wrong)
+    found |= {"ours": summary(cases), "naming": naming(plan, wrong), "curves": curves(cases), "nuisance": {}}
+    found["same_alarms"] = same_alarms(plan, wrong)
     for group in NUISANCES:
-        names = session_names(plan.data / "test", group)
-        alarms_there = sum(len(row["alarms"]) for row in watched(plan, group, names).values())
-        if names:
-            found["nuisance"][group] = false_alarm_rate(alarms_there, len(names) * seconds / 3600.0)
+        silent = watched(plan, session_names(plan.data / "test", group))
+        count = sum(len(alarms) for alarms in silent.values())
+        if silent:
+            found["nuisance"][group] = false_alarm_rate(count, len(silent) * seconds / 3600.0)
     found["rivals"] = rival_results(plan, healthy, faulty)
     found["promise"] = promise(plan, seed)
     return found
@@ -448,7 +480,7 @@ def main() -> None:
             choose(plan)
             return
         found = measure(plan, given.seed)
-        finish("monitor", show(found, plan), given.seed, found)
+        finish("monitor", show(found, plan), given.seed, finite(found))
 
     # The short form has other sessions under the same names.
     in_folder(given.data / "quick" if given.quick and given.data else given.data, run)

@@ -121,3 +121,12 @@ def area_under_curve(healthy: NDArray[np.float64], faulty: NDArray[np.float64]) 
     """Chance that a faulty score is above a healthy one, ties counted half."""
     above = (faulty[:, None] > healthy[None, :]).mean()
     return float(above + 0.5 * (faulty[:, None] == healthy[None, :]).mean())
+
+
+def finite(value: Any) -> Any:
+    """Plain values as JSON can keep them: what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -3,10 +3,10 @@
 a) The hydraulic rig of UCI 447 (Helwig et al. 2015): cycles of 60 s with graded faults of cooler, valve, pump and
 accumulator. Fitted to stable healthy cycles alone; of these there are ten, in one stretch of ten minutes. They are held
 out in blocks of two; area under the detection curve of each grade (cycles in which nothing else is wrong) against them.
-Ten cycles cannot show 1 % false alarms: what is found is told at the highest score of a held-out healthy one. All grades
-stand hours away from the healthy stretch, so that a detector of *other times* would score as high as one of faults.
-Therefore a control: the area against the eleven healthy cycles of two other times, which are marked as not yet stable. A
-detector that tells faults from other times has a high area there, too.
+Ten cycles cannot show 1 % false alarms: what is found is told at the highest score of a held-out healthy one. All
+grades stand hours away from the healthy stretch, so that a detector of *other times* would score as high as one of
+faults. Therefore a control: the area against the eleven healthy cycles of two other times, which are marked as not yet
+stable. A detector that tells faults from other times has a high area there, too.
 
 b) Public recordings (`examples/real`): the first 60 % are healthy logs, in the rest one channel gets an offset, a wrong
 scale, noise, a delay, or stays. The promise is what the healthy part supports.
@@ -35,7 +35,7 @@ from edp.monitor.monitor import Monitor
 from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.workflows.monitor import fit_to_recordings
-from monitor_metrics import area_under_curve
+from monitor_metrics import area_under_curve, finite
 from monitor_rivals import CHARTS, Rival, has_pyod, limit_of, raised, rivals_of
 from real_recordings import EXAMPLES, VARIABLE, shared_folder
 
@@ -370,7 +370,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sets[name] = set_results(name, given.seed)
         print(f"{name}: {sets[name]['cases']} cases done", flush=True)
     details = {"rig": rig, "sets": sets}
-    finish("monitor_real", show(rig, sets, given.quick), given.seed, details)
+    finish("monitor_real", show(rig, sets, given.quick), given.seed, finite(details))
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ NUISANCES = {
 COUNTS = {
     "training": {"healthy": 360, "faulty": 0, "nuisance": 0},
     "validation": {"healthy": 120, "faulty": 1, "nuisance": 6},
-    "test": {"healthy": 190, "faulty": 3, "nuisance": 15},
+    "test": {"healthy": 182, "faulty": 1, "nuisance": 8},
 }
 """Healthy sessions; draws of each kind and size of fault; sessions of each nuisance set."""
 
