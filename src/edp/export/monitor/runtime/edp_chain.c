@@ -7,6 +7,7 @@
 #define EXPONENT 0x7FF0000000000000u
 #define MANTISSA 0x000FFFFFFFFFFFFFu
 #define HIDDEN 0x0010000000000000u
+#define EDP_NEAR_ZERO 0.05 /* of healthy variance, added below gain and lag: a channel at rest tells neither */
 
 static uint64_t bits_of(double x) {
     uint64_t bits;
@@ -60,13 +61,121 @@ double edp_root(double x) {
     return result;
 }
 
-double edp_dot(const double *x, const double *y, uint32_t n, uint32_t stride) {
+double edp_dot(const double *x, const double *y, uint32_t n) {
     double sum = 0.0;
     for (uint32_t i = 0; i < n; i++) {
-        sum += x[i] * y[(size_t)i * stride];
+        sum += x[i] * y[i];
     }
     return sum;
 }
+
+uint32_t edp_crc_doubles(uint32_t crc, const double *values, uint32_t n) {
+    uint32_t left = crc ^ 0xFFFFFFFFu;
+    for (uint32_t i = 0; i < n; i++) {
+        uint64_t bits = bits_of(values[i]);
+        for (uint32_t bit = 0; bit < 64u; bit++) {
+            const uint32_t low = (left ^ (uint32_t)(bits & 1u)) & 1u;
+            left = (left >> 1) ^ (0xEDB88320u & (0u - low));
+            bits >>= 1;
+        }
+    }
+    return left ^ 0xFFFFFFFFu;
+}
+
+/* ---- blocks -------------------------------------------------------------------------------------------------------- */
+
+double edp_within(double x, double low, double high) {
+    double y = x;
+    if (x < low) {
+        y = low;
+    } else if (x > high) {
+        y = high;
+    } else {
+        /* within, or NaN */
+    }
+    return y;
+}
+
+static double size_of(double x) { return (x < 0.0) ? -x : x; }
+
+static void add_residual(double r, double u, double d, double *sums) {
+    sums[0] += 1.0;
+    sums[1] += r;
+    sums[2] += r * r;
+    sums[3] += r * u;
+    sums[5] += r * d;
+    sums[7] = (size_of(r) > sums[7]) ? size_of(r) : sums[7];
+}
+
+void edp_block_tick(const edp_blocks *b, bool first, const float *in, const float *residuals, double *y, double *sums) {
+    double *const levels = &sums[EDP_SUMS * b->residuals];
+    double *const sizes = &levels[b->levels];
+    /* Each residual first takes the channel of the tick before, then that of this one. */
+    for (uint32_t i = 0; i < b->residuals; i++) {
+        const uint32_t c = b->channel[i];
+        const double before = y[c];
+        const double u = edp_known((double)in[c]) ? (((double)in[c] - b->centre[c]) / b->spread[c]) : before;
+        const double d = first ? 0.0 : (u - before);
+        double *const own = &sums[EDP_SUMS * i];
+        if (edp_known((double)residuals[i])) {
+            add_residual((double)residuals[i] / b->scale[i], u, d, own);
+        }
+        own[4] += u * u;
+        own[6] += d * d;
+    }
+    for (uint32_t c = 0; c < b->inputs; c++) {
+        if (edp_known((double)in[c])) {
+            y[c] = ((double)in[c] - b->centre[c]) / b->spread[c];
+        }
+    }
+    for (uint32_t i = 0; i < b->levels; i++) {
+        levels[i] += y[b->level[i]];
+    }
+    for (uint32_t i = 0; i < b->moving; i++) {
+        sizes[i] += size_of(y[b->size[i]]);
+    }
+}
+
+void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double summaries[EDP_SUMMARIES]) {
+    const double *const own = &sums[EDP_SUMS * residual];
+    const double whole = (double)b->ticks;
+    const double n = (own[0] > 1.0) ? own[0] : 1.0;
+    const double mean = own[1] / n;
+    const double variance = (own[2] / n) - (mean * mean);
+    if ((2.0 * own[0]) < whole) {
+        for (uint32_t i = 0; i < EDP_SUMMARIES; i++) {
+            summaries[i] = edp_unknown();
+        }
+    } else {
+        summaries[0] = mean;
+        summaries[1] = edp_root(edp_root((variance > 0.0) ? variance : 0.0));
+        summaries[2] = own[3] / (own[4] + (EDP_NEAR_ZERO * whole));
+        summaries[3] = own[5] / (own[6] + ((EDP_NEAR_ZERO * whole) * b->change[residual]));
+        summaries[4] = edp_root(own[7]);
+    }
+}
+
+void edp_block_point(const edp_blocks *b, const double *sums, const double *offset, const double *width, double limit,
+                     double *point) {
+    const double *const values = &sums[EDP_SUMS * b->residuals];
+    const double whole = (double)b->ticks;
+    for (uint32_t i = 0; i < (b->levels + b->moving); i++) {
+        point[i] = edp_within(((values[i] / whole) - offset[i]) / width[i], -limit, limit);
+    }
+}
+
+double edp_conditioned(double summary, const double *point, uint32_t n, const double *usual, const double *wide,
+                       double floor, double limit) {
+    double middle = usual[0];
+    double width = wide[0];
+    for (uint32_t i = 0; i < n; i++) {
+        middle += point[i] * usual[i + 1u];
+        width += point[i] * wide[i + 1u];
+    }
+    return edp_within((summary - middle) / ((width > floor) ? width : floor), -limit, limit);
+}
+
+/* ---- detectors ----------------------------------------------------------------------------------------------------- */
 
 void edp_clear(uint32_t n, double *values) {
     for (uint32_t i = 0; i < n; i++) {
@@ -81,7 +190,7 @@ double edp_cusum(double slack, const double *row, uint32_t n, double *sums) {
     for (uint32_t i = 0; i < n; i++) {
         sums[i] += row[i];
     }
-    length = edp_root(edp_dot(sums, sums, n, 1u));
+    length = edp_root(edp_dot(sums, sums, n));
     left = ((length - slack) > 0.0) ? (length - slack) : 0.0;
     share = left / ((length > 1e-300) ? length : 1e-300);
     for (uint32_t i = 0; i < n; i++) {
@@ -94,12 +203,67 @@ double edp_ewma(double weight, double factor, const double *row, uint32_t n, dou
     for (uint32_t i = 0; i < n; i++) {
         means[i] += weight * (row[i] - means[i]);
     }
-    return edp_dot(means, means, n, 1u) * factor;
+    return edp_dot(means, means, n) * factor;
 }
 
 double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32_t length, double *sums) {
     for (uint32_t i = 0; i < n; i++) {
         sums[i] = ((before == NULL) ? 0.0 : before[i]) + row[i];
     }
-    return edp_dot(sums, sums, n, 1u) / (2.0 * (double)length);
+    return edp_dot(sums, sums, n) / (2.0 * (double)length);
+}
+
+/* ---- watches ------------------------------------------------------------------------------------------------------- */
+
+void edp_watch_centre(const edp_watch *w, const double *z, double *centred) {
+    for (uint32_t i = 0; i < w->summaries; i++) {
+        centred[i] = edp_known(z[i]) ? (z[i] - w->mean[i]) : 0.0;
+    }
+}
+
+double edp_watch_white(const edp_watch *w, const double *centred, uint32_t direction) {
+    const size_t from = (size_t)direction * w->summaries;
+    double sum = 0.0;
+    if (w->exact != NULL) {
+        sum = edp_dot(centred, &w->exact[from], w->summaries);
+    } else {
+        const float *const row = &w->matrix[from];
+        for (uint32_t i = 0; i < w->summaries; i++) {
+            sum += centred[i] * (double)row[i];
+        }
+    }
+    return sum;
+}
+
+uint32_t edp_watch_steps(const edp_watch *w) { return (w->detector == EDP_GLR) ? w->window : 1u; }
+
+void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *rows,
+                    double *statistic) {
+    const uint32_t n = w->directions;
+    if (w->detector == EDP_CUSUM) {
+        *statistic = edp_cusum(w->option, white, n, memory) / w->scale;
+    } else if (w->detector == EDP_EWMA) {
+        *statistic = edp_ewma(w->option, w->factor, white, n, memory) / w->scale;
+    } else {
+        /* Longest first: each sum rests on the next shorter one of the row before. */
+        const uint32_t length = w->window - step;
+        double *const sums = &memory[(size_t)(length - 1u) * n];
+        const double *const before = (length > 1u) ? &memory[(size_t)(length - 2u) * n] : NULL;
+        const double ratio = edp_glr_ratio(white, n, before, length, sums);
+        if (step == 0u) {
+            *rows += (*rows < w->window) ? 1u : 0u;
+            *statistic = 0.0;
+        }
+        if ((length <= *rows) && (ratio > *statistic)) {
+            *statistic = ratio;
+        }
+        if (length == 1u) {
+            *statistic /= w->scale;
+        }
+    }
+}
+
+void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *rows) {
+    edp_clear(EDP_WATCH_MEMORY(w->directions, (w->detector == EDP_GLR) ? w->window : 1u), memory);
+    *rows = 0u;
 }

@@ -1,0 +1,375 @@
+"""The folder of an exported monitor: its C files, its networks, the runtime, a self-test, an example, CMake."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from edp import __version__
+from edp.errors import ExportError
+from edp.export.c.model import RUNTIME
+from edp.export.c.target import check_name, core_files
+from edp.export.c.text import filled, indented, number
+from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
+from edp.export.folder import write_export
+from edp.export.monitor.golden import JUDGED_BLOCKS, MISSING, SEED, SHIFT, golden_blocks
+from edp.export.monitor.numbers import MonitorTables, double_number
+from edp.export.monitor.parts import MonitorParts, WatchPart
+from edp.export.monitor.sources import SourceCode, reads_tables, source_code
+from edp.export.sizes import check_sizes
+from edp.networks.input_range import HOLD_TICKS
+
+OWN = ("edp_chain.h", "edp_chain.c")
+LONGEST_NAME = 20
+"""Of a monitor: names of its networks and functions are made from it."""
+LIMIT = 1e5
+"""Usual widths beyond which a measurement counts as missing."""
+LARGEST = 3.0e38
+DETECTORS = {"cusum": "EDP_CUSUM", "ewma": "EDP_EWMA", "glr": "EDP_GLR"}
+SUMMARIES = 5
+"""Of a residual and block: `EDP_SUMMARIES`."""
+MOST_MEMORY = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorFiles:
+    """What the templates of one monitor are filled with.
+
+    Attributes:
+        name: C prefix.
+        parts: its numbers.
+        sources: of its residuals, as C.
+        tables: its constants.
+    """
+
+    name: str
+    parts: MonitorParts
+    sources: tuple[SourceCode, ...]
+    tables: MonitorTables = field(default_factory=MonitorTables)
+
+    def texts(self) -> dict[str, str]:
+        """Every file by name, the one to read first in front."""
+        name = self.name
+        numbers = self._numbers()
+        texts: dict[str, str] = {
+            f"{name}.h": self._filled("monitor.h.in"),
+            f"{name}.c": self._filled("monitor.c.in"),
+            f"{name}_numbers.h": numbers,
+        }
+        texts |= {file: _own(f"runtime/{file}") for file in OWN}
+        texts |= {file: resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text() for file in RUNTIME}
+        for source in self.sources:
+            texts |= {} if source.model is None else core_files(source.model)
+        return texts
+
+    def folder_texts(self) -> dict[str, str]:
+        """The same with self-test, example and CMake file."""
+        return self.texts() | {
+            f"{self.name}_golden.h": self._golden(),
+            "host_test.c": self._filled("host_test.c.in"),
+            "example_task.c": self._filled("example_task.c.in"),
+            "CMakeLists.txt": self._filled("CMakeLists.txt.in"),
+        }
+
+    @property
+    def compiled(self) -> list[str]:
+        """C files that a program with this monitor compiles."""
+        networks = [file for s in self.sources if s.model is not None for file in s.model.sources]
+        runtime = [file for file in RUNTIME if file.endswith(".c")]
+        return list(dict.fromkeys([f"{self.name}.c", "edp_chain.c", *networks, *runtime]))
+
+    @property
+    def slices(self) -> int:
+        """Parts of the work on a block: operating point, each residual, each watch, the verdict."""
+        return 2 + len(self.parts.residuals) + sum(map(_watch_slices, self.parts.chain.watches))
+
+    def _numbers(self) -> Code:
+        chain, tables = self.parts.chain, self.tables
+        low, high = (chain.centre + side * LIMIT * chain.spread for side in (-1.0, 1.0))
+        tables.floats("input_low", np.clip(low, -LARGEST, LARGEST))
+        tables.floats("input_high", np.clip(high, -LARGEST, LARGEST))
+        reads_tables(self.parts.reads, tables)
+        for source in self.sources:
+            source.constants(tables)
+        for name in ("centre", "spread", "scale", "change"):
+            tables.doubles(name, getattr(chain, name))
+        for name in ("channel", "level", "moving"):
+            tables.places(name, getattr(chain, name))
+        sizes = (chain.block, len(chain.centre), len(chain.scale), len(chain.level), len(chain.moving))
+        named = ", ".join([*(f"{size}u" for size in sizes), "centre, spread, scale, change, channel, level, moving"])
+        tables.text(f"static const edp_blocks blocks = {{{named}}};")
+        tables.doubles("point_offset", chain.point_offset)
+        tables.doubles("point_width", chain.point_width)
+        for name in ("usual", "wide", "least"):
+            tables.doubles(name, getattr(chain, name))
+        self._watches()
+        self._scalars()
+        head = f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */\n"
+        return Code(head + tables.finished())
+
+    def _watches(self) -> None:
+        tables, rows = self.tables, []
+        for place, watch in enumerate(self.parts.chain.watches):
+            tables.doubles(f"mean_{place}", watch.mean)
+            matrix = np.ascontiguousarray(watch.matrix.T)
+            # Half the bytes where nothing is lost: a float is widened exactly.
+            single = np.array_equal(matrix.astype(np.float32).astype(np.float64), matrix)
+            (tables.floats if single else tables.doubles)(f"matrix_{place}", matrix)
+            pointers = f"NULL, matrix_{place}" if single else f"matrix_{place}, NULL"
+            weight = watch.option if watch.detector == "ewma" else 1.0
+            sizes = f"{self.parts.summaries}u, {watch.matrix.shape[1]}u, {_window(watch)}u"
+            options = ", ".join(map(double_number, (watch.option, (2.0 - weight) / weight, watch.scale)))
+            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{place}, {pointers}}}")
+        body = ",\n".join(rows)
+        tables.text(f"static const edp_watch watches[{len(rows)}] = {{\n{body}\n}};")
+        memories = np.cumsum([0, *map(_memory, self.parts.chain.watches)]).tolist()
+        tables.text(
+            f"static const uint32_t memory_from[{len(rows)}] = {{{', '.join(f'{m}u' for m in memories[:-1])}}};"
+        )
+        first = 1 + len(self.parts.residuals)
+        starts = first + np.cumsum([0, *map(_watch_slices, self.parts.chain.watches)])
+        tables.text(f"static const uint32_t slices_from[{len(starts)}] = {{{', '.join(f'{s}u' for s in starts)}}};")
+
+    def _scalars(self) -> None:
+        chain = self.parts.chain
+        scalars = {
+            "POINT_LIMIT": chain.point_limit,
+            "CLIP": chain.clip,
+            "DRIFT_STEP": chain.drift_step,
+            "DRIFT_MOST": chain.drift_most,
+            "ALARM_LIMIT": chain.limit,
+            "QUIET": chain.quiet,
+        }
+        for name, value in scalars.items():
+            self.tables.text(f"#define {name} {double_number(value)}")
+        self.tables.text(f"#define POINTS {self.parts.points}u")
+        self.tables.text(f"#define BLOCK_S {number(chain.block / self.parts.rate_hz)}")
+
+    def _filled(self, template: str) -> Code:
+        return fill(_own(f"templates/{template}"), self._values())
+
+    def _values(self) -> dict[str, object]:
+        parts, chain = self.parts, self.parts.chain
+        models = [source.model for source in self.sources if source.model is not None]
+        checks = "".join(f" && {model.name}_check()" for model in models)
+        headers = sorted({"edp_chain.h", "edp_runtime.h", *(f"{model.name}.h" for model in models)})
+        return {
+            "name": self.name,
+            "NAME": self.name.upper(),
+            "title": c_comment(parts.title),
+            "promise": c_comment(parts.promise),
+            "version": __version__,
+            "hash": parts.digest,
+            # Odd, so that zeroed memory does not look like a state that was reset.
+            "marker": int(hashlib.blake2b(parts.digest.encode(), digest_size=4).hexdigest(), 16) | 1,
+            "crc": self.tables.crc,
+            "rate": number(parts.rate_hz),
+            "rate_hz": f"{parts.rate_hz:g}",
+            "tick_ms": f"{1000 / parts.rate_hz:g}",
+            "block": chain.block,
+            "block_s": f"{chain.block / parts.rate_hz:g}",
+            "settle": chain.settle,
+            "hold": HOLD_TICKS,
+            "limit": f"{LIMIT:.0f}",
+            "inputs": len(parts.inputs),
+            "residuals": len(parts.residuals),
+            "levels": len(chain.level),
+            "moving": len(chain.moving),
+            "points": max(1, parts.points),
+            "watches": len(chain.watches),
+            "widest": max(watch.matrix.shape[1] for watch in chain.watches),
+            "memory": sum(map(_memory, chain.watches)),
+            "slices": self.slices,
+            "slices_per_tick": -(-self.slices // chain.block),
+            "includes": Code("\n".join(f'#include "{file}"' for file in headers)),
+            "what": self._what(),
+            "cost": self._cost(),
+            "check_networks": Code(checks),
+            "compiled": Code(" ".join(self.compiled)),
+            **self._enums(),
+            **self._source_texts(),
+            **self._golden_sizes(),
+        }
+
+    def _what(self) -> Code:
+        lines = [
+            f" * Residuals, measured less expected: {len(self.parts.residuals)} of them, see below. A block gives of each its mean,"
+        ]
+        lines.append(
+            " * spread, gain and lag against the channel that it judges, and peak, at the operating point of the block."
+        )
+        return Code("\n".join(lines))
+
+    def _cost(self) -> Code:
+        models = [source.model for source in self.sources if source.model is not None]
+        macs = sum(model.graph.macs for model in models)
+        return Code(
+            f" * COST PER TICK. {macs} multiply-accumulates of {len(models)} network(s); of the rest about "
+            f"{self.double_operations} operations in double\n * precision. Constants beside those of the networks "
+            f"{self.tables.bytes} bytes. The number of operations is the same at\n * every tick, but for parts of the "
+            "work on a block, which are of different length."
+        )
+
+    @property
+    def double_operations(self) -> int:
+        """Of a tick, on average: + - * / each count as one."""
+        chain = self.parts.chain
+        summaries, points = self.parts.summaries, self.parts.points
+        tick = 14 * len(chain.scale) + 2 * len(chain.centre) + len(chain.level) + len(chain.moving)
+        white = sum(2 * watch.matrix.size + 5 * _memory(watch) for watch in chain.watches)
+        return tick + round((summaries * (4 * points + 12) + white) / chain.block)
+
+    def _enums(self) -> dict[str, Code]:
+        upper, parts = self.name.upper(), self.parts
+        most = C_SIGNIFICANT - len(f"{upper}_RES_")
+        inputs = zip(c_names((c.name for c in parts.inputs), most), parts.inputs, strict=True)
+        residuals = zip(c_names(parts.residuals, most), parts.residuals, strict=True)
+        watches = enumerate(parts.chain.watches)
+        return {
+            "input_enum": Code(
+                "\n".join(
+                    f"    {upper}_IN_{own} = {i}, /* {c_comment(f'{channel.unit}; {channel.description}')} */"
+                    for i, (own, channel) in enumerate(inputs)
+                )
+            ),
+            "residual_enum": Code(
+                "\n".join(
+                    f"    {upper}_RES_{own} = {i}, /* {c_comment(text)} */" for i, (own, text) in enumerate(residuals)
+                )
+            ),
+            "watch_enum": Code(
+                "\n".join(
+                    f"    {upper}_STAT_{i} = {i}, /* {watch.detector}, {watch.matrix.shape[1]} directions */"
+                    for i, watch in watches
+                )
+            ),
+        }
+
+    def _source_texts(self) -> dict[str, Code]:
+        code, calls, first = [], [], 0
+        for source in self.sources:
+            text = source.code(self.name, first)
+            code.append(text)
+            calls.append(f"{text.split('static void ')[1].split('(')[0]}(s);")
+            first += source.residuals
+        return {
+            "source_fields": indented([line for source in self.sources for line in source.fields()]),
+            "sources": Code("".join(code)),
+            "calls": indented(calls),
+            "reset_sources": indented([line for source in self.sources for line in source.reset()]),
+            "reset_networks": indented([line for source in self.sources for line in source.forget()], "        "),
+        }
+
+    def _golden_sizes(self) -> dict[str, object]:
+        chain = self.parts.chain
+        blocks = golden_blocks(chain)
+        return {
+            "golden_blocks": blocks,
+            "golden_late": blocks - JUDGED_BLOCKS // 2,
+            "golden_seed": SEED,
+            "golden_missing": MISSING,
+            "golden_shift": number(SHIFT),
+        }
+
+    def _golden(self) -> Code:
+        chain, rows = self.parts.golden_chain, self.parts.golden_residuals
+        parts = self.parts.chain
+        lines = [f"/* What {self.name} gives in Python: statistics of drawn rows, and residuals of a stretch. */"]
+        lines.append(_rows("double", "golden_statistics", chain.statistics))
+        for name, values in (("golden_alarms", chain.alarms), ("golden_since", chain.since)):
+            lines.append(f"static const int32_t {name}[{len(values)}] = {{\n{filled(map(str, values))}\n}};")
+        lines.append(_array("double", "golden_evidence", chain.evidence))
+        for name in ("centre", "spread"):
+            lines.append(_array("float", f"golden_{name}", getattr(parts, name).astype(np.float32)))
+        lines.append(_array("float", "golden_scale", parts.scale.astype(np.float32)))
+        lines.append(f"#define GOLDEN_TICKS {len(rows.inputs)}u")
+        lines.append(_rows("float", "golden_inputs", rows.inputs))
+        lines.append(_rows("float", "golden_residuals", rows.residuals))
+        lines.append(_array("float", "golden_tolerance", rows.tolerance))
+        return Code("\n".join(lines) + "\n")
+
+
+def _literal(kind: str, value: float) -> str:
+    if not np.isfinite(value):
+        return "NAN"
+    return double_number(value) if kind == "double" else number(value)
+
+
+def _array(kind: str, name: str, values: np.ndarray) -> Code:
+    return Code(f"static const {kind} {name}[{len(values)}] = {{\n{filled(_literal(kind, v) for v in values)}\n}};")
+
+
+def _rows(kind: str, name: str, rows: np.ndarray) -> Code:
+    body = ",\n".join("    {\n" + filled((_literal(kind, v) for v in row), "     ") + "}" for row in rows)
+    return Code(f"static const {kind} {name}[{len(rows)}][{rows.shape[1]}] = {{\n{body}\n}};")
+
+
+def _window(watch: WatchPart) -> int:
+    return int(watch.option) if watch.detector == "glr" else 1
+
+
+def _memory(watch: WatchPart) -> int:
+    return watch.matrix.shape[1] * _window(watch)
+
+
+def _watch_slices(watch: WatchPart) -> int:
+    """Centring, each direction, and the steps of the detector."""
+    return 1 + watch.matrix.shape[1] + _window(watch)
+
+
+def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
+    """A monitor ready to be written.
+
+    Args:
+        parts: its numbers.
+        name: prefix of its C functions and files.
+
+    Raises:
+        ExportError: the name, a detector or a network has no form in C.
+    """
+    check_name(name)
+    if len(name) > LONGEST_NAME:
+        raise ExportError(f"name '{name}' of a monitor has {len(name)} characters; at most {LONGEST_NAME} must hold")
+    _check_detectors(parts.chain.watches)
+    memory = sum(map(_memory, parts.chain.watches))
+    check_sizes({"bytes of the detectors' memory": 8 * memory, "ticks of a block": parts.chain.block}, MOST_MEMORY)
+    sources = tuple(source_code(part, place, name) for place, part in enumerate(parts.sources))
+    files = MonitorFiles(name, parts, sources)
+    return files
+
+
+def _check_detectors(watches: Sequence[WatchPart]) -> None:
+    for watch in watches:
+        if watch.detector not in DETECTORS:
+            raise ExportError(
+                f"detector '{watch.detector}' has no form in C, since it needs exponentials; these have: "
+                f"{', '.join(DETECTORS)}. Fit the monitor with one of them"
+            )
+
+
+def write_monitor(parts: MonitorParts, name: str, folder: Path) -> list[Path]:
+    """Write a monitor under `folder`, in place of the export that it holds.
+
+    Args:
+        parts: its numbers.
+        name: prefix of its C functions and files.
+        folder: made when absent.
+
+    Returns:
+        The files, the one to read first in front.
+
+    Raises:
+        ExportError: the name or a part cannot be written.
+        StorageError: the folder cannot be written.
+    """
+    texts = monitor_files(parts, name).folder_texts()
+    return write_export(folder, {file: text.encode() for file, text in texts.items()})
+
+
+def _own(path: str) -> str:
+    return resources.files("edp.export.monitor").joinpath(path).read_text(encoding="utf-8")
