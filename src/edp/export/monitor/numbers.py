@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edp.errors import ExportError
-from edp.export.c.text import array
+from edp.export.c.text import array, filled, number
 from edp.export.escape import Code
 from edp.export.hashes import little_endian
+from edp.export.monitor.parts import MonitorParts
 
 MOST_PLACES = 2**16 - 1
 """Tables of places are 16 bits wide."""
@@ -60,8 +61,6 @@ class MonitorTables:
 
     def floats(self, name: str, values: ArrayLike) -> None:
         """An array of floats, row by row."""
-        from edp.export.c.text import number
-
         numbers: NDArray[np.float32] = np.asarray(values, dtype=np.float32).ravel()
         self.lines.append(array("float", name, map(number, numbers)))
         self._other(name, numbers)
@@ -98,3 +97,37 @@ class MonitorTables:
             f"#define TABLES_CRC {self.other_crc}u",
         ]
         return Code("\n".join([*self.lines, *tables]) + "\n")
+
+
+def golden_header(name: str, monitor: MonitorParts) -> Code:
+    """What a self-test compares with, as a header."""
+    chain, rows = monitor.golden_chain, monitor.golden_residuals
+    parts = monitor.chain
+    lines = [f"/* What {name} gives in Python: statistics of drawn rows, and residuals of a stretch. */"]
+    lines.append(_rows("double", "golden_statistics", chain.statistics))
+    for array_name, values in (("golden_alarms", chain.alarms), ("golden_since", chain.since)):
+        lines.append(f"static const int32_t {array_name}[{len(values)}] = {{\n{filled(map(str, values))}\n}};")
+    lines.append(_array("double", "golden_evidence", chain.evidence))
+    for side in ("centre", "spread"):
+        lines.append(_array("float", f"golden_{side}", getattr(parts, side).astype(np.float32)))
+    lines.append(_array("float", "golden_scale", parts.scale.astype(np.float32)))
+    lines.append(f"#define GOLDEN_TICKS {len(rows.inputs)}u")
+    lines.append(_rows("float", "golden_inputs", rows.inputs))
+    lines.append(_rows("float", "golden_residuals", rows.residuals))
+    lines.append(_array("float", "golden_tolerance", rows.tolerance))
+    return Code("\n".join(lines) + "\n")
+
+
+def _literal(kind: str, value: float) -> str:
+    if not np.isfinite(value):
+        return "NAN"
+    return double_number(value) if kind == "double" else number(value)
+
+
+def _array(kind: str, name: str, values: np.ndarray) -> Code:
+    return Code(f"static const {kind} {name}[{len(values)}] = {{\n{filled(_literal(kind, v) for v in values)}\n}};")
+
+
+def _rows(kind: str, name: str, rows: np.ndarray) -> Code:
+    body = ",\n".join("    {\n" + filled((_literal(kind, v) for v in row), "     ") + "}" for row in rows)
+    return Code(f"static const {kind} {name}[{len(rows)}][{rows.shape[1]}] = {{\n{body}\n}};")

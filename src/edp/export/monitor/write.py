@@ -14,11 +14,11 @@ from edp import __version__
 from edp.errors import ExportError
 from edp.export.c.model import RUNTIME
 from edp.export.c.target import check_name, core_files
-from edp.export.c.text import filled, indented, number
+from edp.export.c.text import indented, number
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.folder import write_export
 from edp.export.monitor.golden import JUDGED_BLOCKS, MISSING, SEED, SHIFT, golden_blocks
-from edp.export.monitor.numbers import MonitorTables, double_number
+from edp.export.monitor.numbers import MonitorTables, double_number, golden_header
 from edp.export.monitor.parts import MonitorParts, WatchPart
 from edp.export.monitor.sources import SourceCode, reads_tables, source_code
 from edp.export.sizes import check_sizes
@@ -70,7 +70,7 @@ class MonitorFiles:
     def folder_texts(self) -> dict[str, str]:
         """The same with self-test, example and CMake file."""
         return self.texts() | {
-            f"{self.name}_golden.h": self._golden(),
+            f"{self.name}_golden.h": golden_header(self.name, self.parts),
             "host_test.c": self._filled("host_test.c.in"),
             "example_task.c": self._filled("example_task.c.in"),
             "CMakeLists.txt": self._filled("CMakeLists.txt.in"),
@@ -133,7 +133,8 @@ class MonitorFiles:
         )
         first = 1 + len(self.parts.residuals)
         starts = first + np.cumsum([0, *map(_watch_slices, self.parts.chain.watches)])
-        tables.text(f"static const uint32_t slices_from[{len(starts)}] = {{{', '.join(f'{s}u' for s in starts)}}};")
+        slice_text = ", ".join(f"{start}u" for start in starts.tolist())
+        tables.text(f"static const uint32_t slices_from[{len(starts)}] = {{{slice_text}}};")
 
     def _scalars(self) -> None:
         chain = self.parts.chain
@@ -187,7 +188,6 @@ class MonitorFiles:
             "slices": self.slices,
             "slices_per_tick": -(-self.slices // chain.block),
             "includes": Code("\n".join(f'#include "{file}"' for file in headers)),
-            "what": self._what(),
             "cost": self._cost(),
             "check_networks": Code(checks),
             "compiled": Code(" ".join(self.compiled)),
@@ -195,15 +195,6 @@ class MonitorFiles:
             **self._source_texts(),
             **self._golden_sizes(),
         }
-
-    def _what(self) -> Code:
-        lines = [
-            f" * Residuals, measured less expected: {len(self.parts.residuals)} of them, see below. A block gives of each its mean,"
-        ]
-        lines.append(
-            " * spread, gain and lag against the channel that it judges, and peak, at the operating point of the block."
-        )
-        return Code("\n".join(lines))
 
     def _cost(self) -> Code:
         models = [source.model for source in self.sources if source.model is not None]
@@ -276,50 +267,18 @@ class MonitorFiles:
             "golden_shift": number(SHIFT),
         }
 
-    def _golden(self) -> Code:
-        chain, rows = self.parts.golden_chain, self.parts.golden_residuals
-        parts = self.parts.chain
-        lines = [f"/* What {self.name} gives in Python: statistics of drawn rows, and residuals of a stretch. */"]
-        lines.append(_rows("double", "golden_statistics", chain.statistics))
-        for name, values in (("golden_alarms", chain.alarms), ("golden_since", chain.since)):
-            lines.append(f"static const int32_t {name}[{len(values)}] = {{\n{filled(map(str, values))}\n}};")
-        lines.append(_array("double", "golden_evidence", chain.evidence))
-        for name in ("centre", "spread"):
-            lines.append(_array("float", f"golden_{name}", getattr(parts, name).astype(np.float32)))
-        lines.append(_array("float", "golden_scale", parts.scale.astype(np.float32)))
-        lines.append(f"#define GOLDEN_TICKS {len(rows.inputs)}u")
-        lines.append(_rows("float", "golden_inputs", rows.inputs))
-        lines.append(_rows("float", "golden_residuals", rows.residuals))
-        lines.append(_array("float", "golden_tolerance", rows.tolerance))
-        return Code("\n".join(lines) + "\n")
-
-
-def _literal(kind: str, value: float) -> str:
-    if not np.isfinite(value):
-        return "NAN"
-    return double_number(value) if kind == "double" else number(value)
-
-
-def _array(kind: str, name: str, values: np.ndarray) -> Code:
-    return Code(f"static const {kind} {name}[{len(values)}] = {{\n{filled(_literal(kind, v) for v in values)}\n}};")
-
-
-def _rows(kind: str, name: str, rows: np.ndarray) -> Code:
-    body = ",\n".join("    {\n" + filled((_literal(kind, v) for v in row), "     ") + "}" for row in rows)
-    return Code(f"static const {kind} {name}[{len(rows)}][{rows.shape[1]}] = {{\n{body}\n}};")
-
 
 def _window(watch: WatchPart) -> int:
     return int(watch.option) if watch.detector == "glr" else 1
 
 
 def _memory(watch: WatchPart) -> int:
-    return watch.matrix.shape[1] * _window(watch)
+    return int(watch.matrix.shape[1]) * _window(watch)
 
 
 def _watch_slices(watch: WatchPart) -> int:
     """Centring, each direction, and the steps of the detector."""
-    return 1 + watch.matrix.shape[1] + _window(watch)
+    return 1 + int(watch.matrix.shape[1]) + _window(watch)
 
 
 def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
