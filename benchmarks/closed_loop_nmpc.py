@@ -205,10 +205,10 @@ class Stopwatch:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._controller, name)
 
-    def step(self, observation: Any, tick: int) -> Any:
+    def step(self, observation: Any, tick: int, *verdict: Any) -> Any:
         """One tick."""
         began = time.thread_time()
-        levers = self._controller.step(observation, tick)
+        levers = self._controller.step(observation, tick, *verdict)
         self.seconds.append(time.thread_time() - began)
         return levers
 

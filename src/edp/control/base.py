@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.control.geometry import AXES
+from edp.control.guard import TRUSTED, GuardVerdict
 from edp.control.limits import LoopLimits
 from edp.control.models import ControlModels
 from edp.control.plant import STROKES as STROKES
@@ -41,6 +42,15 @@ class ControlEvent:
     text: str
 
 
+def log_event(events: list[ControlEvent], tick: int, text: str) -> None:
+    """Keep an event; one that goes on is made longer, and of many the first `MOST_EVENTS` are kept."""
+    last = events[-1] if events else None
+    if last is not None and last.text == text and last.tick + last.ticks == tick:
+        events[-1] = ControlEvent(last.tick, last.ticks + 1, text)
+    elif len(events) < MOST_EVENTS:
+        events.append(ControlEvent(tick, 1, text))
+
+
 class ControlFault(Exception):
     """A controller has no answer at this tick, since a solver failed; `Controller.step` gives the safe command."""
 
@@ -52,10 +62,14 @@ class Controller(ABC):
     `levers` raises `ControlFault` or answers something that is not finite, the levers go back to neutral at the slew
     limit and an event is logged; nothing is raised in a loop. What a controller asks for is cut to the limits.
 
+    Where a guard says so (`edp.control.guard`), a channel counts as missing though it has a value, but for those of
+    `spared`, and `fallback` answers in place of `levers`.
+
     Args:
         plant: what it controls.
         limits: of its levers.
         reads: names of the measured channels without which it has no answer.
+        spared: those of them without which it has one, where a guard does not trust them.
 
     Attributes:
         events: what was logged since `reset`, at most `MOST_EVENTS`.
@@ -65,8 +79,11 @@ class Controller(ABC):
         ConfigError: the plant does not measure a channel that is read.
     """
 
-    def __init__(self, plant: PlantInterface, limits: LoopLimits, reads: tuple[str, ...]) -> None:
+    def __init__(
+        self, plant: PlantInterface, limits: LoopLimits, reads: tuple[str, ...], spared: Collection[str] = ()
+    ) -> None:
         self.plant, self.limits, self.reads = plant, limits, reads
+        self._spared = np.isin(reads, list(spared))
         self.events: list[ControlEvent] = []
         self.info: dict[str, float] = {}
         self._columns = plant.columns(reads)
@@ -86,12 +103,25 @@ class Controller(ABC):
         """Levers of a tick, shape (3,), before limits.
 
         Args:
-            measured: the channels of `reads`, finite.
+            measured: the channels of `reads`, finite; NaN where a spared one is not trusted.
             tick: row of the reference that belongs to now.
 
         Raises:
             ControlFault: there is no answer.
         """
+
+    def fallback(self, measured: Array, tick: int, reason: str) -> Array:
+        """Levers of a tick at which a guard does not trust the controller's model; arguments and shape of `levers`.
+
+        Args:
+            measured: the channels of `reads`, finite; NaN where a spared one is not trusted.
+            tick: row of the reference that belongs to now.
+            reason: of the guard, for the log.
+
+        Raises:
+            ControlFault: it has no answer without its model.
+        """
+        raise ControlFault(f"it has no fallback where a guard asks for one{f' ({reason})' if reason else ''}")
 
     def missed(self, tick: int) -> None:
         """Called at each tick at which the safe command is given; a controller with memory brings it up to date."""
@@ -127,32 +157,43 @@ class Controller(ABC):
         self._before = np.zeros(AXES)
         self.begin(measured, reference)
 
-    def step(self, observation: Array, tick: int) -> Array:
+    def step(self, observation: Array, tick: int, verdict: GuardVerdict = TRUSTED) -> Array:
         """Levers to apply from now to the next tick, shape (3,), within the limits; never raises.
 
         Args:
             observation: SI values in the order of the plant's channels; NaN where one is missing.
             tick: row of the reference that belongs to now.
+            verdict: what a guard says of this tick.
         """
-        asked, fault = self._asked(observation, tick)
+        asked, fault = self._asked(observation, tick, verdict)
         if fault:
             self._log(tick, fault)
             self.missed(tick)
         self._before = self.limits.applied(asked, self._before, self.plant.rate_hz)
         return self._before.copy()
 
-    def _asked(self, observation: Array, tick: int) -> tuple[Array, str]:
+    def _asked(self, observation: Array, tick: int, verdict: GuardVerdict) -> tuple[Array, str]:
         """Levers before limits, and the fault for which they are neutral; empty without one."""
         values = np.asarray(observation, float)
         neutral = np.zeros(AXES)
         if values.shape != (len(self.plant.channels),):
             return neutral, f"an observation of shape {values.shape} came for {len(self.plant.channels)} channels"
         measured = values[self._columns]
-        finite = np.isfinite(measured)
-        if not finite.all():
-            return neutral, f"{self.reads[int(np.argmin(finite))]} is missing: spools to neutral"
+        lacking = ~np.isfinite(measured)
+        if verdict.untrusted:
+            doubted = np.isin(self.reads, list(verdict.untrusted))
+            needed = doubted & ~self._spared
+            if needed.any():
+                return neutral, f"{self.reads[int(np.argmax(needed))]} is not trusted: spools to neutral"
+            # A spared channel that a guard does not trust may be missing, too.
+            measured[doubted], lacking = np.nan, lacking & ~doubted
+        if lacking.any():
+            return neutral, f"{self.reads[int(np.argmax(lacking))]} is missing: spools to neutral"
         try:
-            levers = np.asarray(self.levers(measured, tick), float)
+            if verdict.fall_back:
+                levers = np.asarray(self.fallback(measured, tick, verdict.reason), float)
+            else:
+                levers = np.asarray(self.levers(measured, tick), float)
         except (ControlFault, EdpError, ArithmeticError, np.linalg.LinAlgError) as error:
             return neutral, f"no answer ({error}): spools to neutral"
         if levers.shape != (AXES,) or not np.isfinite(levers).all():
@@ -160,12 +201,8 @@ class Controller(ABC):
         return levers, ""
 
     def _log(self, tick: int, text: str) -> None:
-        """Keep an event; one that goes on is made longer."""
-        last = self.events[-1] if self.events else None
-        if last is not None and last.text == text and last.tick + last.ticks == tick:
-            self.events[-1] = ControlEvent(last.tick, last.ticks + 1, text)
-        elif len(self.events) < MOST_EVENTS:
-            self.events.append(ControlEvent(tick, 1, text))
+        """See `log_event`."""
+        log_event(self.events, tick, text)
 
 
 class ControllerSpec(Protocol):

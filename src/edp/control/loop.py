@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.control.base import ControlEvent, Controller
+from edp.control.base import ControlEvent, Controller, log_event
 from edp.control.geometry import AXES, TipGeometry
+from edp.control.guard import TRUSTED, LoopGuard, verdict_of
 from edp.control.plant import STROKES
 from edp.control.score import LoopScore, LoopTrace, scored
 from edp.control.tasks.base import ControlTask
@@ -42,6 +43,7 @@ class LoopResult:
         events: what the controller logged.
         solve_s: time of each step of the controller, shape (ticks,), s.
         infos: figures that the controller gave, by name, shape (ticks,) each; NaN where it gave none.
+        warnings: what the guard said, but for ticks at which nothing was wrong.
     """
 
     recording: Recording
@@ -49,6 +51,7 @@ class LoopResult:
     events: tuple[ControlEvent, ...]
     solve_s: Array
     infos: Mapping[str, Array]
+    warnings: tuple[ControlEvent, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,7 @@ def run_loop(
     task: ControlTask,
     seed: int,
     options: Mapping[str, Any] | None = None,
+    guard: LoopGuard | None = None,
 ) -> LoopResult:
     """Run a controller on a plant along a task.
 
@@ -77,6 +81,7 @@ def run_loop(
         task: reference and limits.
         seed: of the environment.
         options: further options of the environment's reset.
+        guard: what says at each tick which channels the controller may read, and whether it has to fall back.
 
     Raises:
         ConfigError: the environment and the controller do not fit, or a channel is missing at the start.
@@ -90,18 +95,38 @@ def run_loop(
         )
     controller.reset(np.asarray(observation, float), reference)
     names = tuple(name for name in (*STROKES, *TIP, *PUMPS, *OTHERS, *GROUND_CHANNELS) if name in info["truth"])
-    rows, infos = _driven(env, controller, reference.ticks, names, (observation, info))
+    if guard is not None:
+        guard.reset(controller.plant)
+    watched = _Watched(controller, guard)
+    rows, infos = _driven(env, watched, reference.ticks, names, (observation, info))
     trace = _trace(rows, names, geometry, controller)
     score = scored(trace, reference, task.limits, sum(event.ticks for event in controller.events))
     recording = _recorded(rows, names, task, controller)
-    return LoopResult(recording, score, tuple(controller.events), rows.solve_s, infos)
+    return LoopResult(recording, score, tuple(controller.events), rows.solve_s, infos, tuple(watched.warnings))
+
+
+class _Watched:
+    """A controller and what guards it."""
+
+    def __init__(self, controller: Controller, guard: LoopGuard | None) -> None:
+        self.controller, self._guard = controller, guard
+        self.warnings: list[ControlEvent] = []
+
+    def step(self, observation: Array, tick: int) -> tuple[Array, float]:
+        """Levers of a tick, and the time (s) that the controller took, without the guard's."""
+        verdict = TRUSTED if self._guard is None else verdict_of(self._guard, self.controller.plant, observation)
+        if verdict.untrusted or verdict.fall_back:
+            log_event(self.warnings, tick, str(verdict))
+        before = time.perf_counter()
+        levers = self.controller.step(observation, tick, verdict)
+        return levers, time.perf_counter() - before
 
 
 def _driven(
-    env: Any, controller: Controller, ticks: int, names: tuple[str, ...], start: tuple[Any, Mapping[str, Any]]
+    env: Any, watched: _Watched, ticks: int, names: tuple[str, ...], start: tuple[Any, Mapping[str, Any]]
 ) -> tuple[_Rows, dict[str, Array]]:
     """Run tick by tick from an observation and its info; ends early where the plant does."""
-    observation, info = start
+    (observation, info), controller = start, watched.controller
     observed, truth = np.zeros((ticks, len(controller.plant.channels))), np.zeros((ticks, len(names)))
     levers, solve_s = np.zeros((ticks, AXES)), np.zeros(ticks)
     infos: dict[str, Array] = {}
@@ -109,9 +134,7 @@ def _driven(
     for tick in range(ticks):
         observed[tick] = observation
         truth[tick] = [info["truth"][name] for name in names]
-        before = time.perf_counter()
-        levers[tick] = controller.step(observed[tick], tick)
-        solve_s[tick] = time.perf_counter() - before
+        levers[tick], solve_s[tick] = watched.step(observed[tick], tick)
         for name, value in controller.info.items():
             infos.setdefault(name, np.full(ticks, np.nan))[tick] = value
         observation, _, terminated, truncated, info = env.step(levers[tick].astype(np.float32))

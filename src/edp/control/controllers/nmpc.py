@@ -59,7 +59,8 @@ class PredictiveControl:
         trust_m_s: most by which a tick may change a speed of the plan: linear models hold near it only.
         window_s: time over which the twin's predictions are compared with what came, for the disturbance.
         smoothing: share of a new error that the disturbance takes over in a tick; 0: offsets stay.
-        fallback: whether a PI loop answers where the program has no solution; otherwise the levers go to neutral.
+        fallback: whether a PI loop answers where the program has no solution, or a guard asks for it; otherwise the
+            levers go to neutral.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("twin", "valve_map")
@@ -118,7 +119,8 @@ class NmpcController(Controller):
         valves: SpeedToLever,
         fallback: PiController | None,
     ) -> None:
-        super().__init__(model.plant, limits, model.reads)
+        # Ports of the twin that nothing measures run free, so that the plan goes on without any one channel.
+        super().__init__(model.plant, limits, model.reads, spared=model.reads)
         self.spec, self.model, self._valves, self._fallback = spec, model, valves, fallback
         self._daqp = _daqp()
         self._moves, self._table = Moves(spec.blocks), TipTable(model.plant.geometry)
@@ -154,21 +156,41 @@ class NmpcController(Controller):
 
     def levers(self, measured: Array, tick: int) -> Array:
         """Levers of the first block of the plan, or those of the PI loop where there is none."""
+        spare = self._followed(measured, tick)
+        try:
+            self._improve(measured, tick)
+        except ControlFault as fault:
+            return self._given_up(spare, tick, fault)
+        return self._valves.levers(self._latest)
+
+    def fallback(self, measured: Array, tick: int, reason: str) -> Array:
+        """Levers of the PI loop, while the twin's memory follows."""
+        fault = ControlFault(f"a guard does not trust the model{f' ({reason})' if reason else ''}")
+        return self._given_up(self._followed(measured, tick), tick, fault)
+
+    def _followed(self, measured: Array, tick: int) -> Array | None:
+        """Bring twin, disturbance and PI loop up to date; levers of the latter, None where it has none."""
         if self._row is not None:
             # After the limits: what was given, not what was asked for.
             self.model.advance(self._row, self.before)
         self._row, self._tick = measured, tick
         self.model.look_back(measured)
-        spare = None if self._fallback is None else self._fallback.levers(measured[self._stroke_columns], tick)
-        try:
-            self._improve(measured, tick)
-        except ControlFault as fault:
-            self._speeds[:], self._latest[:] = 0.0, 0.0
-            if spare is None:
-                raise
-            self._log(tick, f"{fault}: the PI loop answers")
-            return spare
-        return self._valves.levers(self._latest)
+        strokes = measured[self._stroke_columns]
+        if self._fallback is None or not np.isfinite(strokes).all():
+            return None
+        return self._fallback.levers(strokes, tick)
+
+    def _given_up(self, spare: Array | None, tick: int, fault: ControlFault) -> Array:
+        """Forget the plan; what the PI loop says.
+
+        Raises:
+            ControlFault: `fault`, where it says nothing.
+        """
+        self._speeds[:], self._latest[:] = 0.0, 0.0
+        if spare is None:
+            raise fault
+        self._log(tick, f"{fault}: the PI loop answers")
+        return spare
 
     @property
     def memory(self) -> Array:

@@ -97,3 +97,7 @@ class PiController(Controller):
         total = self._sum + self.spec.integral * error / self.plant.rate_hz
         self._sum = np.where(free, np.clip(total, -MOST_SUM, MOST_SUM), self._sum)
         return asked
+
+    def fallback(self, measured: Array, tick: int, reason: str) -> Array:
+        """It has no model, and goes on."""
+        return self.levers(measured, tick)

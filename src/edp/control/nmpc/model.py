@@ -70,13 +70,13 @@ class TwinModel:
         self._past.clear()
 
     def row(self, measured: Array) -> NDArray[np.float32]:
-        """A row of the twin's answers from one of `reads`, NaN where the plant measures nothing."""
+        """A row of the twin's answers from one of `reads`, NaN where nothing is measured, or not to be trusted."""
         row = self._free.copy()
         row[self._ports] = measured
         return row
 
     def look_back(self, measured: Array) -> None:
-        """Bring the disturbance up to date with this row of `reads`."""
+        """Bring the disturbance up to date with this row of `reads`; where a stroke is NaN, its part stays."""
         if len(self._past) < self.window or not self.smoothing:
             return
         state, row, _ = self._past[0]
@@ -84,6 +84,7 @@ class TwinModel:
         answers = self._runner.branches(commands[None], state, row, self._alone)
         missed = self.row(measured)[self._strokes] - answers[0, -1, self._strokes]
         speed = missed * self.plant.rate_hz / self.window
+        speed = np.where(np.isfinite(speed), speed, self.disturbance)
         self.disturbance = self.disturbance + self.smoothing * (speed - self.disturbance)
 
     def predicted(self, levers: Array, measured: Array, first: NDArray[np.int64]) -> tuple[Array, Array]:

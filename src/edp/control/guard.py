@@ -1,0 +1,89 @@
+"""What a loop asks beside its controller: which channels are not to be trusted, and whether to fall back.
+
+A monitor is such a guard. A loop knows no more of it than `LoopGuard` says: any object with its two methods will do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.plant import PlantInterface
+from edp.errors import ConfigError, EdpError, closest
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GuardVerdict:
+    """What a guard says of a tick.
+
+    Attributes:
+        untrusted: names of measured channels whose values controllers must not read.
+        fall_back: whether the model of the controller is not to be trusted, so that its fallback has to answer.
+        reason: for the log; one short sentence without a full stop.
+    """
+
+    untrusted: frozenset[str] = frozenset()
+    fall_back: bool = False
+    reason: str = ""
+
+    def __str__(self) -> str:
+        parts = [f"not trusted: {', '.join(sorted(self.untrusted))}"] if self.untrusted else []
+        parts += ["fall back"] if self.fall_back else []
+        return "; ".join(parts) + (f" ({self.reason})" if self.reason else "")
+
+
+TRUSTED = GuardVerdict()
+"""Nothing is wrong."""
+
+
+class LoopGuard(Protocol):
+    """Watches a loop and says at each tick what its controller may rely on.
+
+    A guard decides alone, hysteresis included: what it says holds for one tick. It sees a tick before the controller
+    does, so that no value is acted on which it has just refused.
+    """
+
+    def reset(self, plant: PlantInterface) -> None:
+        """Begin with a loop.
+
+        Args:
+            plant: names, units and rate of what `step` will get.
+
+        Raises:
+            ConfigError: it cannot guard this plant.
+        """
+        ...
+
+    def step(self, observation: Array) -> GuardVerdict:
+        """What holds for this tick.
+
+        Args:
+            observation: SI values in the order of ``plant.channels``, pilot pressures of the tick before among them
+                where the plant measures them; NaN where one is missing; read-only.
+        """
+        ...
+
+
+def verdict_of(guard: LoopGuard, plant: PlantInterface, observation: Array) -> GuardVerdict:
+    """The verdict of a tick; a guard that fails, or names a channel that the plant does not measure, falls back.
+
+    Args:
+        guard: that is asked.
+        plant: that it was reset for.
+        observation: SI values in the order of the plant's channels.
+    """
+    shown = np.asarray(observation).view()
+    shown.flags.writeable = False
+    try:
+        verdict = guard.step(shown)
+        measured = {channel.name for channel in plant.channels}
+        for name in sorted(verdict.untrusted - measured):
+            raise ConfigError(f"it names '{name}', which {plant.source} does not measure{closest(name, measured)}")
+    except (EdpError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return GuardVerdict(fall_back=True, reason=f"the guard failed: {error}")
+    return verdict
