@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 
@@ -44,22 +45,19 @@ class MonitorFiles:
         name: C prefix.
         parts: its numbers.
         sources: of its residuals, as C.
-        tables: its constants.
     """
 
     name: str
     parts: MonitorParts
     sources: tuple[SourceCode, ...]
-    tables: MonitorTables = field(default_factory=MonitorTables)
 
     def texts(self) -> dict[str, str]:
         """Every file by name, the one to read first in front."""
         name = self.name
-        numbers = self._numbers()
         texts: dict[str, str] = {
             f"{name}.h": self._filled("monitor.h.in"),
             f"{name}.c": self._filled("monitor.c.in"),
-            f"{name}_numbers.h": numbers,
+            f"{name}_numbers.h": self._numbers(),
         }
         texts |= {file: _own(f"runtime/{file}") for file in OWN}
         texts |= {file: resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text() for file in RUNTIME}
@@ -89,7 +87,13 @@ class MonitorFiles:
         return 2 + len(self.parts.residuals) + sum(map(_watch_slices, self.parts.chain.watches))
 
     def _numbers(self) -> Code:
-        chain, tables = self.parts.chain, self.tables
+        head = f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */\n"
+        return Code(head + self.tables.finished())
+
+    @cached_property
+    def tables(self) -> MonitorTables:
+        """The constants."""
+        chain, tables = self.parts.chain, MonitorTables()
         low, high = (chain.centre + side * LIMIT * chain.spread for side in (-1.0, 1.0))
         tables.floats("input_low", np.clip(low, -LARGEST, LARGEST))
         tables.floats("input_high", np.clip(high, -LARGEST, LARGEST))
@@ -103,17 +107,14 @@ class MonitorFiles:
         sizes = (chain.block, len(chain.centre), len(chain.scale), len(chain.level), len(chain.moving))
         named = ", ".join([*(f"{size}u" for size in sizes), "centre, spread, scale, change, channel, level, moving"])
         tables.text(f"static const edp_blocks blocks = {{{named}}};")
-        tables.doubles("point_offset", chain.point_offset)
-        tables.doubles("point_width", chain.point_width)
-        for name in ("usual", "wide", "least"):
+        for name in ("point_offset", "point_width", "usual", "wide", "least"):
             tables.doubles(name, getattr(chain, name))
-        self._watches()
-        self._scalars()
-        head = f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */\n"
-        return Code(head + tables.finished())
+        self._enter_watches(tables)
+        self._enter_scalars(tables)
+        return tables
 
-    def _watches(self) -> None:
-        tables, rows = self.tables, []
+    def _enter_watches(self, tables: MonitorTables) -> None:
+        rows = []
         for place, watch in enumerate(self.parts.chain.watches):
             tables.doubles(f"mean_{place}", watch.mean)
             matrix = np.ascontiguousarray(watch.matrix.T)
@@ -136,7 +137,7 @@ class MonitorFiles:
         slice_text = ", ".join(f"{start}u" for start in starts.tolist())
         tables.text(f"static const uint32_t slices_from[{len(starts)}] = {{{slice_text}}};")
 
-    def _scalars(self) -> None:
+    def _enter_scalars(self, tables: MonitorTables) -> None:
         chain = self.parts.chain
         scalars = {
             "POINT_LIMIT": chain.point_limit,
@@ -147,9 +148,9 @@ class MonitorFiles:
             "QUIET": chain.quiet,
         }
         for name, value in scalars.items():
-            self.tables.text(f"#define {name} {double_number(value)}")
-        self.tables.text(f"#define POINTS {self.parts.points}u")
-        self.tables.text(f"#define BLOCK_S {number(chain.block / self.parts.rate_hz)}")
+            tables.text(f"#define {name} {double_number(value)}")
+        tables.text(f"#define POINTS {self.parts.points}u")
+        tables.text(f"#define BLOCK_S {number(chain.block / self.parts.rate_hz)}")
 
     def _filled(self, template: str) -> Code:
         return fill(_own(f"templates/{template}"), self._values())
