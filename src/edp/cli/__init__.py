@@ -22,6 +22,7 @@ from edp.cli import (
     footprint,
     identify,
     inspect,
+    monitor,
     parity,
     pretrain,
     quantise,
@@ -65,6 +66,7 @@ app.command("pretrain")(pretrain.pretrain)
 app.command("finetune")(finetune.finetune)
 app.command("adapt")(adapt.adapt)
 app.command("replay")(adapt.replay)
+app.add_typer(monitor.app, name="monitor")
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)
 app.command("parity")(parity.parity)

@@ -1,0 +1,124 @@
+"""``edp monitor``: fit a monitor to healthy logs of a machine, and watch logs with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+# Scripts can tell alarms by the exit code.
+ALARMS = 5
+MOST_SHOWN = 50
+"""Alarms that are printed; the file has all."""
+
+app = typer.Typer(
+    name="monitor",
+    help="Watch a machine for faults of it and of its sensors, with a promised rate of false alarms.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+)
+
+
+@app.command("fit")
+def fit(
+    arguments: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[RUN]... HEALTHY_LOGS", help="Run folders of this machine, if any; last, healthy logs."
+        ),
+    ],
+    folder: Annotated[Path, typer.Option("--out", help="Folder of the monitor.")],
+    hours: Annotated[
+        float | None, typer.Option("--hours-per-false-alarm", help="Operating hours to one false alarm; default: 8.")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(help="Processor time of its networks, about; default: 6.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
+    changes: Annotated[list[str], typer.Option("--set", help="One setting, for example chain.block_s=2.")] = [],  # noqa: B006
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Fit a monitor: what each channel should read is learned from healthy logs, and so is when to raise an alarm.
+
+    Healthy logs are divided by sessions: some train, the others say how widely a healthy machine scatters and set the
+    limit. Hours that are too few for the promise are refused, with the rate that they support.
+
+    Example: `edp monitor fit runs/m22 logs/healthy --out monitors/m22`
+    """
+    from edp.config.monitor import load_monitor_experiment
+    from edp.workflows.monitor import fit_monitor
+
+    options: dict[str, Any] = {} if hours is None else {"hours_per_false_alarm": hours}
+    options |= {} if minutes is None else {"minutes": minutes}
+    experiment = load_monitor_experiment(config, changes, options)
+    *runs, logs = arguments
+    with progress(as_json) as shown:
+        bar, steps = shown.add_task("monitor", total=None, note="reading recordings"), Steps(as_json)
+
+        def note(text: str) -> None:
+            shown.update(bar, note=text)
+            steps.say(f"monitor: {text}", force=True)
+
+        fitted = fit_monitor(runs, source_of(logs, signal_map, repair), experiment, folder, note)
+    monitor = fitted.monitor
+    facts = {
+        "monitor": str(folder),
+        "seconds": fitted.seconds,
+        "residuals": list(monitor.residual_names),
+        "doubtful": list(fitted.doubtful),
+        "promise": monitor.limit.sentence(),
+    }
+
+    def show() -> None:
+        for name in fitted.doubtful:
+            out.print(f"'{name}' was left out: it lies far from all other healthy sessions; look into it")
+        out.print(f"{len(monitor.residual_names)} residuals of {len(monitor.channels)} channels are watched")
+        out.print(monitor.limit.sentence())
+        out.print(f"fitted in {duration(fitted.seconds)} of processor time; monitor in {folder}")
+        out.print(f"next: edp monitor run {folder} LOGS")
+
+    emit(as_json, facts, show)
+
+
+@app.command("run")
+def run(
+    folder: Annotated[Path, typer.Argument(metavar="MONITOR", help="Folder that edp monitor fit wrote.")],
+    logs: Annotated[Path, typer.Argument(metavar="LOGS", help="A log, a folder of logs, or a data-set file (.toml).")],
+    file: Annotated[
+        Path | None, typer.Option("--out", help="File for the alarms (JSON lines); a CSV file comes beside it.")
+    ] = None,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Watch logs: every alarm with when, since when, and what deviates; exit code 5 where there was one.
+
+    Channels that a log lacks are silent with all that reads them, which is said. A log of another machine is refused.
+
+    Example: `edp monitor run monitors/m22 logs/today --out alarms.jsonl`
+    """
+    from edp.workflows.monitor import run_monitor
+
+    with progress(as_json) as shown:
+        on_recording = counted(shown, Steps(as_json), "monitor", "recordings watched")
+        watched = run_monitor(folder, source_of(logs, signal_map, repair), file, on_recording)
+
+    def show() -> None:
+        for name, channels in watched.silent.items():
+            out.print(f"'{name}' lacks {', '.join(channels)}: what judges or reads these channels is silent")
+        rows = [[a.recording, f"{a.raised_s:g}", f"{a.since_s:g}", a.severity, a.sentence] for a in watched.alarms]
+        if rows:
+            table("alarms", ["", "raised, s", "since, s", "severity", ""], rows[:MOST_SHOWN])
+        if len(rows) > MOST_SHOWN:
+            out.print(f"and {len(rows) - MOST_SHOWN:,} more")
+        out.print(f"{len(rows):,} alarms in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
+        if file is not None:
+            out.print(f"alarms in {file} and {file.with_suffix('.csv')}")
+
+    emit(as_json, {"file": file and str(file), **watched.to_json()}, show)
+    if watched.alarms:
+        raise typer.Exit(ALARMS)

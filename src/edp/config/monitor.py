@@ -1,0 +1,95 @@
+"""The settings of a monitor: TOML in, validated specs out, as those of an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tomli_w
+
+from edp.errors import ConfigError
+from edp.monitor.detectors import DETECTORS
+from edp.monitor.fitting import ChainSpec
+from edp.monitor.residuals import RESIDUALS, ResidualSpec
+from edp.monitor.residuals.balances import BalancesSpec
+from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
+from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count
+from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+
+MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS}, what="settings")
+
+
+def default_residuals() -> tuple[ResidualSpec, ...]:
+    """Sources that need no settings; what a machine does not offer gives none."""
+    return VirtualSensorsSpec(), BalancesSpec()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonitorExperiment:
+    """Everything that settles a monitor.
+
+    Attributes:
+        residuals: sources, each a registered part.
+        chain: from residuals to alarms.
+        channels: names of the channels that are watched; empty takes all that sensors can give.
+        groups: names of channels that virtual sensors judge together; empty where names and kinds are to tell.
+        hours_per_false_alarm: operating hours to one false alarm that are promised.
+        train_share: share of the healthy sessions that residuals are fitted to; the others set conditioning and limit.
+        minutes: processor time that fits of networks may take, about.
+        seed: root of every random choice.
+
+    Raises:
+        ConfigError: a value is out of its bounds, or nothing would be watched.
+    """
+
+    residuals: tuple[ResidualSpec, ...] = field(default_factory=default_residuals)
+    chain: ChainSpec = field(default_factory=ChainSpec)
+    channels: tuple[str, ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
+    hours_per_false_alarm: float = 8.0
+    train_share: float = 0.35
+    minutes: float = 6.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "monitor",
+            self,
+            hours_per_false_alarm=above(0.0, 1e6),
+            train_share=between(0.0, 1.0),
+            minutes=above(0.0, 1e5),
+            seed=SEED,
+        )
+        check_count("monitor", "channels", self.channels, MOST_NAMES)
+        check_count("monitor", "groups", self.groups, MOST_NAMES)
+        check_count("monitor", "residuals", self.residuals, 16, least=1)
+        kinds = [RESIDUALS.name_of(part) for part in self.residuals]
+        if len(set(kinds)) < len(kinds):
+            raise ConfigError(f"monitor: residuals = {kinds}; name each source once")
+
+
+def load_monitor_experiment(
+    path: str | Path | None = None, overrides: Sequence[str] = (), options: Table | None = None
+) -> MonitorExperiment:
+    """Settings from a TOML file, changed by options of the command and ``key.path=value`` overrides.
+
+    Args:
+        path: settings file.
+        overrides: each ``key.path=value``; they go before options.
+        options: plain values of options that were given, by key.
+
+    Raises:
+        ConfigError: names every unknown key, wrong type and impossible value at once.
+    """
+    table: Table = {} if path is None else read_toml(path)
+    table = merged(table, options or {})
+    for text in overrides:
+        table = merged(table, override(text))
+    where = "of a monitor" if path is None else f"'{path}'"
+    return MONITOR_SETTINGS.build(MonitorExperiment, table, where + (" with --set" if overrides else ""))
+
+
+def monitor_toml(experiment: MonitorExperiment) -> str:
+    """The whole settings as TOML, defaults included: what a monitor's folder keeps."""
+    return tomli_w.dumps(MONITOR_SETTINGS.plain(experiment))

@@ -1,0 +1,65 @@
+"""What an alarm says: when, since when, by how much, and by whom it was raised; causes are named by a diagnosis."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+SEVERITIES = ("note", "warning", "stop")
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What may be wrong.
+
+    Attributes:
+        kind: of the fault.
+        site: where it sits.
+        size: estimate of it, in `unit`; None where there is none.
+        unit: of the size.
+        probability: 0 to 1.
+        place: ``sensor`` or ``machine``; empty where that is not known.
+    """
+
+    kind: str
+    site: str = ""
+    size: float | None = None
+    unit: str = ""
+    probability: float = 0.0
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class MonitorAlarm:
+    """One alarm of a monitor.
+
+    Attributes:
+        recording: that it was raised in; empty in a stream.
+        raised_s: end of the block at which the statistic passed its limit, s from the start.
+        since_s: estimate of the onset: end of the last block at which the statistic was at a healthy level.
+        detector: name of the detector that raised it.
+        statistic: over the scale of its watch.
+        limit: that it passed.
+        evidence: names of summaries with their mean conditioned deviation since `since_s`, in healthy standard
+            deviations, the largest first.
+        causes: the most probable first; empty without a diagnosis.
+        sentence: all of this for a reader.
+        severity: one of `SEVERITIES`.
+    """
+
+    recording: str
+    raised_s: float
+    since_s: float
+    detector: str
+    statistic: float
+    limit: float
+    evidence: tuple[tuple[str, float], ...]
+    causes: tuple[Cause, ...] = ()
+    sentence: str = ""
+    severity: str = "warning"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON values, keys as the fields."""
+        plain = asdict(self)
+        plain["evidence"] = [[name, value] for name, value in self.evidence]
+        return plain

@@ -1,0 +1,227 @@
+"""From residuals and raw channels at every tick to statistics at every block: sums, conditioning, views, detectors.
+
+All arithmetic is + - * / sqrt and comparisons in double precision in a fixed order, so that C gives the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.monitor.adaptation import Drift
+from edp.monitor.conditioning import Conditioning
+from edp.monitor.detectors.base import DETECTORS, Detector
+from edp.monitor.summaries import BlockSummaries, SummaryState
+from edp.monitor.watches import BankSpec, Watch
+from edp.settings.tree import SettingsTree
+
+Array = NDArray[np.float64]
+MOST_SUMMARIES = 5_000
+MOST_WATCHES = 16
+_TREE = SettingsTree({"detector": DETECTORS}, what="monitor")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Form:
+    detector: Any
+
+
+@dataclass(eq=False)
+class ChainState:
+    """All that a chain remembers of one machine.
+
+    Attributes:
+        summary: sums of the block that has begun.
+        blocks: that have ended since the start.
+        drift: what was learned of slow changes, shape (summaries,).
+        bank: detectors at work; None before the first block. They change in place: copy the state to branch off.
+        since: blocks that had ended when the statistic was last at a healthy level.
+        sums: of the conditioned rows since then, shape (summaries,); `counts` of them that were there.
+        counts: see `sums`.
+    """
+
+    summary: SummaryState
+    blocks: int
+    drift: Array
+    bank: Detector
+    since: int
+    sums: Array
+    counts: Array
+
+
+@dataclass(frozen=True)
+class BlockVerdict:
+    """What one block gave.
+
+    Attributes:
+        block: its number from the start.
+        statistics: of each watch over its scale.
+        row: conditioned summaries, NaN where missing.
+        alarm: place of the watch that passed the limit, None without an alarm.
+        since: block after which the deviation began.
+        evidence: mean conditioned deviation since then, shape (summaries,).
+    """
+
+    block: int
+    statistics: tuple[float, ...]
+    row: Array
+    alarm: int | None
+    since: int
+    evidence: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """The fitted chain.
+
+    Attributes:
+        summaries: of blocks.
+        conditioning: on the operating point.
+        drift: slow changes that are followed.
+        watches: views and their detectors.
+        limit: for the largest statistic over its scale.
+        quiet: below which the largest statistic is at a healthy level.
+        settle: blocks after a start that are not watched.
+    """
+
+    summaries: BlockSummaries
+    conditioning: Conditioning
+    drift: Drift
+    watches: tuple[Watch, ...]
+    limit: float
+    quiet: float
+    settle: int
+
+    @property
+    def bank(self) -> BankSpec:
+        """All watches as one detector."""
+        return BankSpec(self.watches)
+
+    def initial_state(self) -> ChainState:
+        """Before the first tick of one machine."""
+        width, directions = self.summaries.width, sum(watch.directions for watch in self.watches)
+        none = np.zeros(width)
+        bank = self.bank.build(directions)
+        return ChainState(self.summaries.initial_state(), 0, none, bank, 0, none.copy(), none.copy())
+
+    def conditioned(self, residuals: NDArray[Any], rows: NDArray[Any], state: ChainState) -> tuple[Array, ChainState]:
+        """Conditioned rows of the blocks that end within a stretch, with drift taken off, shape (blocks, summaries)."""
+        raw, points, summary = self.summaries.run(residuals, rows, state.summary)
+        z = self.conditioning(raw, points)
+        z[: max(0, self.settle - state.blocks)] = np.nan
+        z, drift = self.drift.run(z, state.drift)
+        state = replace(state, summary=summary, drift=drift, blocks=state.blocks + len(z))
+        return z, state
+
+    def run(
+        self, residuals: NDArray[Any], rows: NDArray[Any], state: ChainState
+    ) -> tuple[list[BlockVerdict], ChainState]:
+        """Verdicts of the blocks that end within a stretch of one machine.
+
+        Args:
+            residuals: shape (ticks, residuals), NaN where not available.
+            rows: raw inputs, shape (ticks, inputs).
+            state: before it; its detectors go on in place.
+
+        Returns:
+            A verdict a block, and the state behind the stretch.
+        """
+        first = state.blocks
+        z, state = self.conditioned(residuals, rows, state)
+        verdicts = []
+        white = self.bank.white(z)
+        for place, (row, seen) in enumerate(zip(z, white, strict=True)):
+            number = first + place + 1
+            if number <= self.settle:
+                state.since = number
+                verdicts.append(BlockVerdict(number, (0.0,) * len(self.watches), row, None, number, np.zeros(len(row))))
+                continue
+            verdicts.append(self._judged(number, row, seen, state))
+        return verdicts, state
+
+    def _judged(self, number: int, row: Array, seen: Array, state: ChainState) -> BlockVerdict:
+        largest = float(state.bank.step(seen[None])[0])
+        each: Array = state.bank.each[:, 0].copy()  # type: ignore[attr-defined]
+        there = np.isfinite(row)
+        state.sums = state.sums + np.where(there, row, 0.0)
+        state.counts = state.counts + there
+        evidence = np.where(state.counts > 0.0, state.sums / np.maximum(state.counts, 1.0), 0.0)
+        alarm = int(each.argmax()) if largest > self.limit else None
+        verdict = BlockVerdict(number, tuple(each.tolist()), row, alarm, state.since, evidence)
+        if alarm is not None:
+            state.bank.reset()
+        if alarm is not None or largest <= self.quiet:
+            state.since, state.sums, state.counts = number, np.zeros(len(row)), np.zeros(len(row))
+        return verdict
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values of its file."""
+        return {
+            "summaries": self.summaries.to_plain(),
+            "clip": self.conditioning.clip,
+            "drift": self.drift.to_plain(),
+            "watches": [
+                {"detector": _TREE.plain(watch.detector, "detector"), "scale": watch.scale} for watch in self.watches
+            ],
+            "limit": self.limit,
+            "quiet": self.quiet,
+            "settle": self.settle,
+        }
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Numbers of its file."""
+        named: dict[str, NDArray[Any]] = {f"summaries.{k}": v for k, v in self.summaries.arrays().items()}
+        named |= {f"conditioning.{name}": values for name, values in self.conditioning.arrays().items()}
+        for place, watch in enumerate(self.watches):
+            named |= {f"watch.{place}.mean": watch.mean, f"watch.{place}.matrix": watch.matrix}
+        return named
+
+    @staticmethod
+    def of(plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Chain:
+        """From plain values and arrays.
+
+        Raises:
+            ValueError: values that cannot be; files are data from outside.
+        """
+        parts = {
+            part: {k.removeprefix(f"{part}."): v for k, v in arrays.items() if k.startswith(f"{part}.")}
+            for part in ("summaries", "conditioning")
+        }
+        summaries = BlockSummaries.of(plain["summaries"], parts["summaries"])
+        if summaries.width > MOST_SUMMARIES:
+            raise ValueError(f"it has {summaries.width} summaries; at most {MOST_SUMMARIES} must hold")
+        clip = _number(plain["clip"], "clip")
+        conditioning = Conditioning.of(parts["conditioning"], clip, summaries.width, summaries.points)
+        watches = _watches(plain["watches"], arrays, summaries.width)
+        settle = plain["settle"]
+        if isinstance(settle, bool) or not isinstance(settle, int) or not 0 <= settle <= 1_000_000:
+            raise ValueError(f"settle is {str(settle)[:40]}; an integer from 0 to 1,000,000 must hold")
+        limit, quiet = _number(plain["limit"], "limit"), _number(plain["quiet"], "quiet")
+        return Chain(summaries, conditioning, Drift.of(plain["drift"]), watches, limit, quiet, settle)
+
+
+def _watches(entries: Sequence[Any], arrays: Mapping[str, NDArray[Any]], summaries: int) -> tuple[Watch, ...]:
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_WATCHES:
+        raise ValueError(f"it has no list of 1 to {MOST_WATCHES} watches")
+    watches = []
+    for place, entry in enumerate(entries):
+        spec = _TREE.build(_Form, {"detector": entry["detector"]}, "of its watches").detector
+        mean = np.asarray(arrays[f"watch.{place}.mean"], np.float64)
+        matrix = np.asarray(arrays[f"watch.{place}.matrix"], np.float64)
+        scale = _number(entry["scale"], "scale")
+        if mean.shape != (summaries,) or matrix.ndim != 2 or len(matrix) != summaries:
+            raise ValueError(f"arrays of watch {place} have other shapes than the summaries")
+        if not (np.isfinite(mean).all() and np.isfinite(matrix).all() and scale > 0.0):
+            raise ValueError(f"a number of watch {place} is not finite, or its scale is not positive")
+        watches.append(Watch(spec, mean, matrix, scale))
+    return tuple(watches)
+
+
+def _number(value: Any, what: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise ValueError(f"{what} is {str(value)[:40]}; a finite number must hold")
+    return float(value)

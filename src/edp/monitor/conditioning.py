@@ -1,0 +1,130 @@
+"""Summaries at an operating point: less what is usual there, over how widely they usually scatter there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+
+Array = NDArray[np.float64]
+POINT_LIMIT = 3.0
+"""Of levels and sizes in healthy standard deviations: beyond it nothing was seen, and lines must not run on."""
+RIDGE = 1e-3
+"""Share of the rows that is added below the regression: operating points that never vary alone."""
+TRIMMED = 4.0
+"""Residuals of the regression in robust deviations, beyond which a row does not count in the second round."""
+LEAST_WIDTH = 0.3
+"""Of the usual width: where the line for the width falls below this share, the share is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Conditioning:
+    """z = (s - W p) / max(V p, floor), with p the operating point, scaled and limited.
+
+    Attributes:
+        offset: of the operating point without its 1, shape (points - 1,).
+        width: the same, above zero.
+        usual: W, shape (summaries, points).
+        spread: V, shape (summaries, points).
+        floor: least width of each summary, above zero, shape (summaries,).
+        clip: largest |z|.
+    """
+
+    offset: Array
+    width: Array
+    usual: Array
+    spread: Array
+    floor: Array
+    clip: float
+
+    def __call__(self, summaries: Array, points: Array) -> Array:
+        """Conditioned rows, shape (blocks, summaries), within `clip`; NaN stays NaN.
+
+        Each sum goes from the first operating number to the last, as in C.
+        """
+        scaled = np.clip((points[:, 1:] - self.offset) / self.width, -POINT_LIMIT, POINT_LIMIT)
+        usual = np.repeat(self.usual[None, :, 0], len(summaries), 0)
+        width = np.repeat(self.spread[None, :, 0], len(summaries), 0)
+        for place in range(scaled.shape[1]):
+            usual = usual + scaled[:, place, None] * self.usual[:, place + 1]
+            width = width + scaled[:, place, None] * self.spread[:, place + 1]
+        z: Array = (summaries - usual) / np.maximum(width, self.floor)
+        return np.clip(z, -self.clip, self.clip)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Numbers of its file."""
+        return {name: getattr(self, name) for name in ("offset", "width", "usual", "spread", "floor")}
+
+    @staticmethod
+    def of(arrays: Mapping[str, NDArray[Any]], clip: float, summaries: int, points: int) -> Conditioning:
+        """From arrays.
+
+        Raises:
+            ValueError: values that cannot be.
+        """
+        names = ("offset", "width", "usual", "spread", "floor")
+        values = {name: np.asarray(arrays[name], np.float64) for name in names}
+        shapes = ((points - 1,), (points - 1,), (summaries, points), (summaries, points), (summaries,))
+        if tuple(values[name].shape for name in names) != shapes:
+            raise ValueError("arrays of the conditioning have other shapes than its header says")
+        if not all(np.isfinite(array).all() for array in values.values()):
+            raise ValueError("a number of the conditioning is not finite")
+        if not ((values["width"] > 0.0).all() and (values["floor"] > 0.0).all() and 0.0 < clip <= 1e6):
+            raise ValueError("a width of the conditioning is not positive")
+        return Conditioning(**values, clip=clip)
+
+
+def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: float) -> Conditioning:
+    """From healthy sessions, shapes (blocks, summaries) and (blocks, points) each.
+
+    Two rounds of ridge regression for what is usual, the second without rows far off the first, and one for the width
+    from what is left: absolute deviations, whose median is made the width.
+
+    Raises:
+        DataError: too few blocks.
+    """
+    s, p = np.concatenate(list(summaries)), np.concatenate(list(points))
+    fine = np.isfinite(s).any(axis=1)
+    s, p = s[fine], p[fine]
+    if len(s) < 4 * p.shape[1]:
+        raise DataError(
+            f"{len(s)} blocks of healthy sessions are too few for an operating point of {p.shape[1]} numbers; bring "
+            f"{4 * p.shape[1]} at least, or make block_s smaller"
+        )
+    offset, scatter = p[:, 1:].mean(axis=0), p[:, 1:].std(axis=0)
+    width: Array = np.where(scatter > 1e-9, scatter, 1.0).astype(np.float64)
+    design = np.concatenate(
+        [np.ones((len(p), 1)), np.clip((p[:, 1:] - offset) / width, -POINT_LIMIT, POINT_LIMIT)], axis=1
+    )
+    count = s.shape[1]
+    usual, spread, floor = np.zeros((count, design.shape[1])), np.zeros((count, design.shape[1])), np.ones(count)
+    for column in range(count):
+        values = s[:, column]
+        there = np.isfinite(values)
+        if there.sum() < 4 * design.shape[1]:
+            continue  # never there: stays at zero with width one, and NaN says nothing
+        x, y = design[there], values[there]
+        line = _ridge(x, y)
+        off = np.abs(y - x @ line)
+        near = off <= TRIMMED * 1.4826 * max(float(np.median(off)), 1e-12)
+        line = _ridge(x[near], y[near])
+        off = np.abs(y - x @ line)
+        size = max(float(off[near].std()), float(off[near].mean()), 1e-9)
+        wide = _ridge(x[near], off[near])
+        floor[column] = LEAST_WIDTH * size
+        # The mean absolute deviation of a normal variable is 0.798 of its standard deviation.
+        usual[column], spread[column] = line, wide / 0.798
+    return Conditioning(offset, width, usual, spread, floor, clip)
+
+
+def _ridge(x: Array, y: Array) -> Array:
+    """Coefficients of y on x; the constant is not drawn to zero."""
+    penalty = RIDGE * len(x) * np.eye(x.shape[1])
+    penalty[0, 0] = 0.0
+    line: Array = np.linalg.solve(x.T @ x + penalty + 1e-12 * np.eye(x.shape[1]), x.T @ y)
+    return line

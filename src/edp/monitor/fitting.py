@@ -1,0 +1,308 @@
+"""A chain from healthy sessions: scales, conditioning, views, and the limit for the promised rate of false alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+from edp.monitor.adaptation import Drift
+from edp.monitor.calibration import AlarmLimit, calibrated
+from edp.monitor.chain import Chain
+from edp.monitor.conditioning import Conditioning, fit_conditioning
+from edp.monitor.detectors.cusum import CusumSpec
+from edp.monitor.detectors.ewma import EwmaSpec
+from edp.monitor.residuals.base import ResidualSource, note_nothing, residuals_of, rows_of
+from edp.monitor.summaries import BlockSummaries
+from edp.monitor.watches import BankSpec, Watch, WatchSpec, fit_watch, scaled_alike
+from edp.recording import Recording
+from edp.settings.bounds import above, below, check_bounds, check_count, integer, span
+from edp.signals import Channel, Kind
+
+Array = NDArray[np.float64]
+SCALED_SESSIONS = 12
+"""Sessions that scales of residuals are taken from: they set units, conditioning does the rest."""
+MOVING = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PILOT_PRESSURE, Kind.FLOW)
+LEVELS = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.POSITION, Kind.ANGLE, Kind.RATIO, Kind.CURRENT, Kind.VOLTAGE)
+MOST_POINT = 24
+"""Channels of an operating point; of more, those that vary most between blocks are taken."""
+LEAST_TICKS = 10
+"""Of a block: spreads of fewer say nothing."""
+
+
+def default_watches() -> tuple[WatchSpec, ...]:
+    """A view of single blocks for sudden faults, one of averages for lasting ones."""
+    return (
+        WatchSpec(detector=EwmaSpec(weight=0.5), memory_s=2.0),
+        WatchSpec(detector=CusumSpec(slack=0.5), memory_s=10.0),
+        WatchSpec(detector=EwmaSpec(weight=0.03), memory_s=60.0),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainSpec:
+    """Options of a chain.
+
+    Attributes:
+        block_s: length of a block, s; where it has fewer than ten ticks, ten ticks are taken.
+        settle_s: start of every session that is not watched, s; at most a tenth of the shortest healthy session.
+        clip: largest size of a conditioned summary, in healthy standard deviations.
+        watches: views with their detectors.
+        folds: parts into which sessions are dealt; what judges a session was fitted without its part.
+        drift_per_hour: of the level of a summary that is followed, in healthy standard deviations.
+        most_drift: of them together.
+        doubtful: of a session's own mean, over that of other sessions, beyond which it is left out and named.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    block_s: float = 1.0
+    settle_s: float = 5.0
+    clip: float = 6.0
+    watches: tuple[WatchSpec, ...] = field(default_factory=default_watches)
+    folds: int = 4
+    drift_per_hour: float = 0.05
+    most_drift: float = 0.5
+    doubtful: float = 8.0
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "chain",
+            self,
+            block_s=above(0.0, 3600.0),
+            settle_s=span(0.0, 3600.0),
+            clip=above(0.0, 1e3),
+            folds=integer(2, 100),
+            drift_per_hour=below(0.0, 1e3),
+            most_drift=below(0.0, 1e3),
+            doubtful=above(0.0, 1e6),
+        )
+        check_count("chain", "watches", self.watches, 16, least=1)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedChain:
+    """What came of it.
+
+    Attributes:
+        chain: on all sessions that were kept.
+        limit: from sessions that the judging parts were not fitted to.
+        doubtful: names of sessions that were left out.
+    """
+
+    chain: Chain
+    limit: AlarmLimit
+    doubtful: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SessionBlocks:
+    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
+
+    name: str
+    summaries: Array
+    points: Array
+
+
+def fit_chain(
+    spec: ChainSpec,
+    sources: Sequence[ResidualSource],
+    channels: Sequence[Channel],
+    sessions: Sequence[Recording],
+    promised_hours: float,
+    note: Callable[[str], None] = note_nothing,
+) -> FittedChain:
+    """Fit all behind the residuals.
+
+    Args:
+        spec: options.
+        sources: fitted to other sessions than these.
+        channels: raw inputs, in order.
+        sessions: healthy ones.
+        promised_hours: operating hours to one false alarm.
+        note: called with what begins.
+
+    Raises:
+        ConfigError: too few hours for the promise; says for which there are enough.
+        DataError: too few sessions or blocks.
+    """
+    if len(sessions) < spec.folds:
+        raise DataError(
+            f"{len(sessions)} healthy sessions are left for conditioning and limits; {spec.folds} at least must hold: "
+            "bring more sessions, or cut long ones"
+        )
+    note("summaries of healthy sessions")
+    summaries = fit_summaries(spec, sources, channels, sessions)
+    blocks = [blocks_of(summaries, sources, channels, session) for session in sessions]
+    rate_hz = sessions[0].rate_hz
+    shortest = min(session.samples for session in sessions)
+    # A tenth: one-minute cycles of a rig would otherwise lose most of what they have.
+    settle_ticks = min(round(spec.settle_s * rate_hz), shortest // 10)
+    settle = -(-settle_ticks // summaries.block)
+    return fit_from_blocks(spec, summaries, blocks, rate_hz, settle, promised_hours, note)
+
+
+def fit_from_blocks(
+    spec: ChainSpec,
+    summaries: BlockSummaries,
+    blocks: Sequence[SessionBlocks],
+    rate_hz: float,
+    settle: int,
+    promised_hours: float,
+    note: Callable[[str], None] = note_nothing,
+) -> FittedChain:
+    """`fit_chain` from the blocks of the sessions on."""
+    note("conditioning, views and limit")
+    kept, doubtful = _without_doubtful(spec, blocks, settle)
+    blocks_per_s = rate_hz / summaries.block
+    rows: list[Array] = [np.zeros(0)] * len(kept)
+    white: list[Array] = [np.zeros(0)] * len(kept)
+    drift = Drift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
+    conditioning = _conditioning(spec, kept, settle)
+    whole = [_conditioned(conditioning, drift, part, settle) for part in kept]
+    watches = scaled_alike([fit_watch(w, whole, blocks_per_s, settle) for w in spec.watches], whole, settle)
+    for fold in range(spec.folds):
+        others = [part for i, part in enumerate(kept) if i % spec.folds != fold]
+        own_conditioning = _conditioning(spec, others, settle)
+        fitted = [_conditioned(own_conditioning, drift, part, settle) for part in others]
+        own = [fit_watch(watch, fitted, blocks_per_s, settle) for watch in spec.watches]
+        # Scales belong to the watches that will be used: limits of the folds must mean the same.
+        own = [Watch(w.detector, w.mean, w.matrix, s.scale) for w, s in zip(own, watches, strict=True)]
+        for i in range(fold, len(kept), spec.folds):
+            rows[i] = _conditioned(own_conditioning, drift, kept[i], settle)
+            white[i] = np.concatenate([watch(rows[i][settle:]) for watch in own], axis=1)
+    bank = _widths_of(watches)
+    limit = calibrated(bank, [_padded(part, bank) for part in white], blocks_per_s, promised_hours)
+    quiet = _quiet(bank, [_padded(part, bank) for part in white])
+    chain = Chain(summaries, conditioning, drift, watches, limit.limit, quiet, settle)
+    return FittedChain(chain, limit, doubtful)
+
+
+def _widths_of(watches: Sequence[Watch]) -> BankSpec:
+    return BankSpec(tuple(watches))
+
+
+def _padded(white: Array, bank: BankSpec) -> Array:
+    """White rows of a fold as wide as those of all sessions: a direction that one of them lacks counts as healthy."""
+    width = sum(watch.directions for watch in bank.watches)
+    if white.shape[1] == width:
+        return white
+    out = np.zeros((len(white), width))
+    out[:, : min(width, white.shape[1])] = white[:, :width]
+    return out
+
+
+def _quiet(bank: BankSpec, sessions: Sequence[Array]) -> float:
+    """The median of the largest statistic on healthy sessions."""
+    values = []
+    for rows in sessions:
+        detector = bank.build(rows.shape[1])
+        values += [float(detector.step(row[None])[0]) for row in rows]
+    return float(np.median(values)) if values else 0.0
+
+
+def _conditioning(spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int) -> Conditioning:
+    return fit_conditioning([p.summaries[settle:] for p in sessions], [p.points[settle:] for p in sessions], spec.clip)
+
+
+def _conditioned(conditioning: Conditioning, drift: Drift, session: SessionBlocks, settle: int) -> Array:
+    z = conditioning(session.summaries, session.points)
+    z[:settle] = np.nan
+    return drift.run(z, np.zeros(z.shape[1]))[0]
+
+
+def _without_doubtful(
+    spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int
+) -> tuple[list[SessionBlocks], tuple[str, ...]]:
+    """Sessions without those whose means lie far from all others, and the names of those."""
+    conditioning = _conditioning(spec, sessions, settle)
+    means = np.stack([np.nanmean(conditioning(s.summaries, s.points)[settle:], axis=0) for s in sessions])
+    means = np.nan_to_num(means)
+    middle = np.median(means, axis=0)
+    width = np.maximum(1.4826 * np.median(np.abs(means - middle), axis=0), 0.02)
+    worst = (np.abs(means - middle) / width).max(axis=1)
+    # Healthy sessions differ as well: what is doubtful stands far out among their own largest deviations.
+    usual = float(np.median(worst))
+    bad = worst > spec.doubtful * usual
+    # A fifth at most: where more stand out, they are not exceptions.
+    if bad.sum() > len(sessions) // 5:
+        bad &= worst >= np.sort(worst)[-max(1, len(sessions) // 5)]
+    kept = [session for session, out in zip(sessions, bad, strict=True) if not out]
+    return kept, tuple(session.name for session, out in zip(sessions, bad, strict=True) if out)
+
+
+def fit_summaries(
+    spec: ChainSpec, sources: Sequence[ResidualSource], channels: Sequence[Channel], sessions: Sequence[Recording]
+) -> BlockSummaries:
+    """Blocks and scales from some healthy sessions."""
+    rate_hz, names = sessions[0].rate_hz, [channel.name for channel in channels]
+    block = max(round(spec.block_s * rate_hz), LEAST_TICKS)
+    block = min(block, max(1, min(session.samples for session in sessions) // 2))
+    places = np.unique(np.linspace(0, len(sessions) - 1, min(len(sessions), SCALED_SESSIONS)).astype(int))
+    chosen = [sessions[i] for i in places]
+    scales = []
+    for source in sources:
+        values = np.concatenate(residuals_of(source, chosen)).astype(np.float64)
+        scales.append(_robust_width(values))
+    rows = np.concatenate([rows_of(session, names) for session in chosen]).astype(np.float64)
+    centre, spread = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
+    centre = np.nan_to_num(centre)
+    spread = np.where(np.nan_to_num(spread) > 0.0, spread, 1.0)
+    judged = [names.index(channel[0]) for source in sources for channel in source.judged]
+    change = np.nanvar(np.diff(rows / spread, axis=0), axis=0)
+    change = np.where(np.nan_to_num(change) > 0.0, change, 1.0)
+    moving, level = _operating_channels(channels, rows, block)
+    return BlockSummaries(
+        block=block,
+        scale=np.concatenate(scales),
+        channel=np.array(judged, np.int64),
+        centre=centre,
+        spread=spread,
+        change=change[judged],
+        moving=moving,
+        level=level,
+    )
+
+
+def _robust_width(values: Array) -> Array:
+    """Deviation of each column, half of it from the middle of the distribution and half from all."""
+    centred = np.abs(values - np.nanmedian(values, axis=0))
+    width = 0.5 * (1.4826 * np.nanmedian(centred, axis=0) + np.sqrt(np.nanmean(np.square(centred), axis=0)))
+    widest: Array = np.where(np.nan_to_num(width) > 0.0, width, 1.0)
+    return widest
+
+
+def _operating_channels(
+    channels: Sequence[Channel], rows: Array, block: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Places of channels whose size, and of those whose level, tells the operating point."""
+    whole = rows[: len(rows) // block * block].reshape(-1, block, rows.shape[1])
+    varies = np.nan_to_num(np.nanstd(np.nanmean(whole, axis=1), axis=0)) > 0.0
+    moving = [i for i, c in enumerate(channels) if c.kind in MOVING and varies[i]]
+    level = [i for i, c in enumerate(channels) if c.kind in LEVELS and varies[i]]
+    return np.array(moving[:MOST_POINT], np.int64), np.array(level[:MOST_POINT], np.int64)
+
+
+def blocks_of(
+    summaries: BlockSummaries, sources: Sequence[ResidualSource], channels: Sequence[Channel], session: Recording
+) -> SessionBlocks:
+    """Summaries and operating points of a session."""
+    residuals = np.concatenate([residuals_of(source, [session])[0] for source in sources], axis=1)
+    rows = rows_of(session, [channel.name for channel in channels])
+    raw, points, _ = summaries.run(residuals, rows, summaries.initial_state())
+    return SessionBlocks(session.name, raw, points)
+
+
+def session_means(channels: Sequence[Channel], sessions: Sequence[Recording]) -> Array:
+    """Mean over sessions of each channel's mean, and a generous deviation between sessions, shape (2, inputs)."""
+    names = [channel.name for channel in channels]
+    rows = [rows_of(session, names).astype(np.float64) for session in sessions]
+    means = np.stack([np.nanmean(part, axis=0) for part in rows])
+    within = np.stack([np.nanstd(part, axis=0) for part in rows]).mean(axis=0)
+    between = means.std(axis=0)
+    width = between + 0.25 * within
+    return np.stack([means.mean(axis=0), np.where(width > 0.0, width, 1.0)])

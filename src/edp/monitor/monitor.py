@@ -1,0 +1,302 @@
+"""The monitor of a machine: raw channels in tick by tick, alarms out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, closest
+from edp.monitor.alarms import MonitorAlarm
+from edp.monitor.calibration import AlarmLimit
+from edp.monitor.chain import BlockVerdict, Chain, ChainState
+from edp.monitor.residuals.base import ResidualSource, Rows, SourceState, rows_of
+from edp.recording import Recording
+from edp.settings.bounds import shown
+from edp.signals import Channel
+
+Array = NDArray[np.float64]
+PIECE = 4096
+"""Ticks of a recording that are taken at once: long enough for speed, short enough for memory."""
+MOST_EVIDENCE = 8
+"""Summaries that an alarm names."""
+OTHER_MACHINE = 6.0
+"""Healthy deviations of a session's mean of a channel, beyond which the channel is not that of this machine."""
+OTHER_SHARE = 0.25
+"""Of the channels: where more than these are beyond `OTHER_MACHINE`, the log is not of this machine."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorState:
+    """All that a monitor remembers of one machine.
+
+    Attributes:
+        sources: of each source of residuals.
+        chain: of the chain.
+        ticks: since the start.
+        missing: ticks since the end of the last block at which each input was missing, shape (inputs,).
+    """
+
+    sources: tuple[SourceState, ...]
+    chain: ChainState
+    ticks: int
+    missing: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What one tick of a stream gives.
+
+    Attributes:
+        alarm: raised at this tick.
+        silent: channels that are missing, so that what judges or reads them says nothing.
+        statistics: of each watch at the last block's end, over its scale; compare with the monitor's limit.
+        block_ended: whether this tick ended a block.
+    """
+
+    alarm: MonitorAlarm | None
+    silent: tuple[str, ...]
+    statistics: tuple[float, ...]
+    block_ended: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Monitor:
+    """A fitted monitor.
+
+    Attributes:
+        channels: raw channels, SI units, in the order of a row.
+        rate_hz: ticks per second.
+        sources: of residuals.
+        chain: from residuals to statistics.
+        limit: what is known of its false alarms.
+        session_means: mean over healthy sessions of each channel's mean in a session, and its deviation between
+            sessions, shape (2, inputs).
+        diagnosis: plain values and arrays of a diagnosis, where one is there.
+        provenance: what it was fitted to.
+    """
+
+    channels: tuple[Channel, ...]
+    rate_hz: float
+    sources: tuple[ResidualSource, ...]
+    chain: Chain
+    limit: AlarmLimit
+    session_means: Array
+    diagnosis: Any = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def residual_names(self) -> tuple[str, ...]:
+        """Names of all residuals, in order."""
+        return tuple(name for source in self.sources for name in source.names)
+
+    @property
+    def summary_names(self) -> tuple[str, ...]:
+        """Names of all summaries, in order."""
+        return self.chain.summaries.names(self.residual_names)
+
+    @property
+    def block_s(self) -> float:
+        """Length of a block."""
+        return self.chain.summaries.block / self.rate_hz
+
+    def initial_state(self) -> MonitorState:
+        """Before the first tick."""
+        states = tuple(source.initial_state(1) for source in self.sources)
+        return MonitorState(states, self.chain.initial_state(), 0, np.zeros(len(self.channels), np.int64))
+
+    def residuals(self, rows: Rows, state: MonitorState) -> tuple[Rows, tuple[SourceState, ...]]:
+        """Residuals of a stretch of one machine, shape (ticks, residuals), and the states of the sources behind it."""
+        place = {name: i for i, name in enumerate(self.inputs)}
+        parts, states = [], []
+        for source, before in zip(self.sources, state.sources, strict=True):
+            part, after = source.run(rows[None, :, [place[name] for name in source.inputs]], before)
+            parts.append(part[0])
+            states.append(after)
+        return np.concatenate(parts, axis=1), tuple(states)
+
+    def advance(self, rows: Rows, state: MonitorState) -> tuple[list[BlockVerdict], MonitorState]:
+        """Verdicts of the blocks that end within a stretch; ticks, chunks and one call give the same.
+
+        Args:
+            rows: raw channels in SI units, shape (ticks, inputs), NaN where missing.
+            state: before it; its detectors go on in place.
+        """
+        residuals, sources = self.residuals(rows, state)
+        verdicts, chain = self.chain.run(residuals, rows, state.chain)
+        missing = state.missing + (~np.isfinite(rows)).sum(axis=0)
+        return verdicts, MonitorState(sources, chain, state.ticks + len(rows), missing)
+
+    def verdicts(self, recording: Recording) -> Iterator[BlockVerdict]:
+        """Verdicts of a whole recording from its start on.
+
+        Raises:
+            DataError: another rate, or a log of another machine.
+        """
+        self.check(recording)
+        state, rows = self.initial_state(), rows_of(recording, self.inputs)
+        for start in range(0, len(rows), PIECE):
+            verdicts, state = self.advance(rows[start : start + PIECE], state)
+            yield from verdicts
+
+    def run(self, recording: Recording) -> list[MonitorAlarm]:
+        """All alarms of a recording; the detectors are reset at each, and a fault that stays alarms again.
+
+        Raises:
+            DataError: another rate, or a log of another machine.
+        """
+        return [
+            self.alarm(verdict, recording.name) for verdict in self.verdicts(recording) if verdict.alarm is not None
+        ]
+
+    def conditioned_rows(self, recording: Recording) -> Array:
+        """Conditioned summaries of each block, NaN where missing, shape (blocks, summaries); see `summary_names`."""
+        self.check(recording)
+        state, rows, out = self.initial_state(), rows_of(recording, self.inputs), []
+        for start in range(0, len(rows), PIECE):
+            piece = rows[start : start + PIECE]
+            residuals, sources = self.residuals(piece, state)
+            z, chain = self.chain.conditioned(residuals, piece, state.chain)
+            state = replace(state, sources=sources, chain=chain)
+            out.append(z)
+        return np.concatenate(out) if out else np.zeros((0, self.chain.summaries.width))
+
+    def white_rows(self, recording: Recording) -> Array:
+        """White rows as the detectors see them, shape (blocks, directions of all watches)."""
+        return self.chain.bank.white(self.conditioned_rows(recording))
+
+    def alarm(self, verdict: BlockVerdict, recording: str = "") -> MonitorAlarm:
+        """The alarm of a block's verdict.
+
+        Raises:
+            DataError: the block raised none.
+        """
+        if verdict.alarm is None:
+            raise DataError(f"block {verdict.block} raised no alarm")
+        watch, names = self.chain.watches[verdict.alarm], self.summary_names
+        order = np.argsort(-np.abs(verdict.evidence), kind="stable")[:MOST_EVIDENCE]
+        evidence = tuple((names[i], float(verdict.evidence[i])) for i in order.tolist())
+        detector = type(watch.detector).__name__.removesuffix("Spec").lower()
+        alarm = MonitorAlarm(
+            recording=recording,
+            raised_s=verdict.block * self.block_s,
+            since_s=verdict.since * self.block_s,
+            detector=f"{detector} {verdict.alarm + 1}",
+            statistic=verdict.statistics[verdict.alarm],
+            limit=self.chain.limit,
+            evidence=evidence,
+        )
+        return replace(alarm, sentence=_sentence(alarm))
+
+    def check(self, recording: Recording) -> tuple[str, ...]:
+        """Refuse a recording that this monitor cannot judge; names of channels that it lacks, which stay silent.
+
+        Raises:
+            DataError: another rate, none of the channels, or values that are not those of this machine.
+        """
+        # A thousandth: loggers state the same rate with different digits.
+        if abs(recording.rate_hz - self.rate_hz) > 1e-3 * self.rate_hz:
+            raise DataError(
+                f"recording '{recording.name}' has {recording.rate_hz:g} Hz, the monitor {self.rate_hz:g} Hz; set "
+                "rate_hz in the signal map"
+            )
+        lacking = tuple(name for name in self.inputs if name not in recording.channel_names)
+        if len(lacking) == len(self.inputs):
+            hint = closest(self.inputs[0], recording.channel_names)
+            raise DataError(
+                f"recording '{recording.name}' has none of the monitor's channels, such as '{self.inputs[0]}'{hint}"
+            )
+        self._check_machine(recording, lacking)
+        return lacking
+
+    def _check_machine(self, recording: Recording, lacking: Sequence[str]) -> None:
+        """Refuse a log whose channels lie far from all healthy sessions."""
+        names = [name for name in self.inputs if name not in lacking]
+        values = recording.select(names).astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            there = np.isfinite(values)
+            means = np.where(there, values, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+        places = [self.inputs.index(name) for name in names]
+        middle, width = self.session_means[:, places]
+        far = np.abs(means - middle) / width
+        far[~there.any(axis=0)] = 0.0
+        beyond = [name for name, value in zip(names, far, strict=True) if value > OTHER_MACHINE]
+        if len(beyond) > max(1, OTHER_SHARE * len(names)):
+            worst = names[int(far.argmax())]
+            raise DataError(
+                f"recording '{recording.name}' is not of the monitor's machine: {len(beyond)} of {len(names)} "
+                f"channels, '{worst}' most of all, lie more than {OTHER_MACHINE:g} deviations from healthy sessions; "
+                "check units and signs in the signal map, or fit a monitor for this machine"
+            )
+
+    def stream(self) -> MonitorStream:
+        """The monitor tick by tick, from a start on."""
+        return MonitorStream(self)
+
+
+class MonitorStream:
+    """A monitor at work on one machine, one row of raw channels a tick."""
+
+    def __init__(self, monitor: Monitor) -> None:
+        self.monitor, self.state = monitor, monitor.initial_state()
+        self._statistics = (0.0,) * len(monitor.chain.watches)
+
+    def reset(self) -> None:
+        """Start anew."""
+        self.state = self.monitor.initial_state()
+        self._statistics = (0.0,) * len(self.monitor.chain.watches)
+
+    def step(self, row: Mapping[str, float] | Sequence[float] | NDArray[Any]) -> Verdict:
+        """Take one tick.
+
+        Args:
+            row: SI values by channel, where a missing name or NaN is a missing channel; or all in the monitor's order.
+
+        Raises:
+            DataError: an unknown channel, or another number of values.
+        """
+        values = self._row(row)
+        verdicts, self.state = self.monitor.advance(values[None], self.state)
+        alarm = None
+        for verdict in verdicts:
+            self._statistics = verdict.statistics
+            alarm = self.monitor.alarm(verdict) if verdict.alarm is not None else None
+        gone = ~np.isfinite(values)
+        silent = tuple(name for name, missing in zip(self.monitor.inputs, gone, strict=True) if missing)
+        return Verdict(alarm, silent, self._statistics, bool(verdicts))
+
+    def _row(self, row: Mapping[str, float] | Sequence[float] | NDArray[Any]) -> NDArray[np.float32]:
+        inputs = self.monitor.inputs
+        if isinstance(row, Mapping):
+            unknown = [name for name in row if name not in inputs]
+            if unknown:
+                raise DataError(
+                    f"channel {shown(unknown[0])} is none of the monitor's{closest(str(unknown[0]), inputs)}"
+                )
+            row = [row.get(name, np.nan) for name in inputs]
+        try:
+            with np.errstate(over="ignore"):
+                values = np.asarray(row, dtype=np.float64).astype(np.float32)
+        except (TypeError, ValueError) as error:
+            raise DataError(f"a row of the stream holds something else than numbers: {shown(row)}") from error
+        if values.shape != (len(inputs),):
+            raise DataError(f"a row of shape {values.shape}; shape ({len(inputs)},) must hold")
+        return values
+
+
+def _sentence(alarm: MonitorAlarm) -> str:
+    """The alarm without a diagnosis, for a reader."""
+    name, size = alarm.evidence[0] if alarm.evidence else ("nothing", 0.0)
+    where = f"{alarm.recording}: " if alarm.recording else ""
+    return (
+        f"{where}not healthy since {alarm.since_s:g} s, raised at {alarm.raised_s:g} s: '{name}' deviates most, by "
+        f"{size:+.2g} healthy deviations on average"
+    )

@@ -1,0 +1,233 @@
+"""Monitors on disk: JSON and safetensors, as bundles of networks are; loading one executes nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from edp import __version__
+from edp.errors import BundleError
+from edp.monitor.calibration import AlarmLimit
+from edp.monitor.chain import Chain
+from edp.monitor.monitor import Monitor
+from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
+from edp.signals import Channel, Kind
+from edp.storage import make_folder, object_with, read_json, write_json
+from edp.training.bundle import (
+    HASH,
+    Bundle,
+    as_damage,
+    check_hash,
+    header_digest,
+    load_bundle,
+    read_arrays,
+    save_bundle,
+    write_arrays,
+)
+from edp.training.bundle import HEADER as BUNDLE_HEADER
+from edp.training.twin_bundle import HEADER as TWIN_HEADER
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
+
+SCHEMA = 1
+HEADER = "monitor.json"
+NETWORKS = "networks"
+"""Folder of the networks that residuals are made with, a bundle or a twin each."""
+_FOLDER = re.compile(r"[a-z0-9]{1,32}-[a-z0-9]{1,32}")
+MOST_CHANNELS, MOST_SOURCES, MOST_NETWORKS = 2_000, 64, 256
+LIMIT = ("limit", "alarms", "hours", "promised_hours", "low_hours", "high_hours")
+
+
+def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
+    """Write a monitor; the header is renamed into place last, so a reader sees the old monitor or the new one.
+
+    Raises:
+        StorageError: the folder cannot be written.
+    """
+    path = make_folder(folder)
+    arrays: dict[str, Any] = {f"chain.{name}": values for name, values in monitor.chain.arrays().items()}
+    arrays["session_means"] = monitor.session_means
+    sources, written = [], set()
+    for place, source in enumerate(monitor.sources):
+        parts = source.parts()
+        arrays |= {f"source.{place}.{name}": values for name, values in parts.arrays.items()}
+        networks = {name: _write_network(path, bundle) for name, bundle in parts.bundles.items()}
+        written |= {entry["folder"] for entry in networks.values()}
+        sources.append({"kind": _kind_of(source), "plain": dict(parts.plain), "networks": networks})
+    entry = write_arrays(path, "monitor", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
+    facts = asdict(monitor.limit)
+    # JSON has no infinity; null says that no false alarm was counted.
+    facts["high_hours"] = None if np.isinf(facts["high_hours"]) else facts["high_hours"]
+    header = {
+        "schema": SCHEMA,
+        "edp": __version__,
+        "rate_hz": monitor.rate_hz,
+        "channels": [
+            {"name": c.name, "kind": str(c.kind), "unit": c.unit, "description": c.description}
+            for c in monitor.channels
+        ],
+        "sources": sources,
+        "chain": monitor.chain.to_plain(),
+        "limit": facts,
+        "arrays": entry,
+        "diagnosis": monitor.diagnosis,
+        "provenance": dict(monitor.provenance),
+    }
+    write_json(path / HEADER, header | {HASH: header_digest(header)})
+    _remove_old(path, entry["file"], written)
+    return path
+
+
+def _kind_of(source: ResidualSource) -> str:
+    return next(name for name, spec in RESIDUALS.items() if spec.source is type(source))
+
+
+def _write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
+    """Write a network beside the header, in a folder that its own header names."""
+    kind = "twin" if isinstance(bundle, TwinBundle) else "bundle"
+    draft = make_folder(path / NETWORKS / f"{kind}-draft")
+    shutil.rmtree(draft)
+    if isinstance(bundle, TwinBundle):
+        save_twin(bundle, draft)
+    else:
+        save_bundle(bundle, draft)
+    digest = str(read_json(draft / (TWIN_HEADER if kind == "twin" else BUNDLE_HEADER))[HASH])
+    folder = f"{kind}-{digest}"
+    if (path / NETWORKS / folder).exists():
+        # Equal content has an equal name: what is there is this network.
+        shutil.rmtree(draft)
+    else:
+        draft.rename(path / NETWORKS / folder)
+    return {"folder": folder, HASH: digest}
+
+
+def _remove_old(path: Path, arrays: str, networks: set[str]) -> None:
+    """Remove what an earlier monitor left; a kill before that leaves spare files, not a broken monitor."""
+    for old in path.glob("monitor-*.safetensors"):
+        if old.name != arrays:
+            old.unlink(missing_ok=True)
+    for folder in (path / NETWORKS).glob("*"):
+        if folder.name not in networks and _FOLDER.fullmatch(folder.name) and not folder.is_symlink():
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def load_monitor(folder: str | Path) -> Monitor:
+    """Read a monitor; schema, hashes, shapes and ranges are checked before it is built.
+
+    Raises:
+        BundleError: not a monitor, another schema, damaged numbers, or parts that this version does not know.
+    """
+    path = Path(folder)
+    if not os.path.lexists(path / HEADER):
+        raise BundleError(f"'{path}' is not a monitor: it has no {HEADER}; give the folder that edp monitor fit wrote")
+    with as_damage(path):
+        header = object_with(read_json(path / HEADER), ("schema",), f"'{path / HEADER}'")
+        schema = header["schema"]
+        if isinstance(schema, bool) or schema != SCHEMA:
+            raise BundleError(
+                f"monitor '{path}' has schema {str(schema)[:40]}, this EDP ({__version__}) reads {SCHEMA}; install a "
+                "newer one, or fit it again"
+            )
+        check_hash(header, path / HEADER)
+        return _assembled(header, path)
+
+
+def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
+    entries = header["channels"]
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CHANNELS:
+        raise ValueError(f"it has no list of 1 to {MOST_CHANNELS:,} channels")
+    channels = tuple(_channel(entry) for entry in entries)
+    names = [channel.name for channel in channels]
+    if len(set(names)) < len(names):
+        raise ValueError("a channel stands twice")
+    rate_hz = header["rate_hz"]
+    if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float) or not 0.0 < rate_hz <= 1e6:
+        raise ValueError(f"its rate_hz is {str(rate_hz)[:40]}; above 0 and at most 1e6 must hold")
+    arrays = load_arrays(read_arrays(path, header["arrays"]))
+    sources = _sources(header["sources"], arrays, path)
+    chain_arrays = {k.removeprefix("chain."): v for k, v in arrays.items() if k.startswith("chain.")}
+    chain = Chain.of(object_with(header["chain"], (), "its chain"), chain_arrays)
+    _check_fit(sources, chain, names)
+    means = np.asarray(arrays["session_means"], np.float64)
+    if means.shape != (2, len(channels)) or not np.isfinite(means).all() or not (means[1] > 0.0).all():
+        raise ValueError("the means of its sessions have another shape, are not finite, or have no width")
+    provenance = object_with(header["provenance"], (), "its provenance")
+    limit = _limit(object_with(header["limit"], LIMIT, "its limit"))
+    return Monitor(channels, float(rate_hz), sources, chain, limit, means, header.get("diagnosis"), provenance)
+
+
+def _check_fit(sources: tuple[ResidualSource, ...], chain: Chain, names: list[str]) -> None:
+    """Refuse parts that do not belong together."""
+    if chain.summaries.residuals != sum(len(source.names) for source in sources):
+        raise ValueError("its chain is for another number of residuals than its sources give")
+    if len(chain.summaries.centre) != len(names):
+        raise ValueError("its chain is for another number of channels")
+    for source in sources:
+        unknown = [name for name in source.inputs if name not in names]
+        if unknown:
+            raise ValueError(f"a source reads '{unknown[0][:80]}', which is none of its channels")
+
+
+def _sources(entries: Any, arrays: Mapping[str, Any], path: Path) -> tuple[ResidualSource, ...]:
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_SOURCES:
+        raise ValueError(f"it has no list of 1 to {MOST_SOURCES} sources of residuals")
+    sources = []
+    for place, entry in enumerate(entries):
+        spec = RESIDUALS[_text(entry["kind"])]
+        prefix = f"source.{place}."
+        own = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+        networks = object_with(entry["networks"], (), "its networks")
+        if len(networks) > MOST_NETWORKS:
+            raise ValueError(f"a source has {len(networks)} networks; at most {MOST_NETWORKS} must hold")
+        bundles = {name: _network(path, value) for name, value in networks.items()}
+        plain = object_with(entry["plain"], (), "a source")
+        sources.append(spec.source.of_parts(SourceParts(plain, own, bundles)))
+    return tuple(sources)
+
+
+def _network(path: Path, entry: Mapping[str, Any]) -> Bundle | TwinBundle:
+    folder = _text(entry["folder"])
+    # Never a path out of the monitor.
+    if not _FOLDER.fullmatch(folder):
+        raise ValueError(f"'{folder[:80]}' is no folder of a network")
+    where = path / NETWORKS / folder
+    if not where.is_dir():
+        raise BundleError(f"monitor '{path}' lacks its network '{folder}'; restore the monitor")
+    twin = folder.startswith("twin-")
+    network = load_twin(where) if twin else load_bundle(where)
+    stated = read_json(where / (TWIN_HEADER if twin else BUNDLE_HEADER))[HASH]
+    if stated != entry[HASH]:
+        raise ValueError(f"its network '{folder}' is another one than its header names")
+    return network
+
+
+def _limit(entry: Mapping[str, Any]) -> AlarmLimit:
+    count = entry["alarms"]
+    if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count < 2**53:
+        raise ValueError(f"alarms of its limit is {str(count)[:40]}; a count must hold")
+    values = {name: np.inf if entry[name] is None else entry[name] for name in LIMIT if name != "alarms"}
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or np.isnan(value):
+            raise ValueError(f"{name} of its limit is {str(value)[:40]}; a number must hold")
+    return AlarmLimit(alarms=count, **values)
+
+
+def _channel(entry: Mapping[str, Any]) -> Channel:
+    channel = Channel(_text(entry["name"]), Kind(entry["kind"]), _text(entry["description"]))
+    if entry["unit"] != channel.unit:
+        raise ValueError(f"channel '{channel.name[:80]}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
+    return channel
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > 4096:
+        raise TypeError(f"{str(value)[:40]!r} stands where a text must be")
+    return value

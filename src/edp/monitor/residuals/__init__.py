@@ -1,0 +1,7 @@
+"""Residuals of a machine, measured less expected: a source a file, entered in `RESIDUALS` by name."""
+
+from edp.monitor.residuals.balances import BalancesSpec as BalancesSpec
+from edp.monitor.residuals.base import RESIDUALS, FitMaterial, ResidualSource, ResidualSpec, SourceParts, SourceState
+from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec as VirtualSensorsSpec
+
+__all__ = ["RESIDUALS", "FitMaterial", "ResidualSource", "ResidualSpec", "SourceParts", "SourceState"]

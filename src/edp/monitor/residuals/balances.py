@@ -1,0 +1,205 @@
+"""Physical balances: a position against the integral of its velocity, a velocity against that of its acceleration."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from edp.monitor.residuals.base import (
+    RESIDUALS,
+    FitMaterial,
+    ResidualSource,
+    ResidualSpec,
+    Rows,
+    SourceParts,
+    residual_labels,
+)
+from edp.recording import Recording
+from edp.settings.bounds import above, check_bounds, span
+from edp.signals import KINDS, Channel, Kind
+
+Array = NDArray[np.float64]
+RATE_OF = {
+    Kind.POSITION: Kind.VELOCITY,
+    Kind.ANGLE: Kind.ANGULAR_VELOCITY,
+    Kind.VELOCITY: Kind.ACCELERATION,
+}
+"""Kind of the rate of change, by kind."""
+MATCH_S = 0.5
+"""Time over which changes are compared to find which rate belongs to which level."""
+MOST_ROWS = 200_000
+"""For that comparison: half an hour at 100 Hz."""
+
+
+class Balances(ResidualSource):
+    """Levels less the integrals of their rates, where what is older than `memory_s` fades.
+
+    With d[t] = x[t] - x[t-1] - gain v[t] dt the residual is e[t] = left e[t-1] + d[t], left = 1 - dt / memory_s: a
+    leaky sum has no drift, and a step of the level stays visible for `memory_s`.
+
+    Args:
+        inputs: raw channels, SI units.
+        pairs: places of level and rate among the inputs, one a residual, shape (residuals, 2).
+        gains: of each rate.
+        memories_s: of each residual.
+        rate_hz: ticks per second.
+        middle: mean of each input on healthy sessions.
+        units: SI unit of each residual.
+    """
+
+    def __init__(
+        self,
+        inputs: Sequence[str],
+        pairs: NDArray[np.int64],
+        gains: Array,
+        memories_s: Array,
+        rate_hz: float,
+        middle: Rows,
+        units: Sequence[str],
+    ) -> None:
+        self.inputs, self.units = tuple(inputs), tuple(units)
+        self.pairs, self.gains, self.memories_s, self.rate_hz = pairs, gains, memories_s, rate_hz
+        self.middle = np.asarray(middle, np.float32)
+        both = [(self.inputs[level], self.inputs[rate]) for level, rate in pairs.tolist()]
+        self.names = tuple(
+            f"balance:{level}-{rate}:{memory:g}s" for (level, rate), memory in zip(both, memories_s, strict=True)
+        )
+        self.judged = self.reads = tuple(both)
+
+    def _start(self, streams: int) -> Any:
+        # None until the first tick, which has no change.
+        return None, np.zeros((streams, len(self.names)))
+
+    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+        before, residual = own
+        levels = rows[..., self.pairs[:, 0]].astype(np.float64)
+        rates = rows[..., self.pairs[:, 1]].astype(np.float64)
+        first = before is None
+        before = levels[:, 0] if first else before
+        steps = rates * (self.gains / self.rate_hz)
+        if first:
+            steps[:, 0] = 0.0
+        change = np.diff(levels, axis=1, prepend=before[:, None]) - steps
+        out = np.empty(change.shape)
+        left = 1.0 - 1.0 / (self.memories_s * self.rate_hz)
+        for column, share in enumerate(left.tolist()):
+            start = share * residual[:, column : column + 1]
+            out[..., column], _ = lfilter([1.0], [1.0, -share], change[..., column], axis=1, zi=start)
+        return out.astype(np.float32), (levels[:, -1], out[:, -1])
+
+    def parts(self) -> SourceParts:
+        """See `ResidualSource.parts`."""
+        plain = {"inputs": list(self.inputs), "units": list(self.units), "rate_hz": self.rate_hz}
+        arrays: dict[str, NDArray[Any]] = {
+            "pairs": self.pairs,
+            "gains": self.gains,
+            "memories_s": self.memories_s,
+            "middle": self.middle,
+        }
+        return SourceParts(plain, arrays)
+
+    @classmethod
+    def of_parts(cls, parts: SourceParts) -> Balances:
+        """See `ResidualSource.of_parts`."""
+        inputs, units = residual_labels(parts.plain)
+        pairs = np.asarray(parts.arrays["pairs"], np.int64)
+        gains, memories = (np.asarray(parts.arrays[name], np.float64) for name in ("gains", "memories_s"))
+        middle, rate_hz = np.asarray(parts.arrays["middle"], np.float32), float(parts.plain["rate_hz"])
+        count = len(units)
+        shapes = (pairs.shape, gains.shape, memories.shape, middle.shape)
+        if shapes != ((count, 2), (count,), (count,), (len(inputs),)):
+            raise ValueError("arrays of a balance have other shapes than its header says")
+        if not all(np.isfinite(values).all() for values in (gains, memories, middle)) or not 0.0 < rate_hz <= 1e6:
+            raise ValueError("a number of a balance is not finite, or its rate cannot be")
+        if count and (pairs.min() < 0 or pairs.max() >= len(inputs) or (memories * rate_hz < 1.0).any()):
+            raise ValueError("a pair of a balance lies outside its inputs, or its memory is shorter than a tick")
+        return cls(inputs, pairs, gains, memories, rate_hz, middle, units)
+
+
+@RESIDUALS.register("balances")
+@dataclass(frozen=True, kw_only=True)
+class BalancesSpec(ResidualSpec):
+    """Levels against the integrals of their rates.
+
+    Attributes:
+        memory_s: times after which the residual of a position has faded.
+        rate_memory_s: the same of a velocity against its acceleration.
+        match: correlation of changes, above which a rate belongs to a level.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    source: ClassVar[type[ResidualSource]] = Balances
+    memory_s: tuple[float, ...] = (1.0, 20.0)
+    rate_memory_s: tuple[float, ...] = (0.5,)
+    match: float = 0.8
+
+    def __post_init__(self) -> None:
+        for name in ("memory_s", "rate_memory_s"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        check_bounds(
+            "balances", self, memory_s=above(0.0, 3600.0), rate_memory_s=above(0.0, 3600.0), match=span(0.0, 1.0)
+        )
+
+    def fit(self, material: FitMaterial) -> ResidualSource | None:
+        """See `ResidualSpec.fit`."""
+        material.note("balances")
+        found = [
+            (level, rate, gain, max(memory, 2.0 / material.rate_hz))
+            for level, rate, gain in matched_pairs(material.channels, material.train, material.rate_hz, self.match)
+            for memory in (self.rate_memory_s if level.kind is Kind.VELOCITY else self.memory_s)
+        ]
+        if not found:
+            return None
+        used = {channel.name for level, rate, _, _ in found for channel in (level, rate)}
+        inputs = tuple(name for name in material.names if name in used)
+        pairs = np.array([[inputs.index(level.name), inputs.index(rate.name)] for level, rate, _, _ in found])
+        middle = np.mean([r.select(inputs).mean(axis=0, dtype=np.float64) for r in material.train], axis=0)
+        gains, memories = (np.array([entry[place] for entry in found]) for place in (2, 3))
+        units = [KINDS[level.kind].si_unit for level, _, _, _ in found]
+        return Balances(inputs, pairs, gains, memories, material.rate_hz, middle.astype(np.float32), units)
+
+
+def matched_pairs(
+    channels: Sequence[Channel], sessions: Sequence[Recording], rate_hz: float, least: float
+) -> list[tuple[Channel, Channel, float]]:
+    """Levels with the rates that belong to them: the best match of each level, with the gain of the rate."""
+    ticks = max(1, round(MATCH_S * rate_hz))
+    pairs = []
+    for kind, rate_kind in RATE_OF.items():
+        levels = [channel for channel in channels if channel.kind is kind]
+        rates = [channel for channel in channels if channel.kind is rate_kind]
+        scored = [
+            (*_match(level.name, rate.name, sessions, ticks, rate_hz), level, rate)
+            for level, rate in itertools.product(levels, rates)
+        ]
+        for level in levels:
+            best = max((entry for entry in scored if entry[2] is level), key=lambda entry: entry[0], default=None)
+            if best is not None and best[0] >= least:
+                pairs.append((level, best[3], best[1]))
+    return pairs
+
+
+def _match(level: str, rate: str, sessions: Sequence[Recording], ticks: int, rate_hz: float) -> tuple[float, float]:
+    """Correlation of the changes of a level with the integral of a rate, and the gain of the latter."""
+    xy = xx = yy = 0.0
+    rows = 0
+    for session in sessions:
+        if rows > MOST_ROWS or session.samples <= ticks:
+            continue
+        x = session.column(level).astype(np.float64)
+        y = np.cumsum(session.column(rate).astype(np.float64)) / rate_hz
+        dx, dy = x[ticks:] - x[:-ticks], y[ticks:] - y[:-ticks]
+        fine = np.isfinite(dx) & np.isfinite(dy)
+        xy, xx, yy = xy + float(dx[fine] @ dy[fine]), xx + float(dx[fine] @ dx[fine]), yy + float(dy[fine] @ dy[fine])
+        rows += len(dx)
+    if xx <= 0.0 or yy <= 0.0:
+        return 0.0, 0.0
+    return xy / float(np.sqrt(xx * yy)), xy / yy

@@ -1,0 +1,269 @@
+"""What a source of residuals is: raw channels go in tick by tick, measured less expected comes out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+from edp.recording import Recording
+from edp.registry import Registry
+from edp.signals import Channel
+from edp.training.bundle import Bundle
+from edp.training.twin_bundle import TwinBundle
+
+Rows = NDArray[np.float32]
+MOST_RESIDUALS = 512
+"""Of one source: a machine with more channels is watched in parts."""
+
+
+def note_nothing(text: str) -> None:
+    """Progress that nobody asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitMaterial:
+    """What residuals are fitted to.
+
+    Attributes:
+        train: healthy sessions, all with `channels` at `rate_hz`.
+        validation: further ones, for the choice among fits.
+        channels: that are watched, in the order of the monitor's inputs.
+        rate_hz: ticks per second.
+        predictors: look-ahead networks of this machine.
+        twins: plant models of this machine.
+        groups: names of channels that are judged together; empty where names and kinds are to tell.
+        seed: root of every random choice.
+        minutes: processor time that fits may take, all together.
+        note: called with what begins.
+    """
+
+    train: Sequence[Recording]
+    validation: Sequence[Recording]
+    channels: tuple[Channel, ...]
+    rate_hz: float
+    predictors: tuple[Bundle, ...] = ()
+    twins: tuple[TwinBundle, ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
+    seed: int = 0
+    minutes: float = 8.0
+    note: Callable[[str], None] = note_nothing
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return tuple(channel.name for channel in self.channels)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceParts:
+    """A source as it lies on disk: plain values, arrays, and the networks that it runs.
+
+    Attributes:
+        plain: JSON values.
+        arrays: numbers by name.
+        bundles: networks by name; twins are `TwinBundle`.
+    """
+
+    plain: Mapping[str, Any] = field(default_factory=dict)
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    bundles: Mapping[str, Bundle | TwinBundle] = field(default_factory=dict)
+
+
+@dataclass
+class SourceState:
+    """All that a source remembers of `streams` machines.
+
+    Attributes:
+        last: the last value of each input that was there, shape (streams, inputs).
+        known: whether there was one, shape (streams, inputs).
+        own: what the source itself carries.
+    """
+
+    last: Rows
+    known: NDArray[np.bool_]
+    own: Any
+
+
+class ResidualSource(ABC):
+    """A fitted source.
+
+    State is explicit: ticks, chunks and one call over everything give the same numbers. A missing input (NaN or
+    infinite) silences the residuals that judge or read it at its ticks, and for what is read the last value that was
+    there stands in, so that it never spoils the memory.
+
+    Attributes:
+        names: one a residual, such as ``virtual:CylVels_1``.
+        judged: channels whose fault shows as a bias of each residual.
+        reads: all inputs that each residual depends on, those that are judged among them.
+        units: SI unit of each residual.
+        inputs: raw channels, SI units.
+        middle: what stands in for an input that was never there, shape (inputs,).
+    """
+
+    names: tuple[str, ...]
+    judged: tuple[tuple[str, ...], ...]
+    reads: tuple[tuple[str, ...], ...]
+    units: tuple[str, ...]
+    inputs: tuple[str, ...]
+    middle: Rows
+
+    def initial_state(self, streams: int) -> SourceState:
+        """State at the start of `streams` machines."""
+        last = np.broadcast_to(self.middle, (streams, len(self.inputs))).astype(np.float32)
+        return SourceState(last, np.zeros((streams, len(self.inputs)), dtype=bool), self._start(streams))
+
+    def run(self, rows: Rows, state: SourceState) -> tuple[Rows, SourceState]:
+        """Residuals of a stretch.
+
+        Args:
+            rows: raw inputs in SI units, shape (streams, ticks, inputs); NaN marks what is missing.
+            state: before it.
+
+        Returns:
+            Measured less expected in SI units, shape (streams, ticks, residuals), NaN where not available; and the
+            state behind it.
+
+        Raises:
+            DataError: rows of another shape.
+        """
+        rows = np.asarray(rows, dtype=np.float32)
+        expected = (len(state.last), len(self.inputs))
+        if rows.ndim != 3 or (rows.shape[0], rows.shape[2]) != expected:
+            raise DataError(f"rows of shape {rows.shape}; shape ({expected[0]}, ticks, {expected[1]}) must hold")
+        if not rows.shape[1]:
+            return np.empty((*rows.shape[:2], len(self.names)), np.float32), state
+        there = np.isfinite(rows)
+        filled, last = self._filled(rows, there, state)
+        residuals, own = self._run(filled, state.own)
+        # A fresh array: sources may give views of what they keep.
+        residuals = np.array(residuals, dtype=np.float32)
+        if not there.all():
+            gone = (~there).astype(np.float32) @ self._read_by.astype(np.float32)
+            residuals[gone > 0.0] = np.nan
+        return residuals, SourceState(last, state.known | there.any(axis=1), own)
+
+    @property
+    def _read_by(self) -> NDArray[np.bool_]:
+        """Which inputs each residual reads, shape (inputs, residuals)."""
+        return np.array([[name in reads for reads in self.reads] for name in self.inputs]).reshape(
+            len(self.inputs), len(self.names)
+        )
+
+    @staticmethod
+    def _filled(rows: Rows, there: NDArray[np.bool_], state: SourceState) -> tuple[Rows, Rows]:
+        """Rows in which the last value stands in for each missing one, and the last values behind them."""
+        if there.all():
+            return rows, rows[:, -1].copy()
+        ticks = np.arange(1, rows.shape[1] + 1)[None, :, None]
+        # The newest tick that has a value, 0 for none in this stretch.
+        newest = np.maximum.accumulate(np.where(there, ticks, 0), axis=1)
+        padded = np.concatenate([state.last[:, None], rows], axis=1)
+        filled = np.take_along_axis(padded, newest, axis=1)
+        return filled, filled[:, -1].copy()
+
+    @abstractmethod
+    def _start(self, streams: int) -> Any:
+        """What the source itself carries, at the start."""
+
+    @abstractmethod
+    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+        """`run` on finite rows."""
+
+    @abstractmethod
+    def parts(self) -> SourceParts:
+        """All of it, for its files."""
+
+    @classmethod
+    @abstractmethod
+    def of_parts(cls, parts: SourceParts) -> ResidualSource:
+        """The source that `parts` describes.
+
+        Raises:
+            ValueError: values that cannot be; files are data from outside.
+        """
+
+
+class ResidualSpec(ABC):
+    """Options of a source; frozen dataclasses entered in `RESIDUALS`.
+
+    Attributes:
+        source: class of what `fit` gives.
+    """
+
+    source: ClassVar[type[ResidualSource]]
+
+    @abstractmethod
+    def fit(self, material: FitMaterial) -> ResidualSource | None:
+        """A source fitted to healthy sessions; None where these channels offer nothing to judge.
+
+        Raises:
+            EdpError: material that cannot be used.
+        """
+
+
+RESIDUALS: Registry[type[ResidualSpec]] = Registry("residual")
+
+
+def texts_of(values: Any, what: str) -> tuple[str, ...]:
+    """A list of texts from a file.
+
+    Raises:
+        ValueError: something else, or too many.
+    """
+    if not isinstance(values, list | tuple) or len(values) > MOST_RESIDUALS * 8:
+        raise ValueError(f"{what} is no list of at most {MOST_RESIDUALS * 8} texts")
+    if not all(isinstance(value, str) and len(value) <= 1024 for value in values):
+        raise ValueError(f"{what} holds something else than texts of at most 1024 characters")
+    return tuple(values)
+
+
+def residuals_of(source: ResidualSource, recordings: Sequence[Recording], streams: int = 16) -> list[Rows]:
+    """Residuals of whole recordings, each from its start, shape (ticks, residuals) each.
+
+    A channel that a recording lacks is missing throughout.
+    """
+    piece = 2048
+    order = sorted(range(len(recordings)), key=lambda i: recordings[i].samples)
+    results: dict[int, Rows] = {}
+    for first in range(0, len(order), streams):
+        members = order[first : first + streams]
+        inputs = [rows_of(recordings[i], source.inputs) for i in members]
+        longest = max(len(rows) for rows in inputs)
+        state, out = source.initial_state(len(members)), []
+        for start in range(0, longest, piece):
+            stop = min(start + piece, longest)
+            # A shorter stream repeats its last tick; those residuals are cut off below.
+            at = np.arange(start, stop)
+            rows = np.stack([values[np.minimum(at, len(values) - 1)] for values in inputs])
+            residuals, state = source.run(rows, state)
+            out.append(residuals)
+        whole = np.concatenate(out, axis=1)
+        results.update({i: whole[lane, : len(inputs[lane])].copy() for lane, i in enumerate(members)})
+    return [results[i] for i in range(len(recordings))]
+
+
+def rows_of(recording: Recording, names: Sequence[str]) -> Rows:
+    """Values of the named channels, shape (ticks, names); NaN for a channel that the recording lacks."""
+    values = np.full((recording.samples, len(names)), np.nan, np.float32)
+    for column, name in enumerate(names):
+        if name in recording.channel_names:
+            values[:, column] = recording.column(name)
+    return values
+
+
+def residual_labels(plain: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Inputs and units of a source from its plain values.
+
+    Raises:
+        ValueError: too many residuals, or something else than texts.
+    """
+    inputs, units = texts_of(plain["inputs"], "its inputs"), texts_of(plain["units"], "its units")
+    if len(units) > MOST_RESIDUALS:
+        raise ValueError(f"it has {len(units)} residuals; at most {MOST_RESIDUALS} must hold")
+    return inputs, units

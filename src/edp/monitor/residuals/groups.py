@@ -1,0 +1,67 @@
+"""Which channels are judged together, and what must not be read for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, TABLE_A1, Channel, Kind
+
+SENSED = ("PumpPressure_1", "PumpPressure_2", "CylStroke_1", "CylStroke_2", "CylStroke_3", "OilTemperature")
+"""Of `EXTRA_CHANNELS`, those that a machine may have sensors for; the others only a simulation knows."""
+MOTION = (Kind.VELOCITY, Kind.ACCELERATION, Kind.POSITION)
+TURNING = (Kind.ANGULAR_VELOCITY, Kind.ANGLE)
+MOST_SINGLE = 24
+"""Channels up to which each is a group of its own; beyond them kinds are."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Channels that are judged together.
+
+    Attributes:
+        name: for messages.
+        judged: the channels.
+        unread: channels that would tell what is judged and must not be read, those that are judged left out.
+    """
+
+    name: str
+    judged: tuple[str, ...]
+    unread: tuple[str, ...] = ()
+
+
+def sensed_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
+    """Channels that sensors can give: without truth of a simulation."""
+    truth = {*EXTRA_CHANNELS, *GROUND_CHANNELS, *FAULT_CHANNELS} - {*SENSED}
+    return tuple(channel for channel in channels if channel.name not in truth)
+
+
+def groups_of(channels: Sequence[Channel]) -> tuple[Group, ...]:
+    """Groups by Table A.1; of other machines every channel is one, or where there are many every kind."""
+    names = {channel.name for channel in channels}
+    if len(names & {*TABLE_A1}) >= 9:
+        return _excavator_groups(names)
+    if len(channels) <= MOST_SINGLE:
+        return tuple(Group(channel.name, (channel.name,)) for channel in channels)
+    kinds = list(dict.fromkeys(channel.kind for channel in channels))
+    return tuple(Group(str(kind), tuple(c.name for c in channels if c.kind is kind)) for kind in kinds)
+
+
+def _excavator_groups(names: set[str]) -> tuple[Group, ...]:
+    """Velocities, head pressures, rod pressures, pump pressures, pilots."""
+    numbers = range(1, 4)
+    velocities = tuple(f"CylVels_{n}" for n in numbers)
+    shadows = (*(f"CylAcc_{n}" for n in numbers), *(f"CylStroke_{n}" for n in numbers))
+    groups = (
+        Group("velocities", velocities, shadows),
+        Group("head pressures", tuple(f"CylPressures_{n}" for n in numbers)),
+        Group("rod pressures", tuple(f"CylPressures_{n + 4}" for n in numbers)),
+        Group("pump pressures", ("PumpPressure_1", "PumpPressure_2")),
+        Group("pilot pressures", tuple(TABLE_A1)[12:18], ()),
+        Group("conflux pilot pressures", tuple(TABLE_A1)[18:], ()),
+    )
+    present = (
+        Group(g.name, tuple(n for n in g.judged if n in names), tuple(n for n in g.unread if n in names))
+        for g in groups
+    )
+    return tuple(group for group in present if group.judged)

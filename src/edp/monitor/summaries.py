@@ -1,0 +1,226 @@
+"""From residuals at every tick to few numbers a block: sums in a fixed order, which C repeats bit by bit.
+
+Only + - * / sqrt and comparisons are used, in double precision, one tick after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
+"""Of each residual and block, in this order."""
+NEAR_ZERO = 0.05
+"""Variance in healthy units that is added below `gain` and `lag`: a channel at rest tells neither."""
+MOST_BLOCK = 1_000_000
+"""Ticks of a block."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSummaries:
+    """What is taken of each block.
+
+    r is a residual over its healthy `scale`, u the channel that it judges less its `centre` over its `spread`, d the
+    change of u since the tick before, n the ticks of the block at which r is there::
+
+        mean = sum r / n                      spread = sqrt(sqrt(max(sum r^2 / n - mean^2, 0)))
+        gain = sum r u / (sum u^2 + 0.05 n)   lag    = sum r d / (sum d^2 + 0.05 n D)
+        peak = sqrt(max |r|)
+
+    A block in which more than half of the ticks of a residual are missing gives NaN for it.
+
+    Attributes:
+        block: ticks of a block.
+        scale: of each residual, shape (residuals,).
+        channel: place of the channel that each residual judges among the raw inputs, shape (residuals,).
+        centre: of each raw input, shape (inputs,); `spread` likewise.
+        spread: above zero.
+        change: D, healthy variance of d of the channel of each residual, shape (residuals,).
+        moving: places of inputs whose mean size is part of the operating point.
+        level: places of inputs whose mean is part of the operating point.
+    """
+
+    block: int
+    scale: Array
+    channel: NDArray[np.int64]
+    centre: Array
+    spread: Array
+    change: Array
+    moving: NDArray[np.int64]
+    level: NDArray[np.int64]
+
+    @property
+    def residuals(self) -> int:
+        """Number of residuals."""
+        return len(self.scale)
+
+    @property
+    def width(self) -> int:
+        """Numbers of a block: `SUMMARIES` of the first residual, of the second, and so on."""
+        return len(SUMMARIES) * self.residuals
+
+    @property
+    def points(self) -> int:
+        """Numbers of the operating point: 1, levels, sizes of what moves."""
+        return 1 + len(self.level) + len(self.moving)
+
+    def initial_state(self) -> SummaryState:
+        """Before the first tick of one machine."""
+        sums = {name: np.zeros(self.residuals) for name in ("n", "r", "rr", "ru", "uu", "rd", "dd", "peak")}
+        inputs = len(self.centre)
+        sums |= {"y": np.zeros(inputs), "size": np.zeros(inputs)}
+        return SummaryState(0, self.centre, False, sums)
+
+    def run(
+        self, residuals: NDArray[Any], rows: NDArray[Any], state: SummaryState
+    ) -> tuple[Array, Array, SummaryState]:
+        """Blocks that end within a stretch.
+
+        Args:
+            residuals: shape (ticks, residuals), NaN where not available.
+            rows: raw inputs, shape (ticks, inputs); a missing value counts as the last one that was there.
+            state: before it.
+
+        Returns:
+            Summaries, shape (blocks, width); operating points, shape (blocks, points); the state behind the stretch.
+        """
+        summaries, points = [], []
+        at, ticks = 0, len(residuals)
+        # Whole blocks from a block's beginning run side by side; the rest goes tick by tick. The bits are the same.
+        while at < ticks:
+            if state.ticks == 0 and ticks - at >= self.block:
+                blocks = (ticks - at) // self.block
+                stop = at + blocks * self.block
+            else:
+                blocks, stop = 1, min(ticks, at + self.block - state.ticks)
+            shape = (blocks, (stop - at) // blocks, -1)
+            state = self._take(residuals[at:stop].reshape(shape), rows[at:stop].reshape(shape), state)
+            if state.ticks == self.block:
+                summary, point = self._closed(state)
+                summaries.append(summary.reshape(-1, self.width))
+                points.append(point.reshape(-1, self.points))
+                fresh = self.initial_state()
+                state = SummaryState(0, state.last, state.started, fresh.sums)
+            at = stop
+        none = (np.zeros((0, self.width)), np.zeros((0, self.points)))
+        return (np.concatenate(summaries), np.concatenate(points), state) if summaries else (*none, state)
+
+    def _take(self, residuals: NDArray[Any], rows: NDArray[Any], state: SummaryState) -> SummaryState:
+        """The sums after some ticks of several consecutive blocks side by side, shape (blocks, ticks, ...) each."""
+        blocks, ticks = residuals.shape[:2]
+        there = np.isfinite(residuals)
+        r = np.where(there, residuals, 0.0).astype(np.float64) / self.scale
+        flat = _filled(rows.reshape(blocks * ticks, -1).astype(np.float64), state.last)
+        y_flat = (flat - self.centre) / self.spread
+        # The first tick of a stream is its own predecessor.
+        first = (state.last - self.centre) / self.spread if state.started else y_flat[0]
+        before = np.concatenate([first[None], y_flat[:-1]])
+        y, d = y_flat.reshape(blocks, ticks, -1), (y_flat - before).reshape(blocks, ticks, -1)
+        u, change = y[..., self.channel], d[..., self.channel]
+        sums = {name: np.repeat(values[None], blocks, 0) for name, values in state.sums.items()}
+        for tick in range(ticks):
+            rt, ut, dt, finite = r[:, tick], u[:, tick], change[:, tick], there[:, tick]
+            sums["n"] = sums["n"] + finite
+            sums["r"] = sums["r"] + rt
+            sums["rr"] = sums["rr"] + rt * rt
+            sums["ru"] = sums["ru"] + rt * ut
+            sums["uu"] = sums["uu"] + ut * ut
+            sums["rd"] = sums["rd"] + rt * dt
+            sums["dd"] = sums["dd"] + dt * dt
+            sums["peak"] = np.maximum(sums["peak"], np.abs(rt))
+            sums["y"] = sums["y"] + y[:, tick]
+            sums["size"] = sums["size"] + np.abs(y[:, tick])
+        if blocks == 1:
+            sums = {name: values[0] for name, values in sums.items()}
+        return SummaryState(state.ticks + ticks, flat[-1].copy(), True, sums)
+
+    def _closed(self, state: SummaryState) -> tuple[Array, Array]:
+        """Summaries and operating points of blocks that have come to their end."""
+        sums = state.sums
+        n = np.maximum(sums["n"], 1.0)
+        mean = sums["r"] / n
+        variance = np.maximum(sums["rr"] / n - mean * mean, 0.0)
+        whole = float(self.block)
+        gain = sums["ru"] / (sums["uu"] + NEAR_ZERO * whole)
+        lag = sums["rd"] / (sums["dd"] + NEAR_ZERO * whole * self.change)
+        summary = np.stack([mean, np.sqrt(np.sqrt(variance)), gain, lag, np.sqrt(sums["peak"])], axis=-1)
+        # More than half of the ticks are missing: the block says nothing of this residual.
+        summary[2.0 * sums["n"] < whole] = np.nan
+        levels = sums["y"][..., self.level] / whole
+        sizes = sums["size"][..., self.moving] / whole
+        return summary, np.concatenate([np.ones((*levels.shape[:-1], 1)), levels, sizes], axis=-1)
+
+    def names(self, residuals: Sequence[str]) -> tuple[str, ...]:
+        """Names of the summaries, such as ``virtual:CylVels_1.mean``."""
+        return tuple(f"{residual}.{summary}" for residual in residuals for summary in SUMMARIES)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values of its file."""
+        return {"block": self.block}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Numbers of its file."""
+        names = ("scale", "channel", "centre", "spread", "change", "moving", "level")
+        return {name: getattr(self, name) for name in names}
+
+    @staticmethod
+    def of(plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> BlockSummaries:
+        """From plain values and arrays.
+
+        Raises:
+            ValueError: values that cannot be.
+        """
+        block = plain["block"]
+        if isinstance(block, bool) or not isinstance(block, int) or not 1 <= block <= MOST_BLOCK:
+            raise ValueError(f"a block has {str(block)[:40]} ticks; 1 to {MOST_BLOCK:,} must hold")
+        numbers = {name: np.asarray(arrays[name], np.float64) for name in ("scale", "centre", "spread", "change")}
+        places = {name: np.asarray(arrays[name], np.int64) for name in ("channel", "moving", "level")}
+        inputs, residuals = numbers["centre"].shape, numbers["scale"].shape
+        if any(values.ndim != 1 for values in (*numbers.values(), *places.values())):
+            raise ValueError("arrays of the summaries are no lists of numbers")
+        if numbers["spread"].shape != inputs or places["channel"].shape != residuals != numbers["change"].shape:
+            raise ValueError("arrays of the summaries have other lengths than each other")
+        if numbers["change"].shape != residuals:
+            raise ValueError("arrays of the summaries have other lengths than each other")
+        if any(((p < 0) | (p >= inputs[0])).any() for p in places.values()):
+            raise ValueError("summaries name an input that there is not")
+        if not all(np.isfinite(values).all() for values in numbers.values()):
+            raise ValueError("a number of the summaries is not finite")
+        if not all((numbers[name] > 0.0).all() for name in ("scale", "spread", "change")):
+            raise ValueError("a width of the summaries is not positive")
+        centre, spread = numbers["centre"], numbers["spread"]
+        moving, level = places["moving"], places["level"]
+        channel, change = places["channel"], numbers["change"]
+        return BlockSummaries(block, numbers["scale"], channel, centre, spread, change, moving, level)
+
+
+@dataclass(frozen=True, eq=False)
+class SummaryState:
+    """Sums of a block that has begun.
+
+    Attributes:
+        ticks: of it.
+        last: the inputs of the tick before, the last ones that were there, shape (inputs,).
+        started: whether there was a tick before.
+        sums: by name.
+    """
+
+    ticks: int
+    last: Array
+    started: bool
+    sums: Mapping[str, Array] = field(default_factory=dict)
+
+
+def _filled(rows: Array, last: Array) -> Array:
+    """Rows in which the last value stands in for a missing one."""
+    there = np.isfinite(rows)
+    if there.all():
+        return rows
+    newest = np.maximum.accumulate(np.where(there, np.arange(1, len(rows) + 1)[:, None], 0), axis=0)
+    filled: Array = np.take_along_axis(np.concatenate([last[None], rows]), newest, axis=0)
+    return filled

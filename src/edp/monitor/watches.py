@@ -1,0 +1,173 @@
+"""What watches conditioned rows: a linear view of them and a detector on it, several side by side under one limit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+from edp.monitor.detectors.base import Detector, DetectorSpec
+from edp.settings.bounds import check_bounds, span
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchSpec:
+    """Options of one view.
+
+    Attributes:
+        detector: that sees it.
+        memory_s: time over which rows are averaged where the covariance is taken that the view makes white; 0 takes
+            single rows. A slow fault is a shift of averages, and averages of healthy sessions scatter more widely,
+            in other directions, than independent rows would.
+        shrink: share of the diagonal in that covariance.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    detector: DetectorSpec
+    memory_s: float = 0.0
+    shrink: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_bounds("watches", self, memory_s=span(0.0, 3600.0), shrink=span(0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """A fitted view.
+
+    Attributes:
+        detector: that sees it.
+        mean: of healthy rows, shape (summaries,).
+        matrix: shape (summaries, directions).
+        scale: of the detector's statistic: over it, statistics of all watches are compared with one limit.
+    """
+
+    detector: DetectorSpec
+    mean: Array
+    matrix: Array
+    scale: float = 1.0
+
+    @property
+    def directions(self) -> int:
+        """Numbers that the detector sees."""
+        return int(self.matrix.shape[1])
+
+    def __call__(self, rows: Array) -> Array:
+        """White rows, shape (blocks, directions); a missing summary counts as healthy.
+
+        Each sum goes from the first summary to the last, as in C.
+        """
+        centred = rows - self.mean
+        centred = np.where(np.isfinite(centred), centred, 0.0)
+        white = np.zeros((len(rows), self.directions))
+        for place in range(centred.shape[1]):
+            white = white + centred[:, place, None] * self.matrix[place]
+        return white
+
+
+def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, settle: int) -> Watch:
+    """A view from conditioned rows of healthy sessions, shape (blocks, summaries) each.
+
+    Raises:
+        DataError: too few rows.
+    """
+    blocks = max(1, round(spec.memory_s * blocks_per_s))
+    rows = np.concatenate([_averaged(np.nan_to_num(session[settle:]), blocks) for session in sessions])
+    if len(rows) < 2 * blocks + 8:
+        raise DataError(f"{len(rows)} averages over {blocks} blocks are too few for a covariance; bring more hours")
+    mean = rows.mean(axis=0)
+    centred = rows - mean
+    covariance = centred.T @ centred / len(rows)
+    variances = np.diag(covariance)
+    kept = variances > 1e-9 * max(float(variances.max()), 1e-300)
+    size = np.sqrt(np.where(kept, variances, 1.0))
+    correlation = (covariance / np.outer(size, size))[np.ix_(kept, kept)]
+    correlation = (1.0 - spec.shrink) * correlation + spec.shrink * np.eye(int(kept.sum()))
+    values, vectors = np.linalg.eigh(correlation)
+    fine = values > 1e-6
+    matrix = np.zeros((rows.shape[1], int(fine.sum())))
+    matrix[kept] = vectors[:, fine] / np.sqrt(values[fine]) / size[kept][:, None]
+    # An average of `blocks` independent white rows has a variance of 1 / blocks: single rows then have about one.
+    return Watch(spec.detector, mean, matrix / np.sqrt(blocks))
+
+
+def _averaged(rows: Array, blocks: int) -> Array:
+    """Means of `blocks` rows, every half of that; of a shorter session the mean of all."""
+    if blocks == 1 or not len(rows):
+        return rows
+    if len(rows) <= blocks:
+        whole: Array = rows.mean(axis=0, keepdims=True)
+        return whole
+    sums = np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
+    starts = np.arange(0, len(rows) - blocks + 1, max(1, blocks // 2))
+    averages: Array = (sums[starts + blocks] - sums[starts]) / blocks
+    return averages
+
+
+class _Bank(Detector):
+    def __init__(self, watches: Sequence[Watch], lanes: int) -> None:
+        super().__init__(sum(watch.directions for watch in watches), lanes)
+        self.detectors = [watch.detector.build(watch.directions, lanes) for watch in watches]
+        self.scales = [watch.scale for watch in watches]
+        self.ends = np.cumsum([0, *(watch.directions for watch in watches)]).tolist()
+        self.each = np.zeros((len(watches), lanes))
+
+    def _take(self, rows: Array) -> Array:
+        for place, detector in enumerate(self.detectors):
+            part = rows[:, self.ends[place] : self.ends[place + 1]]
+            self.each[place] = detector.step(part) / self.scales[place]
+        largest: Array = self.each.max(axis=0)
+        return largest
+
+    def reset(self, lanes: NDArray[np.bool_] | None = None) -> None:
+        for detector in self.detectors:
+            detector.reset(lanes)
+
+
+@dataclass(frozen=True, eq=False)
+class BankSpec(DetectorSpec):
+    """All watches as one detector: its rows are the white rows of each, one behind the other; the largest counts."""
+
+    watches: tuple[Watch, ...]
+
+    def build(self, channels: int, lanes: int = 1) -> Detector:
+        """See `DetectorSpec.build`."""
+        bank = _Bank(self.watches, lanes)
+        if bank.channels != channels:
+            raise DataError(f"rows of {channels} numbers; the watches see {bank.channels}")
+        return bank
+
+    def white(self, rows: Array) -> Array:
+        """Rows as the bank takes them, of conditioned ones."""
+        return np.concatenate([watch(rows) for watch in self.watches], axis=1)
+
+
+def scaled_alike(watches: Sequence[Watch], sessions: Sequence[Array], settle: int) -> tuple[Watch, ...]:
+    """The watches with scales at which each is as eager: of its largest statistic of a healthy session the upper tenth.
+
+    Args:
+        watches: with a scale of one.
+        sessions: conditioned rows of healthy sessions.
+        settle: blocks of the start of a session that are not watched.
+    """
+    result = []
+    for watch in watches:
+        peaks = []
+        for session in sessions:
+            detector, white = watch.detector.build(watch.directions), watch(session[settle:])
+            values = [float(detector.step(row[None])[0]) for row in white]
+            peaks.append(max(values, default=0.0))
+        scale = float(np.quantile(peaks, EAGER)) if peaks else 1.0
+        result.append(Watch(watch.detector, watch.mean, watch.matrix, max(scale, 1e-9)))
+    return tuple(result)
+
+
+EAGER = 0.8
+"""Of the largest statistics of healthy sessions: where watches are made equal."""

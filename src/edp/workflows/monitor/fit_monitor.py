@@ -1,0 +1,217 @@
+"""From runs of a machine and healthy logs of it to a monitor."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edp.config.monitor import MonitorExperiment, monitor_toml
+from edp.errors import ConfigError, DataError, closest
+from edp.logs.source import DataSource
+from edp.monitor.fitting import fit_chain, session_means
+from edp.monitor.monitor import Monitor
+from edp.monitor.monitor_file import save_monitor
+from edp.monitor.residuals.base import FitMaterial, note_nothing
+from edp.monitor.residuals.groups import sensed_channels
+from edp.recording import Recording
+from edp.signals import Channel
+from edp.storage import check_writable, write_bytes
+from edp.training.blas import one_blas_thread
+from edp.training.bundle import Bundle, load_bundle
+from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
+
+LEAST_SESSIONS = 8
+"""Of healthy sessions: two to train on, one to choose by, and some for the rest."""
+CUT_S = 480.0
+"""Where there are too few sessions, longer ones are cut into pieces of this length."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedMonitor:
+    """A monitor and what is to be said of its fit.
+
+    Attributes:
+        monitor: ready to run.
+        doubtful: names of healthy sessions that were left out.
+        seconds: processor time.
+        folder: where it lies; None where it was not saved.
+    """
+
+    monitor: Monitor
+    doubtful: tuple[str, ...]
+    seconds: float
+    folder: Path | None = None
+
+
+def fit_monitor(
+    runs: Sequence[str | Path],
+    source: DataSource,
+    experiment: MonitorExperiment,
+    out: str | Path,
+    note: Callable[[str], None] = note_nothing,
+) -> FittedMonitor:
+    """Fit a monitor to healthy logs and write its folder.
+
+    Args:
+        runs: run folders of networks or twins of this machine; may be empty.
+        source: healthy logs.
+        experiment: settings.
+        out: folder of the monitor.
+        note: called with what begins.
+
+    Raises:
+        EdpError: runs or logs that cannot be used, or too few hours for the promise.
+    """
+    check_writable(out)
+    bundles = [load_twin(run) if holds_twin(run) else load_bundle(run) for run in runs]
+    recordings = source.read()
+    fitted = fit_to_recordings(recordings, experiment, bundles, note)
+    folder = save_monitor(fitted.monitor, out)
+    write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
+    return FittedMonitor(fitted.monitor, fitted.doubtful, fitted.seconds, folder)
+
+
+@one_blas_thread()
+def fit_to_recordings(
+    recordings: Sequence[Recording],
+    experiment: MonitorExperiment,
+    bundles: Sequence[Bundle | TwinBundle] = (),
+    note: Callable[[str], None] = note_nothing,
+) -> FittedMonitor:
+    """`fit_monitor` without files.
+
+    Raises:
+        EdpError: recordings that cannot be used, or too few hours for the promise.
+    """
+    began = time.process_time()
+    channels = watched_channels(recordings, experiment)
+    _check_values(recordings, channels)
+    sessions = _enough_sessions(recordings)
+    _check_hours(sessions, experiment)
+    train, validation, rest = _divided(sessions, experiment)
+    material = FitMaterial(
+        train=train,
+        validation=validation,
+        channels=channels,
+        rate_hz=recordings[0].rate_hz,
+        predictors=tuple(bundle for bundle in bundles if isinstance(bundle, Bundle)),
+        twins=tuple(bundle for bundle in bundles if isinstance(bundle, TwinBundle)),
+        groups=experiment.groups,
+        seed=experiment.seed,
+        minutes=experiment.minutes,
+        note=note,
+    )
+    fits = [spec.fit(material) for spec in experiment.residuals]
+    sources = tuple(source for source in fits if source is not None)
+    if not sources:
+        raise DataError(
+            "none of the settings' residuals finds something to judge in these channels; name further channels or "
+            "residuals"
+        )
+    fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note)
+    provenance: dict[str, Any] = {
+        "sessions": len(sessions),
+        "hours": sum(session.duration_s for session in sessions) / 3600.0,
+        "doubtful": list(fitted.doubtful),
+        "seed": experiment.seed,
+    }
+    monitor = Monitor(
+        channels,
+        recordings[0].rate_hz,
+        sources,
+        fitted.chain,
+        fitted.limit,
+        session_means(channels, sessions),
+        provenance=provenance,
+    )
+    return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began)
+
+
+def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
+    """Channels that all recordings have and sensors can give, or those of the settings.
+
+    Raises:
+        DataError: a named channel is missing, rates differ, or fewer than two channels are left.
+    """
+    if not recordings:
+        raise DataError("there are no healthy logs; give a log or a folder of logs")
+    first = recordings[0]
+    rates = sorted({recording.rate_hz for recording in recordings})
+    if rates[-1] > rates[0] * 1.001:
+        raise DataError(f"healthy logs have rates from {rates[0]:g} to {rates[-1]:g} Hz; set rate_hz in the signal map")
+    for name in experiment.channels:
+        for recording in recordings:
+            if name not in recording.channel_names:
+                hint = closest(name, recording.channel_names)
+                raise DataError(f"healthy log '{recording.name}' has no channel '{name}'{hint}")
+    shared = set(first.channel_names).intersection(*(recording.channel_names for recording in recordings))
+    offered = [channel for channel in sensed_channels(first.channels) if channel.name in shared]
+    wanted = experiment.channels or tuple(channel.name for channel in offered)
+    channels = tuple(channel for channel in first.channels if channel.name in wanted)
+    if len(channels) < 2:
+        raise DataError(f"{len(channels)} channel can be watched; a monitor compares two at least: map more columns")
+    return channels
+
+
+def _check_values(recordings: Sequence[Recording], channels: Sequence[Channel]) -> None:
+    """Healthy logs have all values: what networks learn from must be there."""
+    names = [channel.name for channel in channels]
+    for recording in recordings:
+        bad = ~np.isfinite(recording.select(names))
+        if bad.any():
+            row, which = (int(i) for i in np.argwhere(bad)[0])
+            raise DataError(
+                f"healthy log '{recording.name}': channel '{names[which]}' has missing values, the first at row {row}; "
+                'allow a repair (nan = "hold"), or leave the channel out'
+            )
+
+
+def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings, or where there are few pieces of them."""
+    if len(recordings) >= LEAST_SESSIONS:
+        return list(recordings)
+    pieces = []
+    for recording in recordings:
+        longest = round(CUT_S * recording.rate_hz)
+        wanted = -(-2 * LEAST_SESSIONS // len(recordings))
+        count = max(-(-recording.samples // longest), wanted)
+        edges = np.linspace(0, recording.samples, count + 1).astype(int).tolist()
+        pieces += [recording.rows(a, b) for a, b in itertools.pairwise(edges) if b > a]
+    return pieces
+
+
+def _check_hours(sessions: Sequence[Recording], experiment: MonitorExperiment) -> None:
+    """Refuse a promise that the hours cannot support before networks are trained for it."""
+    hours = sum(session.duration_s for session in sessions) / 3600.0
+    left = hours * (1.0 - experiment.train_share)
+    if left < experiment.hours_per_false_alarm:
+        promised = experiment.hours_per_false_alarm
+        raise ConfigError(
+            f"{hours:.3g} h of healthy logs are too few for one false alarm in {promised:g} h: "
+            f"{experiment.train_share:.0%} of them train residuals, and what is left supports one in {left:.3g} h; ask "
+            f"for that with --hours-per-false-alarm {0.97 * left:.3g}, or bring "
+            f"{promised / (1.0 - experiment.train_share) - hours:.3g} h more"
+        )
+
+
+def _divided(
+    sessions: Sequence[Recording], experiment: MonitorExperiment
+) -> tuple[list[Recording], list[Recording], list[Recording]]:
+    """Sessions that train residuals, that choose among fits, and the rest, drawn at random."""
+    order = np.random.default_rng(experiment.seed).permutation(len(sessions)).tolist()
+    total, taken = sum(session.samples for session in sessions), 0
+    count = 0
+    for count, place in enumerate(order, start=1):
+        taken += sessions[place].samples
+        if taken >= experiment.train_share * total and count >= 2:
+            break
+    count = min(count, len(sessions) - 4)
+    chosen = [sessions[i] for i in order[:count]]
+    cut = max(1, count // 6)
+    return chosen[cut:], chosen[:cut], [sessions[i] for i in sorted(order[count:])]

@@ -1,0 +1,116 @@
+"""What every registered source of residuals keeps: streaming, silence of what is missing, and its files."""
+
+import numpy as np
+import pytest
+
+from edp.monitor.residuals import RESIDUALS, FitMaterial, ResidualSource
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+from edp.testing.monitor import rig_sessions
+
+TICKS = 400
+
+
+@pytest.fixture(scope="module")
+def sessions() -> list[Recording]:
+    return rig_sessions(6, TICKS, seed=3)
+
+
+@pytest.fixture(scope="module", params=list(RESIDUALS))
+def source(request, sessions) -> ResidualSource:
+    material = FitMaterial(sessions[:4], sessions[4:5], sessions[0].channels, 100.0, minutes=0.02)
+    fitted = RESIDUALS[request.param]().fit(material)
+    if fitted is None:
+        pytest.skip(f"{request.param} needs what this rig does not offer")
+    return fitted
+
+
+def rows_of(source: ResidualSource, recordings) -> np.ndarray:
+    return np.stack([recording.select(source.inputs) for recording in recordings])
+
+
+def test_ticks_chunks_and_one_call_agree(source, sessions):
+    rows = rows_of(source, sessions[:2])[:, :150]
+    whole, _ = source.run(rows, source.initial_state(2))
+    for length in (1, 37):
+        state, parts = source.initial_state(2), []
+        for start in range(0, rows.shape[1], length):
+            part, state = source.run(rows[:, start : start + length], state)
+            parts.append(part)
+        scale = np.abs(whole).max(axis=(0, 1))
+        np.testing.assert_allclose(np.concatenate(parts, axis=1) / scale, whole / scale, atol=2e-4)
+
+
+def test_a_missing_channel_silences_what_reads_it_and_spoils_nothing(source, sessions):
+    rows = rows_of(source, sessions[:1])
+    gone = rows.copy()
+    gone[:, 50:60, 0] = np.nan
+    residuals, _ = source.run(gone, source.initial_state(1))
+    silent = np.array([source.inputs[0] in reads for reads in source.reads])
+    assert np.isnan(residuals[0, 50:60][:, silent]).all()
+    assert np.isfinite(residuals[0, 50:60][:, ~silent]).all()
+    assert np.isfinite(residuals[0, 60:]).all()
+    state = source.initial_state(1)
+    for tick in gone[0]:
+        one, state = source.run(tick[None, None], state)
+        assert np.isnan(one[0, 0][silent]).all() == bool(np.isnan(tick[0])) or not silent.any()
+
+
+def test_missing_from_the_start(source, sessions):
+    rows = rows_of(source, sessions[:1])
+    rows[:, :, 0] = np.nan
+    residuals, _ = source.run(rows, source.initial_state(1))
+    silent = np.array([source.inputs[0] in reads for reads in source.reads])
+    assert np.isnan(residuals[..., silent]).all()
+    assert np.isfinite(residuals[..., ~silent]).all()
+
+
+def test_facts_have_one_entry_a_residual(source):
+    assert len(source.names) == len(source.judged) == len(source.reads) == len(source.units)
+    assert len(set(source.names)) == len(source.names)
+    assert all({*judged} <= {*reads} for judged, reads in zip(source.judged, source.reads, strict=True))
+
+
+def test_a_bias_of_what_is_judged_shows(source, sessions):
+    """Measured less expected: an offset of the channel moves its residual to its side, at least for a while."""
+    rows = rows_of(source, sessions[:1])
+    before, _ = source.run(rows, source.initial_state(1))
+    for place, judged in enumerate(source.judged):
+        column = source.inputs.index(judged[0])
+        moved = rows.copy()
+        moved[:, TICKS // 2 :, column] += 10.0 * rows[..., column].std()
+        after, _ = source.run(moved, source.initial_state(1))
+        assert (after - before)[0, TICKS // 2, place] > 0.0, source.names[place]
+
+
+def test_parts_give_the_same_source(source, sessions):
+    rows = rows_of(source, sessions[:1])
+    again = type(source).of_parts(source.parts())
+    assert (again.names, again.judged, again.reads, again.units, again.inputs) == (
+        source.names,
+        source.judged,
+        source.reads,
+        source.units,
+        source.inputs,
+    )
+    expected, _ = source.run(rows, source.initial_state(1))
+    given, _ = again.run(rows, again.initial_state(1))
+    np.testing.assert_array_equal(given, expected)
+
+
+def test_a_channel_of_another_kind_is_no_trap():
+    """A constant channel, and one that nothing explains, must not stop a fit."""
+    sessions = rig_sessions(4, TICKS, seed=5)
+    extended = [
+        Recording(
+            s.name,
+            (*s.channels, Channel("constant", Kind.GENERIC)),
+            np.concatenate([s.values, np.ones((TICKS, 1), np.float32)], axis=1),
+            s.rate_hz,
+        )
+        for s in sessions
+    ]
+    material = FitMaterial(extended[:3], extended[3:], extended[0].channels, 100.0, minutes=0.02)
+    for spec in RESIDUALS.values():
+        fitted = spec().fit(material)
+        assert fitted is None or not any("constant" in judged for judged in fitted.judged)
