@@ -96,7 +96,8 @@ def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: 
             f"{len(s)} blocks of healthy sessions are too few for an operating point of {p.shape[1]} numbers; bring "
             f"{4 * p.shape[1]} at least, or make block_s smaller"
         )
-    offset, scatter = p[:, 1:].mean(axis=0), p[:, 1:].std(axis=0)
+    offset: Array = p[:, 1:].mean(axis=0)
+    scatter = p[:, 1:].std(axis=0)
     width: Array = np.where(scatter > 1e-9, scatter, 1.0).astype(np.float64)
     design = np.concatenate(
         [np.ones((len(p), 1)), np.clip((p[:, 1:] - offset) / width, -POINT_LIMIT, POINT_LIMIT)], axis=1
@@ -119,12 +120,18 @@ def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: 
         floor[column] = LEAST_WIDTH * size
         # The mean absolute deviation of a normal variable is 0.798 of its standard deviation.
         usual[column], spread[column] = line, wide / 0.798
+    # Single precision: a controller stores half as much, and the bits stay the same.
+    offset, width, usual, spread, floor = map(_single, (offset, width, usual, spread, floor))
     return Conditioning(offset, width, usual, spread, floor, clip)
+
+
+def _single(values: Array) -> Array:
+    return values.astype(np.float32).astype(np.float64)
 
 
 def _ridge(x: Array, y: Array) -> Array:
     """Coefficients of y on x; the constant is not drawn to zero."""
     penalty = RIDGE * len(x) * np.eye(x.shape[1])
     penalty[0, 0] = 0.0
-    line: Array = np.linalg.solve(x.T @ x + penalty + 1e-12 * np.eye(x.shape[1]), x.T @ y)
-    return line
+    line = np.linalg.solve(x.T @ x + penalty + 1e-12 * np.eye(x.shape[1]), x.T @ y)
+    return np.asarray(line, dtype=np.float64)

@@ -258,10 +258,10 @@ def fit_summaries(
     moving, level = _operating_channels(channels, rows, block)
     return BlockSummaries(
         block=block,
-        scale=np.concatenate(scales),
+        scale=1.0 / np.concatenate(scales),
         channel=np.array(judged, np.int64),
         centre=centre,
-        spread=spread,
+        spread=1.0 / spread,
         change=change[judged],
         moving=moving,
         level=level,
@@ -300,9 +300,11 @@ def blocks_of(
 def session_means(channels: Sequence[Channel], sessions: Sequence[Recording]) -> Array:
     """Mean over sessions of each channel's mean, and a generous deviation between sessions, shape (2, inputs)."""
     names = [channel.name for channel in channels]
-    rows = [rows_of(session, names).astype(np.float64) for session in sessions]
-    means = np.stack([np.nanmean(part, axis=0) for part in rows])
-    within = np.stack([np.nanstd(part, axis=0) for part in rows]).mean(axis=0)
-    between = means.std(axis=0)
-    width = between + 0.25 * within
-    return np.stack([means.mean(axis=0), np.where(width > 0.0, width, 1.0)])
+    means, within = [], []
+    # One session at a time: hundreds of hours in double precision would not fit into memory.
+    for session in sessions:
+        rows = rows_of(session, names).astype(np.float64)
+        means.append(rows.mean(axis=0))
+        within.append(rows.std(axis=0))
+    width = np.std(means, axis=0) + 0.25 * np.mean(within, axis=0)
+    return np.stack([np.mean(means, axis=0), np.where(width > 0.0, width, 1.0)])

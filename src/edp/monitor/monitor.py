@@ -25,6 +25,8 @@ MOST_EVIDENCE = 8
 """Summaries that an alarm names."""
 OTHER_MACHINE = 6.0
 """Healthy deviations of a session's mean of a channel, beyond which the channel is not that of this machine."""
+IMPOSSIBLE = 1e5
+"""Healthy deviations beyond which a value is a broken number, as exported code takes it."""
 OTHER_SHARE = 0.25
 """Of the channels: where more than these are beyond `OTHER_MACHINE`, the log is not of this machine."""
 
@@ -113,6 +115,13 @@ class Monitor:
         states = tuple(source.initial_state(1) for source in self.sources)
         return MonitorState(states, self.chain.initial_state(), 0, np.zeros(len(self.channels), np.int64))
 
+    def plausible(self, rows: Rows) -> Rows:
+        """Rows in which a value that no sensor gives is missing: not finite, or beyond `IMPOSSIBLE` deviations."""
+        summaries = self.chain.summaries
+        with np.errstate(invalid="ignore", over="ignore"):
+            possible = np.abs(rows.astype(np.float64) - summaries.centre) * summaries.spread <= IMPOSSIBLE
+        return rows if possible.all() else np.where(possible, rows, np.float32(np.nan))
+
     def residuals(self, rows: Rows, state: MonitorState) -> tuple[Rows, tuple[SourceState, ...]]:
         """Residuals of a stretch of one machine, shape (ticks, residuals), and the states of the sources behind it."""
         place = {name: i for i, name in enumerate(self.inputs)}
@@ -130,6 +139,7 @@ class Monitor:
             rows: raw channels in SI units, shape (ticks, inputs), NaN where missing.
             state: before it; its detectors go on in place.
         """
+        rows = self.plausible(rows)
         residuals, sources = self.residuals(rows, state)
         verdicts, chain = self.chain.run(residuals, rows, state.chain)
         missing = state.missing + (~np.isfinite(rows)).sum(axis=0)
@@ -162,7 +172,7 @@ class Monitor:
         self.check(recording)
         state, rows, out = self.initial_state(), rows_of(recording, self.inputs), []
         for start in range(0, len(rows), PIECE):
-            piece = rows[start : start + PIECE]
+            piece = self.plausible(rows[start : start + PIECE])
             residuals, sources = self.residuals(piece, state)
             z, chain = self.chain.conditioned(residuals, piece, state.chain)
             state = replace(state, sources=sources, chain=chain)

@@ -25,8 +25,8 @@ MOST_BLOCK = 1_000_000
 class BlockSummaries:
     """What is taken of each block.
 
-    r is a residual over its healthy `scale`, u the channel that it judges less its `centre` over its `spread`, d the
-    change of u since the tick before, n the ticks of the block at which r is there::
+    r is a residual times one over its healthy scale, u the channel that it judges less its `centre`, times one over its
+    healthy deviation, d the change of u since the tick before, n the ticks of the block at which r is there::
 
         mean = sum r / n                      spread = sqrt(sqrt(max(sum r^2 / n - mean^2, 0)))
         gain = sum r u / (sum u^2 + 0.05 n)   lag    = sum r d / (sum d^2 + 0.05 n D)
@@ -36,10 +36,11 @@ class BlockSummaries:
 
     Attributes:
         block: ticks of a block.
-        scale: of each residual, shape (residuals,).
+        scale: one over the healthy width of each residual, shape (residuals,): a controller multiplies faster than it
+            divides.
         channel: place of the channel that each residual judges among the raw inputs, shape (residuals,).
-        centre: of each raw input, shape (inputs,); `spread` likewise.
-        spread: above zero.
+        centre: of each raw input, shape (inputs,).
+        spread: one over the healthy deviation of each, above zero.
         change: D, healthy variance of d of the channel of each residual, shape (residuals,).
         moving: places of inputs whose mean size is part of the operating point.
         level: places of inputs whose mean is part of the operating point.
@@ -114,11 +115,11 @@ class BlockSummaries:
         """The sums after some ticks of several consecutive blocks side by side, shape (blocks, ticks, ...) each."""
         blocks, ticks = residuals.shape[:2]
         there = np.isfinite(residuals)
-        r = np.where(there, residuals, 0.0).astype(np.float64) / self.scale
+        r = np.where(there, residuals, 0.0).astype(np.float64) * self.scale
         flat = _filled(rows.reshape(blocks * ticks, -1).astype(np.float64), state.last)
-        y_flat = (flat - self.centre) / self.spread
+        y_flat = (flat - self.centre) * self.spread
         # The first tick of a stream is its own predecessor.
-        first = (state.last - self.centre) / self.spread if state.started else y_flat[0]
+        first = (state.last - self.centre) * self.spread if state.started else y_flat[0]
         before = np.concatenate([first[None], y_flat[:-1]])
         y, d = y_flat.reshape(blocks, ticks, -1), (y_flat - before).reshape(blocks, ticks, -1)
         u, change = y[..., self.channel], d[..., self.channel]

@@ -93,9 +93,11 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
     values, vectors = np.linalg.eigh(correlation)
     fine = values > 1e-6
     matrix = np.zeros((rows.shape[1], int(fine.sum())))
-    matrix[kept] = vectors[:, fine] / np.sqrt(values[fine]) / size[kept][:, None]
+    matrix[kept] = vectors[:, fine] / np.sqrt(values[fine] * blocks) / size[kept][:, None]
     # An average of `blocks` independent white rows has a variance of 1 / blocks: single rows then have about one.
-    return Watch(spec.detector, mean, matrix / np.sqrt(blocks))
+    # Single precision: a controller stores half as much, and the bits stay the same.
+    mean, matrix = (values.astype(np.float32).astype(np.float64) for values in (mean, matrix))
+    return Watch(spec.detector, mean, matrix)
 
 
 def _averaged(rows: Array, blocks: int) -> Array:

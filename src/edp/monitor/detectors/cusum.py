@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edp.monitor.detectors.base import DETECTORS, Array, Bools, Detector, DetectorSpec
+from edp.monitor.detectors.base import DETECTORS, Array, Bools, Detector, DetectorSpec, in_order
 from edp.settings.bounds import check_bounds, span
 
 
@@ -17,7 +17,7 @@ class _Cusum(Detector):
 
     def _take(self, rows: Array) -> Array:
         self.sums += rows
-        length = np.linalg.norm(self.sums, axis=1)
+        length = np.sqrt(in_order(np.square(self.sums)))
         # A sum that is shorter than the slack becomes zero; of a longer one the slack is taken off.
         left: Array = np.maximum(length - self.slack, 0.0)
         self.sums *= (left / np.maximum(length, 1e-300))[:, None]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edp.monitor.detectors.base import DETECTORS, Array, Bools, Detector, DetectorSpec
+from edp.monitor.detectors.base import DETECTORS, Array, Bools, Detector, DetectorSpec, in_order
 from edp.settings.bounds import above, check_bounds
 
 
@@ -18,7 +18,7 @@ class _Ewma(Detector):
     def _take(self, rows: Array) -> Array:
         self.means += self.weight * (rows - self.means)
         # The variance of the mean after long; at first it is smaller, and the detector is a little less eager.
-        statistic: Array = np.square(self.means).sum(axis=1) * ((2.0 - self.weight) / self.weight)
+        statistic: Array = in_order(np.square(self.means)) * ((2.0 - self.weight) / self.weight)
         return statistic
 
     def reset(self, lanes: Bools | None = None) -> None:

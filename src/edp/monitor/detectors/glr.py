@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edp.monitor.detectors.base import DETECTORS, Array, Bools, Detector, DetectorSpec
+from edp.monitor.detectors.base import DETECTORS, Array, Bools, Detector, DetectorSpec, in_order
 from edp.settings.bounds import check_bounds, integer
 
 
@@ -24,7 +24,7 @@ class _Glr(Detector):
         self.sums += rows[:, None, :]
         self.rows = np.minimum(self.rows + 1, self.window)
         lengths = np.arange(1, self.window + 1)
-        ratios = np.square(self.sums).sum(axis=2) / (2.0 * lengths)
+        ratios = in_order(np.square(self.sums)) / (2.0 * lengths)
         statistic: Array = np.where(lengths <= self.rows[:, None], ratios, 0.0).max(axis=1)
         return statistic
 

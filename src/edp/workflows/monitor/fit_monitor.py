@@ -119,6 +119,9 @@ def fit_to_recordings(
         "sessions": len(sessions),
         "hours": sum(session.duration_s for session in sessions) / 3600.0,
         "doubtful": list(fitted.doubtful),
+        "trained_on": [session.name for session in (*train, *validation)],
+        "calibrated_on": [session.name for session in rest if session.name not in fitted.doubtful],
+        "seconds": time.process_time() - began,
         "seed": experiment.seed,
     }
     monitor = Monitor(
