@@ -1,5 +1,6 @@
 """Monitors as C99 without heap: residuals, chain and alarms beside the predictor, and a self-test."""
 
+from edp.export.monitor.fmu import write_monitor_fmu
 from edp.export.monitor.golden import drawn_rows
 from edp.export.monitor.parts import (
     BalancePart,
@@ -26,4 +27,5 @@ __all__ = [
     "drawn_rows",
     "monitor_files",
     "write_monitor",
+    "write_monitor_fmu",
 ]

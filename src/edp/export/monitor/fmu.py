@@ -26,7 +26,7 @@ OUTPUTS = (
 
 def monitor_variables(parts: MonitorParts) -> list[Variable]:
     """Inputs and outputs in the order of the monitor's C structures, then those of the FMU itself."""
-    spread = parts.chain.spread
+    spread = 1.0 / parts.chain.spread
     inputs = [
         Variable(c.name, "input", c.description, kind=c.kind, nominal=float(f"{abs(width):.3g}") or 1.0)
         for c, width in zip(parts.inputs, spread, strict=True)

@@ -33,15 +33,23 @@ def drawn_rows(chain: ChainPart) -> tuple[Rows, Rows]:
     width = inputs + residuals
     draws = _lcg(ticks * (width + 1), SEED).reshape(ticks, width + 1)
     u = (draws[:, 1:] >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
-    middle = np.concatenate([chain.centre, np.zeros(residuals)]).astype(np.float32)
-    wide = np.concatenate([chain.spread, chain.scale]).astype(np.float32)
-    values = middle + wide * (np.float32(2.0) * u - np.float32(1.0))
+    centre, spread, scale = usual_widths(chain)
+    middle = np.concatenate([centre, np.zeros(residuals, np.float32)])
+    values = middle + np.concatenate([spread, scale]) * (np.float32(2.0) * u - np.float32(1.0))
     late = np.arange(ticks) >= (golden_blocks(chain) - JUDGED_BLOCKS // 2) * chain.block
-    shift = np.concatenate([np.zeros(inputs), chain.scale]).astype(np.float32) * np.float32(SHIFT)
-    values[late] += shift
+    values[late] += np.concatenate([np.zeros(inputs, np.float32), scale * np.float32(SHIFT)])
     holes = (draws[:, :1] >> np.uint32(30) == 0) & (draws[:, 1:] % np.uint32(MISSING) == 0)
     values[holes] = np.nan
     return values[:, :inputs], values[:, inputs:]
+
+
+def usual_widths(chain: ChainPart) -> tuple[Rows, Rows, Rows]:
+    """Middle and width of each input, and width of each residual, in single precision."""
+    return (
+        chain.centre.astype(np.float32),
+        (1.0 / chain.spread).astype(np.float32),
+        (1.0 / chain.scale).astype(np.float32),
+    )
 
 
 def _lcg(count: int, seed: int) -> NDArray[np.uint32]:

@@ -13,6 +13,7 @@ from edp.errors import ExportError
 from edp.export.c.text import array, filled, number
 from edp.export.escape import Code
 from edp.export.hashes import little_endian
+from edp.export.monitor.golden import usual_widths
 from edp.export.monitor.parts import MonitorParts
 
 MOST_PLACES = 2**16 - 1
@@ -58,6 +59,19 @@ class MonitorTables:
         self.double_entries.append(f"{{{name}, {numbers.size}u}}")
         self.crc = zlib.crc32(little_endian(numbers), self.crc)
         self.bytes += numbers.nbytes
+
+    def singles(self, name: str, values: ArrayLike) -> None:
+        """An array of doubles that are float32 numbers, stored as those: C widens them to the same bits.
+
+        Raises:
+            ExportError: one is none.
+        """
+        exact: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
+        with np.errstate(over="ignore"):
+            same = np.array_equal(exact.astype(np.float32).astype(np.float64), exact)
+        if not same:
+            raise ExportError(f"'{name}' of the monitor holds numbers that are no float32 numbers; fit it again")
+        self.floats(name, exact)
 
     def floats(self, name: str, values: ArrayLike) -> None:
         """An array of floats, row by row."""
@@ -108,9 +122,8 @@ def golden_header(name: str, monitor: MonitorParts) -> Code:
     for array_name, values in (("golden_alarms", chain.alarms), ("golden_since", chain.since)):
         lines.append(f"static const int32_t {array_name}[{len(values)}] = {{\n{filled(map(str, values))}\n}};")
     lines.append(_array("double", "golden_evidence", chain.evidence))
-    for side in ("centre", "spread"):
-        lines.append(_array("float", f"golden_{side}", getattr(parts, side).astype(np.float32)))
-    lines.append(_array("float", "golden_scale", parts.scale.astype(np.float32)))
+    for part, widths in zip(("centre", "spread", "scale"), usual_widths(parts), strict=True):
+        lines.append(_array("float", f"golden_{part}", widths))
     lines.append(f"#define GOLDEN_TICKS {len(rows.inputs)}u")
     lines.append(_rows("float", "golden_inputs", rows.inputs))
     lines.append(_rows("float", "golden_residuals", rows.residuals))

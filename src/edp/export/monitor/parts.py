@@ -87,8 +87,11 @@ class ChainPart:
 
     Attributes:
         block: ticks of a block.
-        centre: of each input, shape (inputs,); `spread` likewise.
-        scale: of each residual, shape (residuals,); `change` likewise.
+        centre: of each input, shape (inputs,).
+        spread: one over the usual width of each input, shape (inputs,).
+        impossible: usual widths from its centre beyond which an input counts as missing.
+        scale: one over the usual width of each residual, shape (residuals,).
+        change: usual variance of the change of the channel of each residual, shape (residuals,).
         channel: input that each residual judges.
         level: inputs whose mean is part of the operating point.
         moving: inputs whose mean size is.
@@ -108,6 +111,7 @@ class ChainPart:
     block: int
     centre: Array
     spread: Array
+    impossible: float
     scale: Array
     change: Array
     channel: Places

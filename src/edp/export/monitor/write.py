@@ -28,9 +28,6 @@ from edp.networks.input_range import HOLD_TICKS
 OWN = ("edp_chain.h", "edp_chain.c")
 LONGEST_NAME = 20
 """Of a monitor: names of its networks and functions are made from it."""
-LIMIT = 1e5
-"""Usual widths beyond which a measurement counts as missing."""
-LARGEST = 3.0e38
 DETECTORS = {"cusum": "EDP_CUSUM", "ewma": "EDP_EWMA", "glr": "EDP_GLR"}
 SUMMARIES = 5
 """Of a residual and block: `EDP_SUMMARIES`."""
@@ -94,9 +91,6 @@ class MonitorFiles:
     def tables(self) -> MonitorTables:
         """The constants."""
         chain, tables = self.parts.chain, MonitorTables()
-        low, high = (chain.centre + side * LIMIT * chain.spread for side in (-1.0, 1.0))
-        tables.floats("input_low", np.clip(low, -LARGEST, LARGEST))
-        tables.floats("input_high", np.clip(high, -LARGEST, LARGEST))
         reads_tables(self.parts.reads, tables)
         for source in self.sources:
             source.constants(tables)
@@ -108,7 +102,7 @@ class MonitorFiles:
         named = ", ".join([*(f"{size}u" for size in sizes), "centre, spread, scale, change, channel, level, moving"])
         tables.text(f"static const edp_blocks blocks = {{{named}}};")
         for name in ("point_offset", "point_width", "usual", "wide", "least"):
-            tables.doubles(name, getattr(chain, name))
+            tables.singles(name, getattr(chain, name))
         self._enter_watches(tables)
         self._enter_scalars(tables)
         return tables
@@ -116,16 +110,12 @@ class MonitorFiles:
     def _enter_watches(self, tables: MonitorTables) -> None:
         rows = []
         for place, watch in enumerate(self.parts.chain.watches):
-            tables.doubles(f"mean_{place}", watch.mean)
-            matrix = np.ascontiguousarray(watch.matrix.T)
-            # Half the bytes where nothing is lost: a float is widened exactly.
-            single = np.array_equal(matrix.astype(np.float32).astype(np.float64), matrix)
-            (tables.floats if single else tables.doubles)(f"matrix_{place}", matrix)
-            pointers = f"NULL, matrix_{place}" if single else f"matrix_{place}, NULL"
+            tables.singles(f"mean_{place}", watch.mean)
+            tables.singles(f"matrix_{place}", np.ascontiguousarray(watch.matrix.T))
             weight = watch.option if watch.detector == "ewma" else 1.0
             sizes = f"{self.parts.summaries}u, {watch.matrix.shape[1]}u, {_window(watch)}u"
             options = ", ".join(map(double_number, (watch.option, (2.0 - weight) / weight, watch.scale)))
-            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{place}, {pointers}}}")
+            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{place}, matrix_{place}}}")
         body = ",\n".join(rows)
         tables.text(f"static const edp_watch watches[{len(rows)}] = {{\n{body}\n}};")
         memories = np.cumsum([0, *map(_memory, self.parts.chain.watches)]).tolist()
@@ -140,6 +130,7 @@ class MonitorFiles:
     def _enter_scalars(self, tables: MonitorTables) -> None:
         chain = self.parts.chain
         scalars = {
+            "IMPOSSIBLE": chain.impossible,
             "POINT_LIMIT": chain.point_limit,
             "CLIP": chain.clip,
             "DRIFT_STEP": chain.drift_step,
@@ -177,7 +168,7 @@ class MonitorFiles:
             "block_s": f"{chain.block / parts.rate_hz:g}",
             "settle": chain.settle,
             "hold": HOLD_TICKS,
-            "limit": f"{LIMIT:.0f}",
+            "limit": f"{chain.impossible:.0f}",
             "inputs": len(parts.inputs),
             "residuals": len(parts.residuals),
             "levels": len(chain.level),

@@ -61,10 +61,18 @@ double edp_root(double x) {
     return result;
 }
 
-double edp_dot(const double *x, const double *y, uint32_t n) {
+double edp_dot(const double *x, const float *y, uint32_t n) {
     double sum = 0.0;
     for (uint32_t i = 0; i < n; i++) {
-        sum += x[i] * y[i];
+        sum += x[i] * (double)y[i];
+    }
+    return sum;
+}
+
+double edp_squares(const double *x, uint32_t n) {
+    double sum = 0.0;
+    for (uint32_t i = 0; i < n; i++) {
+        sum += x[i] * x[i];
     }
     return sum;
 }
@@ -98,6 +106,10 @@ double edp_within(double x, double low, double high) {
 
 static double size_of(double x) { return (x < 0.0) ? -x : x; }
 
+bool edp_plausible(float x, double centre, double spread, double limit) {
+    return (size_of((double)x - centre) * spread) <= limit; /* false for NaN */
+}
+
 static void add_residual(double r, double u, double d, double *sums) {
     sums[0] += 1.0;
     sums[1] += r;
@@ -114,18 +126,18 @@ void edp_block_tick(const edp_blocks *b, bool first, const float *in, const floa
     for (uint32_t i = 0; i < b->residuals; i++) {
         const uint32_t c = b->channel[i];
         const double before = y[c];
-        const double u = edp_known((double)in[c]) ? (((double)in[c] - b->centre[c]) / b->spread[c]) : before;
+        const double u = edp_known((double)in[c]) ? (((double)in[c] - b->centre[c]) * b->spread[c]) : before;
         const double d = first ? 0.0 : (u - before);
         double *const own = &sums[EDP_SUMS * i];
         if (edp_known((double)residuals[i])) {
-            add_residual((double)residuals[i] / b->scale[i], u, d, own);
+            add_residual((double)residuals[i] * b->scale[i], u, d, own);
         }
         own[4] += u * u;
         own[6] += d * d;
     }
     for (uint32_t c = 0; c < b->inputs; c++) {
         if (edp_known((double)in[c])) {
-            y[c] = ((double)in[c] - b->centre[c]) / b->spread[c];
+            y[c] = ((double)in[c] - b->centre[c]) * b->spread[c];
         }
     }
     for (uint32_t i = 0; i < b->levels; i++) {
@@ -155,22 +167,22 @@ void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t resid
     }
 }
 
-void edp_block_point(const edp_blocks *b, const double *sums, const double *offset, const double *width, double limit,
+void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
                      double *point) {
     const double *const values = &sums[EDP_SUMS * b->residuals];
     const double whole = (double)b->ticks;
     for (uint32_t i = 0; i < (b->levels + b->moving); i++) {
-        point[i] = edp_within(((values[i] / whole) - offset[i]) / width[i], -limit, limit);
+        point[i] = edp_within(((values[i] / whole) - (double)offset[i]) / (double)width[i], -limit, limit);
     }
 }
 
-double edp_conditioned(double summary, const double *point, uint32_t n, const double *usual, const double *wide,
+double edp_conditioned(double summary, const double *point, uint32_t n, const float *usual, const float *wide,
                        double floor, double limit) {
-    double middle = usual[0];
-    double width = wide[0];
+    double middle = (double)usual[0];
+    double width = (double)wide[0];
     for (uint32_t i = 0; i < n; i++) {
-        middle += point[i] * usual[i + 1u];
-        width += point[i] * wide[i + 1u];
+        middle += point[i] * (double)usual[i + 1u];
+        width += point[i] * (double)wide[i + 1u];
     }
     return edp_within((summary - middle) / ((width > floor) ? width : floor), -limit, limit);
 }
@@ -190,7 +202,7 @@ double edp_cusum(double slack, const double *row, uint32_t n, double *sums) {
     for (uint32_t i = 0; i < n; i++) {
         sums[i] += row[i];
     }
-    length = edp_root(edp_dot(sums, sums, n));
+    length = edp_root(edp_squares(sums, n));
     left = ((length - slack) > 0.0) ? (length - slack) : 0.0;
     share = left / ((length > 1e-300) ? length : 1e-300);
     for (uint32_t i = 0; i < n; i++) {
@@ -203,36 +215,26 @@ double edp_ewma(double weight, double factor, const double *row, uint32_t n, dou
     for (uint32_t i = 0; i < n; i++) {
         means[i] += weight * (row[i] - means[i]);
     }
-    return edp_dot(means, means, n) * factor;
+    return edp_squares(means, n) * factor;
 }
 
 double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32_t length, double *sums) {
     for (uint32_t i = 0; i < n; i++) {
         sums[i] = ((before == NULL) ? 0.0 : before[i]) + row[i];
     }
-    return edp_dot(sums, sums, n) / (2.0 * (double)length);
+    return edp_squares(sums, n) / (2.0 * (double)length);
 }
 
 /* ---- watches ------------------------------------------------------------------------------------------------------- */
 
 void edp_watch_centre(const edp_watch *w, const double *z, double *centred) {
     for (uint32_t i = 0; i < w->summaries; i++) {
-        centred[i] = edp_known(z[i]) ? (z[i] - w->mean[i]) : 0.0;
+        centred[i] = edp_known(z[i]) ? (z[i] - (double)w->mean[i]) : 0.0;
     }
 }
 
 double edp_watch_white(const edp_watch *w, const double *centred, uint32_t direction) {
-    const size_t from = (size_t)direction * w->summaries;
-    double sum = 0.0;
-    if (w->exact != NULL) {
-        sum = edp_dot(centred, &w->exact[from], w->summaries);
-    } else {
-        const float *const row = &w->matrix[from];
-        for (uint32_t i = 0; i < w->summaries; i++) {
-            sum += centred[i] * (double)row[i];
-        }
-    }
-    return sum;
+    return edp_dot(centred, &w->matrix[(size_t)direction * w->summaries], w->summaries);
 }
 
 uint32_t edp_watch_steps(const edp_watch *w) { return (w->detector == EDP_GLR) ? w->window : 1u; }

@@ -17,7 +17,11 @@ bool edp_known(double x);
 /* What stands for a number that is not there. */
 double edp_unknown(void);
 /* The sum of products x[i] y[i] over i < n. */
-double edp_dot(const double *x, const double *y, uint32_t n);
+double edp_dot(const double *x, const float *y, uint32_t n);
+/* The sum of squares over i < n. */
+double edp_squares(const double *x, uint32_t n);
+/* Whether a measurement is one: finite, and at most `limit` usual widths from its usual value. */
+bool edp_plausible(float x, double centre, double spread, double limit);
 
 /* The checksum of arrays in flash goes on from `crc` (0 to begin with); as CRC-32 of the bytes, lowest byte first. */
 uint32_t edp_crc_doubles(uint32_t crc, const double *values, uint32_t n);
@@ -27,8 +31,8 @@ uint32_t edp_crc_doubles(uint32_t crc, const double *values, uint32_t n);
 #define EDP_SUMS 8u      /* of a residual: ticks, r, r r, r u, u u, r d, d d, largest |r| */
 #define EDP_SUMMARIES 5u /* of a residual and block: mean, spread, gain, lag, peak */
 
-/* How blocks are formed. r is a residual over its scale, u the channel that it judges less its centre over its spread, d
-   the change of u since the tick before. */
+/* How blocks are formed. r is a residual times `scale`, u the channel that it judges less its `centre` times `spread`, d
+   the change of u since the tick before: both factors are one over a usual width. */
 typedef struct {
     uint32_t ticks; /* of a block */
     uint32_t inputs;
@@ -52,11 +56,11 @@ void edp_block_tick(const edp_blocks *b, bool first, const float *in, const floa
 /* The summaries of a residual when the block has ended; NaN where more than half of its ticks are missing. */
 void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double summaries[EDP_SUMMARIES]);
 /* The operating point (levels + moving), scaled and limited. */
-void edp_block_point(const edp_blocks *b, const double *sums, const double *offset, const double *width, double limit,
+void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
                      double *point);
 /* A summary at an operating point of n numbers: less what is usual there, over how widely it scatters there. `usual` and
    `wide` have 1 + n numbers. */
-double edp_conditioned(double summary, const double *point, uint32_t n, const double *usual, const double *wide,
+double edp_conditioned(double summary, const double *point, uint32_t n, const float *usual, const float *wide,
                        double floor, double limit);
 /* A number within limits; NaN stays. */
 double edp_within(double x, double low, double high);
@@ -85,9 +89,8 @@ typedef struct {
     double option;    /* slack or weight */
     double factor;    /* of the weighted means */
     double scale;     /* over which statistics of all watches are compared with one limit */
-    const double *mean;     /* (summaries) */
-    const double *exact;    /* (directions, summaries), or NULL: then `matrix` has these numbers */
-    const float *matrix;
+    const float *mean;   /* (summaries) */
+    const float *matrix; /* (directions, summaries) */
 } edp_watch;
 
 /* Doubles in the memory of a detector. */
