@@ -18,6 +18,7 @@ from edp.monitor.residuals.base import (
     ResidualSpec,
     Rows,
     SourceParts,
+    mean_inputs,
     residual_labels,
 )
 from edp.recording import Recording
@@ -161,10 +162,9 @@ class BalancesSpec(ResidualSpec):
         used = {channel.name for level, rate, _, _ in found for channel in (level, rate)}
         inputs = tuple(name for name in material.names if name in used)
         pairs = np.array([[inputs.index(level.name), inputs.index(rate.name)] for level, rate, _, _ in found])
-        middle = np.mean([r.select(inputs).mean(axis=0, dtype=np.float64) for r in material.train], axis=0)
         gains, memories = (np.array([entry[place] for entry in found]) for place in (2, 3))
         units = [KINDS[level.kind].si_unit for level, _, _, _ in found]
-        return Balances(inputs, pairs, gains, memories, material.rate_hz, middle.astype(np.float32), units)
+        return Balances(inputs, pairs, gains, memories, material.rate_hz, mean_inputs(material, inputs), units)
 
 
 def matched_pairs(

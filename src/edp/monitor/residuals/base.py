@@ -267,3 +267,21 @@ def residual_labels(plain: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[st
     if len(units) > MOST_RESIDUALS:
         raise ValueError(f"it has {len(units)} residuals; at most {MOST_RESIDUALS} must hold")
     return inputs, units
+
+
+def mean_inputs(material: FitMaterial, inputs: Sequence[str]) -> Rows:
+    """Mean of each input over the sessions that train, shape (inputs,)."""
+    means = [session.select(inputs).mean(axis=0, dtype=np.float64) for session in material.train]
+    return np.asarray(np.mean(means, axis=0), dtype=np.float32)
+
+
+def middle_of(parts: SourceParts) -> tuple[tuple[str, ...], Rows]:
+    """Inputs of a source, and what stands in for each that was never there.
+
+    Raises:
+        ValueError: values that cannot be.
+    """
+    inputs, middle = texts_of(parts.plain["inputs"], "its inputs"), np.asarray(parts.arrays["middle"], np.float32)
+    if middle.shape != (len(inputs),) or not np.isfinite(middle).all():
+        raise ValueError("the middle of the inputs has another shape, or is not finite")
+    return inputs, middle

@@ -25,6 +25,8 @@ from edp.monitor.residuals.base import (
     ResidualSpec,
     Rows,
     SourceParts,
+    mean_inputs,
+    middle_of,
     texts_of,
 )
 from edp.monitor.residuals.groups import Group, groups_of
@@ -91,10 +93,7 @@ class VirtualSensors(ResidualSource):
     @classmethod
     def of_parts(cls, parts: SourceParts) -> VirtualSensors:
         """See `ResidualSource.of_parts`."""
-        inputs, groups = texts_of(parts.plain["inputs"], "its inputs"), texts_of(parts.plain["groups"], "its groups")
-        middle = np.asarray(parts.arrays["middle"], np.float32)
-        if middle.shape != (len(inputs),) or not np.isfinite(middle).all():
-            raise ValueError("the middle of the inputs has another shape, or is not finite")
+        (inputs, middle), groups = middle_of(parts), texts_of(parts.plain["groups"], "its groups")
         bundles = {}
         for group in groups:
             bundle = parts.bundles[group]
@@ -165,8 +164,7 @@ class VirtualSensorsSpec(ResidualSpec):
             return None
         used = {name for b in bundles.values() for name in (*b.task.inputs, *b.task.targets)}
         inputs = tuple(name for name in material.names if name in used)
-        middle = np.mean([r.select(inputs).mean(axis=0, dtype=np.float64) for r in material.train], axis=0)
-        return VirtualSensors(bundles, inputs, middle.astype(np.float32))
+        return VirtualSensors(bundles, inputs, mean_inputs(material, inputs))
 
     def _fed(self, group: Group, material: FitMaterial) -> tuple[Channel, ...]:
         """Channels that the network of a group reads."""

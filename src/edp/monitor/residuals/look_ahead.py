@@ -1,0 +1,145 @@
+"""Look-ahead errors: what a network of `edp train` predicted some ticks ago, against what came."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from edp.monitor.residuals.base import (
+    RESIDUALS,
+    FitMaterial,
+    ResidualSource,
+    ResidualSpec,
+    Rows,
+    SourceParts,
+    mean_inputs,
+    middle_of,
+)
+from edp.networks.predictor import Predictor
+from edp.signals import Channel
+from edp.training.bundle import Bundle
+
+SMALLEST_WIDTH = 1e-9
+"""Of an interval, in SI units: one that has closed is no scale."""
+
+
+class LookAhead(ResidualSource):
+    """Networks with horizons of one tick and more.
+
+    The residual of a horizon k at tick t is the channel at t less the prediction made at t - k; where the network gives
+    intervals, over half the width of the first of them. Such a residual follows a fault of a channel that the network
+    reads: it shows onsets and noise, not lasting offsets.
+
+    Args:
+        bundles: by a number from 0 on, as text.
+        inputs: raw channels, SI units.
+        middle: mean of each on healthy sessions.
+    """
+
+    def __init__(self, bundles: dict[str, Bundle], inputs: Sequence[str], middle: Rows) -> None:
+        self.bundles, self.inputs, self.middle = dict(bundles), tuple(inputs), np.asarray(middle, np.float32)
+        names: list[str] = []
+        judged: list[tuple[str, ...]] = []
+        reads: list[tuple[str, ...]] = []
+        units: list[str] = []
+        place = {name: i for i, name in enumerate(self.inputs)}
+        self._columns = []
+        for number, bundle in self.bundles.items():
+            task, scaled = bundle.task, bool(bundle.predictor.output.coverages)
+            logged = [i for i, target in enumerate(task.targets) if target in place]
+            self._columns.append(
+                ([place[name] for name in task.inputs], logged, [place[task.targets[i]] for i in logged])
+            )
+            for horizon in task.horizons:
+                for i in logged:
+                    target = task.targets[i]
+                    names.append(f"ahead{'' if number == '0' else number}:{target}:{horizon}")
+                    judged.append((target,))
+                    reads.append(tuple(dict.fromkeys((target, *task.inputs))))
+                    units.append("1" if scaled else Channel(target, bundle.target_kinds[i]).unit)
+        self.names, self.judged, self.reads, self.units = tuple(names), tuple(judged), tuple(reads), tuple(units)
+
+    def _start(self, streams: int) -> Any:
+        states = []
+        for bundle, (_, logged, _) in zip(self.bundles.values(), self._columns, strict=True):
+            predictor = bundle.predictor
+            state = predictor.initial_state(streams, next(predictor.parameters()))
+            # The last predictions of each horizon, and half the widths of their intervals; NaN before there are any.
+            waiting = [np.full((streams, k, 2, len(logged)), np.nan, np.float32) for k in bundle.task.horizons]
+            states.append((state, waiting))
+        return states
+
+    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+        parts, states = [], []
+        for bundle, columns, (state, waiting) in zip(self.bundles.values(), self._columns, own, strict=True):
+            fed, logged, measured = columns
+            with torch.inference_mode():
+                x = torch.from_numpy(np.ascontiguousarray(rows[..., fed]))
+                predicted, width, state = _predicted(bundle.predictor, x, state)
+            kept = []
+            for place, horizon in enumerate(bundle.task.horizons):
+                now = np.stack([predicted[:, :, place][..., logged], width[:, :, place][..., logged]], axis=2)
+                all_of = np.concatenate([waiting[place], now], axis=1)
+                due = all_of[:, : rows.shape[1]]
+                parts.append((rows[..., measured] - due[:, :, 0]) / due[:, :, 1])
+                kept.append(all_of[:, len(all_of[0]) - horizon :])
+            states.append((state, kept))
+        return np.concatenate(parts, axis=-1), states
+
+    def parts(self) -> SourceParts:
+        """See `ResidualSource.parts`."""
+        return SourceParts({"inputs": list(self.inputs)}, {"middle": self.middle}, dict(self.bundles))
+
+    @classmethod
+    def of_parts(cls, parts: SourceParts) -> LookAhead:
+        """See `ResidualSource.of_parts`."""
+        inputs, middle = middle_of(parts)
+        bundles = {}
+        for number in sorted(parts.bundles, key=lambda text: (len(text), text)):
+            bundle = parts.bundles[number]
+            if not isinstance(bundle, Bundle) or min(bundle.task.horizons) < 1:
+                raise ValueError(f"network {number[:20]} does not look ahead")
+            if not {*bundle.task.inputs} <= {*inputs}:
+                raise ValueError(f"network {number[:20]} reads what is no input of the monitor")
+            bundles[number] = bundle
+        return cls(bundles, inputs, middle)
+
+
+def _predicted(predictor: Predictor, x: torch.Tensor, state: Any) -> tuple[Rows, Rows, Any]:
+    """Predictions and half the widths of their first intervals, one where there are none; the state behind them."""
+    center, bounds, state = predictor.predict_with_intervals(x, state)
+    values = center.numpy()
+    if bounds is None:
+        return values, np.ones_like(values), state
+    width = 0.5 * (bounds[:, :, 0, 1] - bounds[:, :, 0, 0]).numpy()
+    return values, np.maximum(width, SMALLEST_WIDTH), state
+
+
+@RESIDUALS.register("look_ahead")
+@dataclass(frozen=True, kw_only=True)
+class LookAheadSpec(ResidualSpec):
+    """Errors of the look-ahead networks that the monitor is given; without any there is nothing to judge."""
+
+    source: ClassVar[type[ResidualSource]] = LookAhead
+
+    def fit(self, material: FitMaterial) -> ResidualSource | None:
+        """See `ResidualSpec.fit`."""
+        names = {*material.names}
+        usable = [
+            bundle
+            for bundle in material.predictors
+            if min(bundle.task.horizons) >= 1
+            and {*bundle.task.inputs} <= names
+            and names.intersection(bundle.task.targets)
+            and abs(bundle.task.rate_hz - material.rate_hz) <= 1e-3 * material.rate_hz
+        ]
+        if not usable:
+            return None
+        material.note("look-ahead errors")
+        used = {name for bundle in usable for name in (*bundle.task.inputs, *bundle.task.targets)}
+        inputs = tuple(name for name in material.names if name in used)
+        return LookAhead({str(i): b for i, b in enumerate(usable)}, inputs, mean_inputs(material, inputs))
