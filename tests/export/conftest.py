@@ -227,3 +227,35 @@ def exported_loop(c, tmp_path_factory):
     from exported_controllers import exported_run
 
     return exported_run(c, tmp_path_factory.mktemp("loop"), "pi")
+
+
+@pytest.fixture(scope="session")
+def rig_monitor():
+    """A monitor of the small rig: two kinds of residuals, all detectors with a form in C, fitted within seconds."""
+    from edp.config.monitor import load_monitor_experiment
+    from edp.testing.monitor import rig_sessions
+    from edp.workflows.monitor import fit_to_recordings
+
+    watches = ",".join(
+        f"{{detector={{kind={kind}}},memory_s={memory}}}"
+        for kind, memory in (('"ewma",weight=0.5', 0.2), ('"cusum",slack=0.5', 1.0), ('"glr",window=5', 0.2))
+    )
+    sensors = '{kind="virtual_sensors",members=2,units=4,rows=2000,lags_s=[0.05,0.1]}'
+    changes = [
+        *("chain.block_s=0.2", "chain.settle_s=1.0", "chain.folds=2"),
+        f"chain.watches=[{watches}]",
+        f'residuals=[{sensors},{{kind="balances"}}]',
+    ]
+    experiment = load_monitor_experiment(None, changes, {"hours_per_false_alarm": 0.02, "minutes": 0.02})
+    return fit_to_recordings(rig_sessions(12, 2000, seed=1), experiment).monitor
+
+
+@pytest.fixture(scope="session")
+def rig_fault(rig_monitor):
+    """Rows of a session of the rig whose head pressure sensor reads too high from its middle on."""
+    from edp.testing.monitor import rig_sessions
+
+    (session,) = rig_sessions(1, 2000, seed=1, first=20)
+    rows = session.select(rig_monitor.inputs).copy()
+    rows[1000:, rig_monitor.inputs.index("pressure_a")] += 2e6
+    return rows

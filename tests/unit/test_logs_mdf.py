@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from asammdf import MDF, Signal
 from asammdf.blocks.conversion_utils import from_dict
 
 from edp.errors import DataError
-from edp.logs import Repair, inspect_log, read_parts, read_recording, write_recording
+from edp.logs import LogEvent, Repair, inspect_log, read_parts, read_recording, write_recording, write_with_events
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, Kind, SignalMap
 
@@ -155,3 +156,38 @@ def test_a_map_may_take_the_file_by_kind_and_rows(tmp_path):
     wanted = SignalMap((ChannelMap("x", "x", "m", Kind.POSITION),), rate_hz=50.0)
     read = read_recording(path, wanted, rows=(10, 20))
     np.testing.assert_allclose(read.values[:, 0], np.arange(10, 20) / 50, atol=1e-6)
+
+
+def test_events_lie_beside_the_signals_as_stretches_with_their_text(tmp_path):
+    written = Recording("log", (TABLE_A1["BmUp"],), np.zeros((300, 1), np.float32), 100.0, "s", {})
+    hostile = "a <b> & 'c' \u202e" + "x" * 5_000
+    events = [LogEvent("head pressure of the boom", 0.5, 2.25, hostile), LogEvent("<EVcomment>", 2.5, 2.5)]
+    path = write_with_events(written, tmp_path / "a.mf4", events)
+    with MDF(path) as log:
+        found = log.events
+        assert [event.range_type for event in found] == [1, 2, 1, 2]
+        assert [event.value for event in found] == pytest.approx([0.5, 2.25, 2.5, 2.5])
+        assert [event.name for event in found] == [events[0].name] * 2 + ["<EVcomment>"] * 2
+        assert found[1].range_start_ev_addr == found[0].address
+        text = ElementTree.fromstring(found[0].comment).findtext("TX")
+        assert text.startswith("a <b> & 'c'  xxx")
+        assert len(text) == 2_000
+    # The reader of logs takes such a file, and the signals are what they were.
+    np.testing.assert_array_equal(read_recording(path).values, written.values)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s"), [(2.0, 1.0), (-1.0, 1.0), (0.0, float("nan")), (float("inf"), float("inf"))]
+)
+def test_events_that_are_no_stretch_are_refused(start_s, end_s):
+    with pytest.raises(DataError, match="an end not before the start"):
+        LogEvent("x", start_s, end_s)
+
+
+def test_events_are_refused_where_a_file_cannot_hold_them(tmp_path):
+    one = Recording("log", (TABLE_A1["BmUp"],), np.zeros((3, 1), np.float32), 100.0, "s", {})
+    with pytest.raises(DataError, match=r"takes no events.*\.mf4"):
+        write_with_events(one, tmp_path / "a.csv", [])
+    with pytest.raises(DataError, match="at most"):
+        write_with_events(one, tmp_path / "a.mf4", [LogEvent("x", 0.0, 0.0)] * 100_001)
+    assert not list(tmp_path.iterdir())

@@ -13,6 +13,7 @@ from edp.errors import ConfigError, closest
 
 CONTROLLER, CONTROLLER_NAME = "controller", "machine"
 """The form of a run of edp control, and the name of what it holds unless one is given."""
+MONITOR_NAME = "monitor"
 
 
 def _list_forms(listing_asked: bool) -> None:
@@ -29,11 +30,13 @@ def _list_forms(listing_asked: bool) -> None:
 
 
 def export(
-    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp twin or edp control.")],
+    bundle: Annotated[
+        Path, typer.Argument(help="Bundle, run folder of edp train, edp twin or edp control, or a monitor.")
+    ],
     to: Annotated[str, typer.Option(help="Form, such as c (C99 for controllers); --forms lists all.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an existing export is replaced.")],
     name: Annotated[
-        str, typer.Option(help="Name in the exported files; default: predictor, of a controller machine.")
+        str, typer.Option(help="Name in the exported files; default: predictor, machine (a controller) or monitor.")
     ] = "",
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
@@ -55,15 +58,19 @@ def export(
     """
     from edp.workflows.deployment import export_bundle, unheld_adaptation
     from edp.workflows.deployment import forms as registered_forms
+    from edp.workflows.monitor.export_monitor import export_monitor, holds_monitor
 
     names = (CONTROLLER, *registered_forms())
     if to not in names:
         raise ConfigError(f"unknown export target '{to}'{closest(to, names)}; known: {', '.join(sorted(names))}")
-    name = name or (CONTROLLER_NAME if to == CONTROLLER else "predictor")
+    monitor = holds_monitor(bundle)
+    name = name or (MONITOR_NAME if monitor else CONTROLLER_NAME if to == CONTROLLER else "predictor")
     options = dict(map(_option, changes or []))
-    if to == CONTROLLER:
-        if w8a16 is not None:
-            raise ConfigError("--w8a16: a controller computes in single precision; leave it out")
+    if (monitor or to == CONTROLLER) and w8a16 is not None:
+        raise ConfigError("--w8a16: only twins are brought into W8A16 while they are exported; leave it out")
+    if monitor:
+        files = export_monitor(bundle, to, folder, name, options)
+    elif to == CONTROLLER:
         from edp.workflows.control import export_controller
 
         files = export_controller(bundle, folder, name, options)
@@ -74,7 +81,7 @@ def export(
     def show() -> None:
         for file in files:
             out.print(str(file))
-        if to != CONTROLLER and unheld_adaptation(bundle, to):
+        if to != CONTROLLER and not monitor and unheld_adaptation(bundle, to):
             out.print(f"note: the form '{to}' holds the network alone; its adaptation is held by c")
         out.print(f"written: {files[0].parent.resolve()}; read {files[0].name} first")
         if (files[0].parent / "CMakeLists.txt").is_file():

@@ -8,6 +8,7 @@ from edp.logs.formats import parquet as parquet
 from edp.logs.formats import rosbag as rosbag
 from edp.logs.formats.base import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
 from edp.logs.formats.mat_layouts import LAYOUTS
+from edp.logs.formats.mdf_events import LogEvent
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import inspect_log, look_into
@@ -23,7 +24,7 @@ from edp.logs.read import (
     unique_names,
 )
 from edp.logs.repair import Repair, split_at_gaps
-from edp.logs.write import truth_path, write_recording
+from edp.logs.write import truth_path, write_recording, write_with_events
 
 __all__ = [
     "FORMATS",
@@ -33,6 +34,7 @@ __all__ = [
     "ClockFacts",
     "DataQuality",
     "Finding",
+    "LogEvent",
     "LogFormat",
     "QualityReport",
     "RawLog",
@@ -60,4 +62,5 @@ __all__ = [
     "truth_path",
     "unique_names",
     "write_recording",
+    "write_with_events",
 ]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.detect import format_for
 from edp.logs.formats.base import TRUTH, LogFormat, WriteOptions, holds_truth_apart, parted
+from edp.logs.formats.mdf import MdfFormat
+from edp.logs.formats.mdf_events import LogEvent
 from edp.recording import Recording
 from edp.storage import replacing
 
@@ -44,6 +47,28 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
     # The log last: where it lies, its truth lies beside it.
     _write(chosen, truth, truth_path(target), options)
     return _write(chosen, measured, target, options)
+
+
+def write_with_events(recording: Recording, path: str | Path, events: Sequence[LogEvent]) -> Path:
+    """Write a recording as MDF 4 with events, which measurement tools mark along its signals.
+
+    Args:
+        recording: what to write.
+        path: an existing file is replaced only by a complete new one.
+        events: at most `edp.logs.formats.mdf_events.MOST_EVENTS`.
+
+    Raises:
+        DataError: an ending other than MDF's, nothing to write, too many events, or the package asammdf is missing.
+        StorageError: disk full or read-only folder; an existing file is left as it was.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in MdfFormat.suffixes:
+        raise DataError(f"'{target}' takes no events; MDF 4 does: choose an ending of {', '.join(MdfFormat.suffixes)}")
+    if recording.samples == 0 or not recording.channels:
+        raise DataError(f"recording '{recording.name}' is empty; nothing is written to '{target}'")
+    with replacing(target) as temporary:
+        MdfFormat().write_with_events(recording, temporary, events)
+    return target
 
 
 def _write(chosen: LogFormat, recording: Recording, target: Path, options: WriteOptions) -> Path:

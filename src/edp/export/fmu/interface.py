@@ -57,7 +57,7 @@ def variables(model: Model) -> list[Variable]:
         Variable(entry.name, "input", entry.description, kind=entry.kind, nominal=_nominal(width))
         for entry, width in zip(model.bundle.inputs, spread, strict=True)
     ]
-    return _unique(entries + _predictions(model) + list(OWN))
+    return unique(entries + _predictions(model) + list(OWN))
 
 
 def _predictions(model: Model) -> list[Variable]:
@@ -89,7 +89,7 @@ def _nominal(width: float) -> float:
     return float(f"{abs(width):.3g}") or 1.0
 
 
-def _unique(listed: list[Variable]) -> list[Variable]:
+def unique(listed: list[Variable]) -> list[Variable]:
     """The same with names and descriptions of printable characters; names differ."""
     names = shown_names(entry.name for entry in listed)
     return [

@@ -27,11 +27,21 @@ PLANT = (
     "data.",
 )
 
+MONITOR = (
+    RULES[0].replace("predictions", "verdicts"),
+    RULES[1].replace("the last accepted inputs are fed again", "ticks without any measurement"),
+    "An input that is NaN, infinite, far beyond its range or was never set is missing at that tick: its last value "
+    "stands in, residuals that judge or read it are silent, the step returns a warning, and valid is false.",
+    "What a block says is computed during the next block. After an alarm the detectors begin anew.",
+    *RULES[4:],
+)
+
 
 def page(about: About) -> bytes:
     """The page: what goes in and out, and the rules."""
-    window = about.facts["window"]
-    texts = RULES + (PLANT if "plant" in about.facts else ())
+    window = about.facts.get("window", "")
+    monitor = "monitor_hash" in about.facts
+    texts = MONITOR if monitor else RULES + (PLANT if "plant" in about.facts else ())
     rules = "".join(f"<li>{xml_text(t.format(step=about.step_s, window=window, name=about.name))}</li>" for t in texts)
     rows = "".join(
         f"<tr><td>{xml_text(entry.name)}</td><td>{entry.causality}</td>"

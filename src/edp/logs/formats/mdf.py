@@ -24,6 +24,7 @@ from edp.logs.formats.base import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal
 from edp.logs.formats.edp_metadata import EdpMetadata, facts_text, parse_edp_metadata
 from edp.logs.formats.mdf_check import check_blocks
 from edp.logs.formats.mdf_conversion import Conversion, refuse_engines
+from edp.logs.formats.mdf_events import LogEvent, event_blocks
 from edp.logs.formats.names import only, shown_name, told_apart
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
@@ -86,6 +87,14 @@ class MdfFormat:
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write one channel group of float32 with the time in s, packed, and EDP's facts as an attachment."""
+        self.write_with_events(recording, path, ())
+
+    def write_with_events(self, recording: Recording, path: Path, events: Sequence[LogEvent]) -> None:
+        """The same with event blocks.
+
+        Raises:
+            DataError: too many events.
+        """
         asammdf = _library()
         time = np.arange(recording.samples) / recording.rate_hz
         signals = [
@@ -101,6 +110,7 @@ class MdfFormat:
         with asammdf.MDF(version="4.10") as log, path.open("wb+") as stream:
             log.append(signals, acq_name=recording.name, comment="EDP", common_timebase=True)
             log.attach(facts_text(recording).encode(), file_name=_FACTS, mime="application/json")
+            log.events = event_blocks(events)
             # 2 packs transposed records: bytes of equal weight lie beside each other.
             log.save(stream, compression=2)
 

@@ -1,0 +1,127 @@
+"""FMUs as files: descriptions, sources, libraries and documentation packed for each version of FMI."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import uuid
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
+
+from edp.errors import ExportError
+from edp.export.escape import Code, c_string, fill
+from edp.export.fmu.build import PLATFORMS, Sources, libraries
+from edp.export.fmu.describe import About, build_description, fmi2, fmi3
+from edp.export.fmu.page import page
+
+COMMON = ("edp_fmu.h", "edp_fmu.c")
+OWN: Mapping[int, tuple[str, ...]] = {
+    2: ("edp_fmi2.h", "edp_fmi2.c"),
+    3: ("edp_fmi3.h", "edp_fmi3.c", "edp_fmi3_absent.c"),
+}
+"""Files of the plumbing by version of FMI."""
+VERSIONS = {"2": (2,), "3": (3,), "both": (2, 3)}
+BINARIES = {"both": tuple(PLATFORMS), **{name: (name,) for name in PLATFORMS}, "none": ()}
+# The earliest date that a ZIP file can hold.
+DATE = (1980, 1, 1, 0, 0, 0)
+"""Of every file in an FMU, so that the same network gives the same bytes."""
+
+
+def check_choice(version: str, binaries: str) -> None:
+    """Refuse what is not written.
+
+    Raises:
+        ExportError: no such version or binaries.
+    """
+    if binaries not in BINARIES:
+        raise ExportError(f"binaries '{binaries}' are not built; choose one of {', '.join(BINARIES)}")
+    if version not in VERSIONS:
+        raise ExportError(f"FMI version '{version}' is not written; choose one of {', '.join(VERSIONS)}")
+
+
+def token_of(texts: Iterable[str]) -> str:
+    """Content address in the form of a GUID: everything that decides behaviour or interface goes in."""
+    state = hashlib.blake2b(digest_size=16)
+    for text in (*texts, *plumbing(*COMMON, *OWN[2], *OWN[3]).values()):
+        # The zero byte separates texts: two files cannot be shifted into one another.
+        state.update(text.encode() + b"\0")
+    return "{" + str(uuid.UUID(bytes=state.digest())) + "}"
+
+
+def model_header(about: About, required: int, tangent: str = "") -> str:
+    """What binds the plumbing to the model.
+
+    Args:
+        about: the model.
+        required: inputs that count as missing until they are set; those behind them are zero.
+        tangent: definitions of its derivatives.
+    """
+    text = resources.files("edp.export.fmu").joinpath("templates/fmu_model.h.in").read_text()
+    names = Code(", ".join(c_string(entry.name) for entry in about.listed if entry.causality == "input"))
+    values: dict[str, object] = {"name": about.name, "NAME": about.name.upper(), "token": Code(about.token)}
+    values |= {"required": required, "rate": repr(about.rate_hz), "step": repr(about.step_s), "names": names}
+    return fill(text, values | {"tangent": Code(tangent)})
+
+
+def fmu_files(
+    about: About, core: Mapping[str, str], description: bytes, version: str, binaries: str
+) -> dict[str, bytes]:
+    """The FMUs of a model by file name.
+
+    Args:
+        about: what the XML files tell.
+        core: C code of the model by file name, `model_header` as ``fmu_model.h`` among it.
+        description: JSON, a file of its resources.
+        version: a name of `VERSIONS`.
+        binaries: a name of `BINARIES`.
+
+    Raises:
+        ExportError: no compiler, or it refuses the code.
+    """
+    versions = VERSIONS[version]
+    texts = plumbing(*COMMON, *(file for v in versions for file in OWN[v]))
+    common = c_files((*core, *COMMON))
+    own = {v: c_files(OWN[v]) for v in versions}
+    built = libraries(Sources(about.name, {**core, **texts}, common, own), BINARIES[binaries])
+    files = {}
+    for v in versions:
+        # Only the plumbing of its own version: two sets of entry points would clash in one library.
+        sources = {**core, **{file: texts[file] for file in (*COMMON, *OWN[v])}}
+        content = _content(v, about, sources, description)
+        files[f"{about.name}_fmi{v}.fmu"] = _packed(content | built[v])
+    return files
+
+
+def _content(version: int, about: About, sources: Mapping[str, str], description: bytes) -> dict[str, bytes]:
+    """Content of an FMU without libraries, by path."""
+    compiled = c_files(tuple(sources))
+    files = {"modelDescription.xml": fmi2(about, compiled) if version == 2 else fmi3(about)}
+    files["documentation/index.html"] = page(about)
+    files[f"resources/{about.name}.json"] = description
+    files |= {f"sources/{file}": text.encode() for file, text in sources.items()}
+    if version == 3:
+        files["sources/buildDescription.xml"] = build_description(about, compiled)
+    return files
+
+
+def plumbing(*names: str) -> dict[str, str]:
+    """Files of the FMU's own code."""
+    return {name: resources.files("edp.export.fmu").joinpath(f"plumbing/{name}").read_text() for name in names}
+
+
+def c_files(names: Sequence[str]) -> list[str]:
+    """Those that are compiled."""
+    return [name for name in names if name.endswith(".c")]
+
+
+def _packed(content: Mapping[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path, data in content.items():
+            entry = zipfile.ZipInfo(path, DATE)
+            # Executable rights and Unix origin: without them the libraries cannot be loaded after unpacking on Linux.
+            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o755 << 16
+            entry.create_system = 3
+            archive.writestr(entry, data)
+    return buffer.getvalue()

@@ -1,0 +1,31 @@
+"""Monitors as C99 without heap: residuals, chain and alarms beside the predictor, and a self-test."""
+
+from edp.export.monitor.fmu import write_monitor_fmu
+from edp.export.monitor.golden import drawn_rows
+from edp.export.monitor.parts import (
+    BalancePart,
+    ChainPart,
+    GoldenChain,
+    GoldenResiduals,
+    MonitorParts,
+    NetworkPart,
+    SourcePart,
+    WatchPart,
+)
+from edp.export.monitor.write import DETECTORS, monitor_files, write_monitor
+
+__all__ = [
+    "DETECTORS",
+    "BalancePart",
+    "ChainPart",
+    "GoldenChain",
+    "GoldenResiduals",
+    "MonitorParts",
+    "NetworkPart",
+    "SourcePart",
+    "WatchPart",
+    "drawn_rows",
+    "monitor_files",
+    "write_monitor",
+    "write_monitor_fmu",
+]

@@ -1,0 +1,35 @@
+"""What the reader of an exported monitor must know: names, units, order, rate, limit; as JSON."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from edp import __version__
+from edp.export.monitor.parts import MonitorParts
+
+SCHEMA = 1
+
+
+def description(parts: MonitorParts, name: str) -> dict[str, Any]:
+    """Plain values that JSON can hold."""
+    chain = parts.chain
+    return {
+        "schema": SCHEMA,
+        "edp": __version__,
+        "name": name,
+        "monitor": parts.title,
+        "monitor_hash": parts.digest,
+        "promise": parts.promise,
+        "rate_hz": parts.rate_hz,
+        "block_s": chain.block / parts.rate_hz,
+        "settle_blocks": chain.settle,
+        "inputs": [
+            {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in parts.inputs
+        ],
+        "residuals": list(parts.residuals),
+        "summaries": ["mean", "spread", "gain", "lag", "peak"],
+        "watches": [
+            {"detector": w.detector, "option": w.option, "directions": int(w.matrix.shape[1])} for w in chain.watches
+        ],
+        "limit": chain.limit,
+    }

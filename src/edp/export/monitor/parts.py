@@ -1,0 +1,205 @@
+"""What an exported monitor is made of: networks, plain numbers in SI units, and what a self-test expects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.signals import Channel
+from edp.training.bundle import Bundle
+
+Array = NDArray[np.float64]
+Places = tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkPart:
+    """Residuals of a network: what was measured less what it predicted.
+
+    Attributes:
+        bundle: the network.
+        reads: inputs of the monitor that it is fed, in its order.
+        middle: what stands in for each of them before it was ever there, shape (reads,).
+        judged: input of the monitor that each residual judges.
+        results: place of each prediction among those of the network, horizon by horizon.
+        delays: ticks by which each prediction is older than what it is compared with; 0 for a virtual sensor.
+        widths: over which each residual is divided; 1 leaves it in SI units.
+    """
+
+    bundle: Bundle
+    reads: Places
+    middle: NDArray[np.float32]
+    judged: Places
+    results: Places
+    delays: Places
+    widths: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class BalancePart:
+    """Levels less the integrals of their rates, with sums that fade.
+
+    Attributes:
+        reads: inputs of the monitor that are read.
+        middle: what stands in for each of them before it was ever there, shape (reads,).
+        levels: place of the level of each residual among `reads`.
+        rates: likewise of its rate.
+        steps: gain of the rate times the time of a tick, shape (residuals,).
+        left: share of the sum that is left after a tick, shape (residuals,).
+    """
+
+    reads: Places
+    middle: NDArray[np.float32]
+    levels: Places
+    rates: Places
+    steps: Array
+    left: Array
+
+
+SourcePart = NetworkPart | BalancePart
+
+
+@dataclass(frozen=True, eq=False)
+class WatchPart:
+    """A view of conditioned summaries and the detector on it.
+
+    Attributes:
+        detector: ``cusum``, ``ewma`` or ``glr``.
+        option: its slack, weight or window.
+        mean: shape (summaries,).
+        matrix: shape (summaries, directions).
+        scale: of its statistic.
+    """
+
+    detector: str
+    option: float
+    mean: Array
+    matrix: Array
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class ChainPart:
+    """From residuals to alarms: `edp.monitor.chain` as numbers.
+
+    Attributes:
+        block: ticks of a block.
+        centre: of each input, shape (inputs,).
+        spread: one over the usual width of each input, shape (inputs,).
+        impossible: usual widths from its centre beyond which an input counts as missing.
+        scale: one over the usual width of each residual, shape (residuals,).
+        change: usual variance of the change of the channel of each residual, shape (residuals,).
+        channel: input that each residual judges.
+        level: inputs whose mean is part of the operating point.
+        moving: inputs whose mean size is.
+        point_offset: of the operating point, shape (points,); `point_width` likewise.
+        point_limit: of its scaled numbers.
+        usual: of each summary, shape (summaries, 1 + points); `wide` likewise.
+        least: width of each summary, shape (summaries,).
+        clip: of conditioned summaries.
+        drift_step: most by which the slow drift changes in a block.
+        drift_most: its limit.
+        watches: side by side.
+        limit: of the largest statistic over its scale.
+        quiet: at or below which it is at a healthy level.
+        settle: blocks after a reset that are not judged.
+    """
+
+    block: int
+    centre: Array
+    spread: Array
+    impossible: float
+    scale: Array
+    change: Array
+    channel: Places
+    level: Places
+    moving: Places
+    point_offset: Array
+    point_width: Array
+    point_limit: float
+    usual: Array
+    wide: Array
+    least: Array
+    clip: float
+    drift_step: float
+    drift_most: float
+    watches: tuple[WatchPart, ...]
+    limit: float
+    quiet: float
+    settle: int
+
+
+@dataclass(frozen=True, eq=False)
+class GoldenChain:
+    """What Python makes of drawn residuals and inputs (`edp.export.monitor.golden.drawn_rows`), a row a block.
+
+    Attributes:
+        statistics: shape (blocks, watches).
+        alarms: place of the watch that raised one, -1 without, shape (blocks,).
+        since: block after which the deviation began, shape (blocks,).
+        evidence: of the last alarm, shape (summaries,).
+    """
+
+    statistics: Array
+    alarms: Places
+    since: Places
+    evidence: Array
+
+
+@dataclass(frozen=True, eq=False)
+class GoldenResiduals:
+    """Inputs, and what Python's sources make of them.
+
+    Attributes:
+        inputs: shape (ticks, inputs).
+        residuals: shape (ticks, residuals); NaN where silent.
+        tolerance: how far another form may be off, shape (residuals,).
+    """
+
+    inputs: NDArray[np.float32]
+    residuals: NDArray[np.float32]
+    tolerance: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorParts:
+    """A monitor.
+
+    Attributes:
+        title: a line about it.
+        digest: content address.
+        promise: a sentence on false alarms.
+        inputs: measured channels, in the order in which they are given.
+        rate_hz: ticks per second.
+        residuals: names.
+        reads: inputs that each residual depends on.
+        sources: in the order of the residuals.
+        chain: what follows them.
+        golden_chain: of the self-test.
+        golden_residuals: of the self-test.
+    """
+
+    title: str
+    digest: str
+    promise: str
+    inputs: tuple[Channel, ...]
+    rate_hz: float
+    residuals: tuple[str, ...]
+    reads: Sequence[Places]
+    sources: tuple[SourcePart, ...]
+    chain: ChainPart
+    golden_chain: GoldenChain
+    golden_residuals: GoldenResiduals
+
+    @property
+    def summaries(self) -> int:
+        """Numbers of a block."""
+        return len(self.chain.least)
+
+    @property
+    def points(self) -> int:
+        """Numbers of the operating point, without its 1."""
+        return len(self.chain.point_offset)

@@ -1,0 +1,271 @@
+/* Arithmetic and detectors of exported monitors; see edp_chain.h. */
+#include "edp_chain.h"
+
+#include <stddef.h>
+#include <string.h>
+
+#define EXPONENT 0x7FF0000000000000u
+#define MANTISSA 0x000FFFFFFFFFFFFFu
+#define HIDDEN 0x0010000000000000u
+#define EDP_NEAR_ZERO 0.05 /* of healthy variance, added below gain and lag: a channel at rest tells neither */
+
+static uint64_t bits_of(double x) {
+    uint64_t bits;
+    (void)memcpy(&bits, &x, sizeof bits);
+    return bits;
+}
+
+static double from_bits(uint64_t bits) {
+    double x;
+    (void)memcpy(&x, &bits, sizeof x);
+    return x;
+}
+
+bool edp_known(double x) { return (bits_of(x) & EXPONENT) != EXPONENT; }
+
+double edp_unknown(void) { return from_bits(EXPONENT | (HIDDEN >> 1)); }
+
+double edp_root(double x) {
+    double result = x; /* zero with its sign, NaN and +infinity are their own roots */
+    if (x < 0.0) {
+        result = edp_unknown();
+    } else if ((x > 0.0) && edp_known(x)) {
+        /* 2^54 brings what is subnormal into the normal range, without rounding. */
+        const bool tiny = bits_of(x) < HIDDEN;
+        const uint64_t bits = bits_of(tiny ? (x * 18014398509481984.0) : x);
+        const int32_t power = (int32_t)(bits >> 52) - 1023;
+        uint64_t left = (bits & MANTISSA) | HIDDEN;
+        uint64_t root = 0u;
+        uint64_t twice = 0u;
+        int32_t half = power / 2;
+        if ((power % 2) != 0) { /* an even power of two is left outside */
+            left <<= 1;
+            half -= (power < 0) ? 1 : 0;
+        }
+        /* Digit by digit: 53 bits of the root, and one to round by. */
+        left <<= 1;
+        for (uint64_t digit = HIDDEN << 1; digit != 0u; digit >>= 1) {
+            const uint64_t next = twice + digit;
+            if (next <= left) {
+                twice = next + digit;
+                left -= next;
+                root += digit;
+            }
+            left <<= 1;
+        }
+        /* A root is never halfway between two numbers. */
+        root += root & 1u;
+        result = from_bits((root >> 1) + ((uint64_t)(int64_t)(half + 1022) << 52));
+        result = tiny ? (result * 7.450580596923828125e-9) : result; /* 2^-27 */
+    }
+    return result;
+}
+
+double edp_dot(const double *x, const float *y, uint32_t n) {
+    double sum = 0.0;
+    for (uint32_t i = 0; i < n; i++) {
+        sum += x[i] * (double)y[i];
+    }
+    return sum;
+}
+
+double edp_squares(const double *x, uint32_t n) {
+    double sum = 0.0;
+    for (uint32_t i = 0; i < n; i++) {
+        sum += x[i] * x[i];
+    }
+    return sum;
+}
+
+uint32_t edp_crc_doubles(uint32_t crc, const double *values, uint32_t n) {
+    uint32_t left = crc ^ 0xFFFFFFFFu;
+    for (uint32_t i = 0; i < n; i++) {
+        uint64_t bits = bits_of(values[i]);
+        for (uint32_t bit = 0; bit < 64u; bit++) {
+            const uint32_t low = (left ^ (uint32_t)(bits & 1u)) & 1u;
+            left = (left >> 1) ^ (0xEDB88320u & (0u - low));
+            bits >>= 1;
+        }
+    }
+    return left ^ 0xFFFFFFFFu;
+}
+
+/* ---- blocks -------------------------------------------------------------------------------------------------------- */
+
+double edp_within(double x, double low, double high) {
+    double y = x;
+    if (x < low) {
+        y = low;
+    } else if (x > high) {
+        y = high;
+    } else {
+        /* within, or NaN */
+    }
+    return y;
+}
+
+static double size_of(double x) { return (x < 0.0) ? -x : x; }
+
+bool edp_plausible(float x, double centre, double spread, double limit) {
+    return (size_of((double)x - centre) * spread) <= limit; /* false for NaN */
+}
+
+static void add_residual(double r, double u, double d, double *sums) {
+    sums[0] += 1.0;
+    sums[1] += r;
+    sums[2] += r * r;
+    sums[3] += r * u;
+    sums[5] += r * d;
+    sums[7] = (size_of(r) > sums[7]) ? size_of(r) : sums[7];
+}
+
+void edp_block_tick(const edp_blocks *b, bool first, const float *in, const float *residuals, double *y, double *sums) {
+    double *const levels = &sums[EDP_SUMS * b->residuals];
+    double *const sizes = &levels[b->levels];
+    /* Each residual first takes the channel of the tick before, then that of this one. */
+    for (uint32_t i = 0; i < b->residuals; i++) {
+        const uint32_t c = b->channel[i];
+        const double before = y[c];
+        const double u = edp_known((double)in[c]) ? (((double)in[c] - b->centre[c]) * b->spread[c]) : before;
+        const double d = first ? 0.0 : (u - before);
+        double *const own = &sums[EDP_SUMS * i];
+        if (edp_known((double)residuals[i])) {
+            add_residual((double)residuals[i] * b->scale[i], u, d, own);
+        }
+        own[4] += u * u;
+        own[6] += d * d;
+    }
+    for (uint32_t c = 0; c < b->inputs; c++) {
+        if (edp_known((double)in[c])) {
+            y[c] = ((double)in[c] - b->centre[c]) * b->spread[c];
+        }
+    }
+    for (uint32_t i = 0; i < b->levels; i++) {
+        levels[i] += y[b->level[i]];
+    }
+    for (uint32_t i = 0; i < b->moving; i++) {
+        sizes[i] += size_of(y[b->size[i]]);
+    }
+}
+
+void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double summaries[EDP_SUMMARIES]) {
+    const double *const own = &sums[EDP_SUMS * residual];
+    const double whole = (double)b->ticks;
+    const double n = (own[0] > 1.0) ? own[0] : 1.0;
+    const double mean = own[1] / n;
+    const double variance = (own[2] / n) - (mean * mean);
+    if ((2.0 * own[0]) < whole) {
+        for (uint32_t i = 0; i < EDP_SUMMARIES; i++) {
+            summaries[i] = edp_unknown();
+        }
+    } else {
+        summaries[0] = mean;
+        summaries[1] = edp_root(edp_root((variance > 0.0) ? variance : 0.0));
+        summaries[2] = own[3] / (own[4] + (EDP_NEAR_ZERO * whole));
+        summaries[3] = own[5] / (own[6] + ((EDP_NEAR_ZERO * whole) * b->change[residual]));
+        summaries[4] = edp_root(own[7]);
+    }
+}
+
+void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
+                     double *point) {
+    const double *const values = &sums[EDP_SUMS * b->residuals];
+    const double whole = (double)b->ticks;
+    for (uint32_t i = 0; i < (b->levels + b->moving); i++) {
+        point[i] = edp_within(((values[i] / whole) - (double)offset[i]) / (double)width[i], -limit, limit);
+    }
+}
+
+double edp_conditioned(double summary, const double *point, uint32_t n, const float *usual, const float *wide,
+                       double floor, double limit) {
+    double middle = (double)usual[0];
+    double width = (double)wide[0];
+    for (uint32_t i = 0; i < n; i++) {
+        middle += point[i] * (double)usual[i + 1u];
+        width += point[i] * (double)wide[i + 1u];
+    }
+    return edp_within((summary - middle) / ((width > floor) ? width : floor), -limit, limit);
+}
+
+/* ---- detectors ----------------------------------------------------------------------------------------------------- */
+
+void edp_clear(uint32_t n, double *values) {
+    for (uint32_t i = 0; i < n; i++) {
+        values[i] = 0.0;
+    }
+}
+
+double edp_cusum(double slack, const double *row, uint32_t n, double *sums) {
+    double length;
+    double left;
+    double share;
+    for (uint32_t i = 0; i < n; i++) {
+        sums[i] += row[i];
+    }
+    length = edp_root(edp_squares(sums, n));
+    left = ((length - slack) > 0.0) ? (length - slack) : 0.0;
+    share = left / ((length > 1e-300) ? length : 1e-300);
+    for (uint32_t i = 0; i < n; i++) {
+        sums[i] *= share;
+    }
+    return left;
+}
+
+double edp_ewma(double weight, double factor, const double *row, uint32_t n, double *means) {
+    for (uint32_t i = 0; i < n; i++) {
+        means[i] += weight * (row[i] - means[i]);
+    }
+    return edp_squares(means, n) * factor;
+}
+
+double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32_t length, double *sums) {
+    for (uint32_t i = 0; i < n; i++) {
+        sums[i] = ((before == NULL) ? 0.0 : before[i]) + row[i];
+    }
+    return edp_squares(sums, n) / (2.0 * (double)length);
+}
+
+/* ---- watches ------------------------------------------------------------------------------------------------------- */
+
+void edp_watch_centre(const edp_watch *w, const double *z, double *centred) {
+    for (uint32_t i = 0; i < w->summaries; i++) {
+        centred[i] = edp_known(z[i]) ? (z[i] - (double)w->mean[i]) : 0.0;
+    }
+}
+
+double edp_watch_white(const edp_watch *w, const double *centred, uint32_t direction) {
+    return edp_dot(centred, &w->matrix[(size_t)direction * w->summaries], w->summaries);
+}
+
+uint32_t edp_watch_steps(const edp_watch *w) { return (w->detector == EDP_GLR) ? w->window : 1u; }
+
+void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *rows,
+                    double *statistic) {
+    const uint32_t n = w->directions;
+    if (w->detector == EDP_CUSUM) {
+        *statistic = edp_cusum(w->option, white, n, memory) / w->scale;
+    } else if (w->detector == EDP_EWMA) {
+        *statistic = edp_ewma(w->option, w->factor, white, n, memory) / w->scale;
+    } else {
+        /* Longest first: each sum rests on the next shorter one of the row before. */
+        const uint32_t length = w->window - step;
+        double *const sums = &memory[(size_t)(length - 1u) * n];
+        const double *const before = (length > 1u) ? &memory[(size_t)(length - 2u) * n] : NULL;
+        const double ratio = edp_glr_ratio(white, n, before, length, sums);
+        if (step == 0u) {
+            *rows += (*rows < w->window) ? 1u : 0u;
+            *statistic = 0.0;
+        }
+        if ((length <= *rows) && (ratio > *statistic)) {
+            *statistic = ratio;
+        }
+        if (length == 1u) {
+            *statistic /= w->scale;
+        }
+    }
+}
+
+void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *rows) {
+    edp_clear(EDP_WATCH_MEMORY(w->directions, (w->detector == EDP_GLR) ? w->window : 1u), memory);
+    *rows = 0u;
+}

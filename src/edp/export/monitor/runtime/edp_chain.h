@@ -1,0 +1,110 @@
+/* From residuals to alarms: what every exported monitor needs. C99, double precision, no heap, no globals, no libm.
+ *
+ * Every sum is taken in the order of its index, from zero, and every operation is one of + - * / and a square root that
+ * is rounded correctly: with -ffp-contract=off (GCC, Clang) the numbers are those of Python bit for bit, on every machine
+ * with IEEE arithmetic. On a core without double precision in hardware they are computed by the compiler's library.
+ */
+#ifndef EDP_CHAIN_H
+#define EDP_CHAIN_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* The square root, rounded to nearest as IEEE 754 asks; NaN of what is negative. By integers: it calls no library. */
+double edp_root(double x);
+/* True unless x is NaN or infinite; works on the bits, so that no compiler flag can take it away. */
+bool edp_known(double x);
+/* What stands for a number that is not there. */
+double edp_unknown(void);
+/* The sum of products x[i] y[i] over i < n. */
+double edp_dot(const double *x, const float *y, uint32_t n);
+/* The sum of squares over i < n. */
+double edp_squares(const double *x, uint32_t n);
+/* Whether a measurement is one: finite, and at most `limit` usual widths from its usual value. */
+bool edp_plausible(float x, double centre, double spread, double limit);
+
+/* The checksum of arrays in flash goes on from `crc` (0 to begin with); as CRC-32 of the bytes, lowest byte first. */
+uint32_t edp_crc_doubles(uint32_t crc, const double *values, uint32_t n);
+
+/* ---- from residuals at every tick to numbers of a block ------------------------------------------------------------ */
+
+#define EDP_SUMS 8u      /* of a residual: ticks, r, r r, r u, u u, r d, d d, largest |r| */
+#define EDP_SUMMARIES 5u /* of a residual and block: mean, spread, gain, lag, peak */
+
+/* How blocks are formed. r is a residual times `scale`, u the channel that it judges less its `centre` times `spread`, d
+   the change of u since the tick before: both factors are one over a usual width. */
+typedef struct {
+    uint32_t ticks; /* of a block */
+    uint32_t inputs;
+    uint32_t residuals;
+    uint32_t levels;
+    uint32_t moving;
+    const double *centre;  /* (inputs) */
+    const double *spread;  /* (inputs) */
+    const double *scale;   /* (residuals) */
+    const double *change;  /* (residuals) usual variance of d */
+    const uint16_t *channel; /* (residuals) input that each judges */
+    const uint16_t *level;   /* (levels) inputs whose mean is part of the operating point */
+    const uint16_t *size;    /* (moving) inputs whose mean size is */
+} edp_blocks;
+
+/* Doubles in `sums` of one block. */
+#define EDP_BLOCK_SUMS(residuals, levels, moving) (EDP_SUMS * (residuals) + (levels) + (moving))
+
+/* A tick: NaN where an input or a residual is missing. `y` (inputs) is what the last tick left, zero before the first. */
+void edp_block_tick(const edp_blocks *b, bool first, const float *in, const float *residuals, double *y, double *sums);
+/* The summaries of a residual when the block has ended; NaN where more than half of its ticks are missing. */
+void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double summaries[EDP_SUMMARIES]);
+/* The operating point (levels + moving), scaled and limited. */
+void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
+                     double *point);
+/* A summary at an operating point of n numbers: less what is usual there, over how widely it scatters there. `usual` and
+   `wide` have 1 + n numbers. */
+double edp_conditioned(double summary, const double *point, uint32_t n, const float *usual, const float *wide,
+                       double floor, double limit);
+/* A number within limits; NaN stays. */
+double edp_within(double x, double low, double high);
+
+/* ---- detectors: one row of white residuals in, a statistic out ---------------------------------------------------- */
+
+/* Multivariate CUSUM; `sums` (n) is its memory. */
+double edp_cusum(double slack, const double *row, uint32_t n, double *sums);
+/* T2 of exponentially weighted means; `means` (n) is its memory, `factor` is (2 - weight) / weight. */
+double edp_ewma(double weight, double factor, const double *row, uint32_t n, double *means);
+/* Likelihood ratio of a shift that began `length` rows ago; `sums` (n) of that length. The sum of a length is that of the
+   next shorter one before this row, and the row: lengths are taken from the longest down, `before` is that of length - 1,
+   NULL for length 1. */
+double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32_t length, double *sums);
+void edp_clear(uint32_t n, double *values);
+
+/* ---- watches: a view of the conditioned summaries, and a detector on it --------------------------------------------- */
+
+typedef enum { EDP_CUSUM = 0, EDP_EWMA = 1, EDP_GLR = 2 } edp_detector;
+
+typedef struct {
+    edp_detector detector;
+    uint32_t summaries;
+    uint32_t directions;
+    uint32_t window;  /* of the likelihood ratio: lengths that are tried */
+    double option;    /* slack or weight */
+    double factor;    /* of the weighted means */
+    double scale;     /* over which statistics of all watches are compared with one limit */
+    const float *mean;   /* (summaries) */
+    const float *matrix; /* (directions, summaries) */
+} edp_watch;
+
+/* Doubles in the memory of a detector. */
+#define EDP_WATCH_MEMORY(directions, window) ((directions) * (((window) > 1u) ? (window) : 1u))
+
+/* Summaries less their mean; a missing one counts as healthy. */
+void edp_watch_centre(const edp_watch *w, const double *z, double *centred);
+/* One number of the white row. */
+double edp_watch_white(const edp_watch *w, const double *centred, uint32_t direction);
+/* Steps that a detector takes for one row. */
+uint32_t edp_watch_steps(const edp_watch *w);
+/* One of them; `rows` counts rows since a reset up to the window. The statistic stands in `statistic` behind the last. */
+void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *rows,
+                    double *statistic);
+void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *rows);
+
+#endif

@@ -1,0 +1,265 @@
+"""``edp export MONITOR``: a fitted monitor as C99 without heap, with its networks and a self-test, and around that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, ExportError, closest
+from edp.export.golden import SHARE
+from edp.export.monitor import (
+    DETECTORS,
+    BalancePart,
+    ChainPart,
+    GoldenChain,
+    GoldenResiduals,
+    MonitorParts,
+    NetworkPart,
+    SourcePart,
+    WatchPart,
+    drawn_rows,
+    write_monitor,
+    write_monitor_fmu,
+)
+from edp.monitor.chain import Chain
+from edp.monitor.conditioning import POINT_LIMIT
+from edp.monitor.detectors import DETECTORS as REGISTERED
+from edp.monitor.monitor import IMPOSSIBLE, Monitor
+from edp.monitor.monitor_file import HEADER, load_monitor
+from edp.monitor.residuals.balances import Balances
+from edp.monitor.residuals.base import ResidualSource
+from edp.monitor.residuals.virtual_sensors import VirtualSensors
+from edp.monitor.watches import Watch
+from edp.networks.integer import IntegerPredictor
+from edp.training.bundle import Bundle
+
+FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries")}
+"""Forms of a monitor with their options; they are forms of networks, too."""
+GOLDEN_TICKS = 120
+"""Of the self-test of residuals: more than a window, with ticks at which inputs are missing."""
+ROUNDING = 2.0**-22
+"""Share of a measured value by which its difference to a prediction may round."""
+Rows = NDArray[np.float32]
+
+
+def holds_monitor(path: str | Path) -> bool:
+    """Whether a folder is one that edp monitor fit wrote."""
+    return (Path(path) / HEADER).is_file()
+
+
+def export_monitor(
+    monitor: str | Path, to: str, folder: str | Path, name: str, options: Mapping[str, str] | None = None
+) -> list[Path]:
+    """Write a fitted monitor in the form `to`.
+
+    Args:
+        monitor: folder that edp monitor fit wrote.
+        to: a name of `FORMS`.
+        folder: where to.
+        name: of the monitor in the files.
+        options: of the form.
+
+    Returns:
+        The files, the one to read first in front.
+
+    Raises:
+        EdpError: not a monitor, a part without a form in C, a form, a name or an option that cannot be.
+    """
+    if to not in FORMS:
+        raise ExportError(f"a monitor has no form '{to}'{closest(to, FORMS)}; it has {', '.join(FORMS)}")
+    known = FORMS[to]
+    for option in options or {}:
+        if option not in known:
+            has = f"it has {', '.join(known)}" if known else "it has none"
+            raise ConfigError(f"--set {option}: form '{to}' of a monitor has no such option ({has}); leave it out")
+    parts = monitor_parts(load_monitor(monitor))
+    if to == "fmu":
+        return write_monitor_fmu(parts, name, Path(folder), dict(options or {}))
+    return write_monitor(parts, name, Path(folder))
+
+
+def monitor_parts(monitor: Monitor) -> MonitorParts:
+    """The numbers of a monitor, and what its self-test expects.
+
+    Raises:
+        ExportError: a source or a detector without a form in C.
+    """
+    place = {name: i for i, name in enumerate(monitor.inputs)}
+    sources = tuple(part for source in monitor.sources for part in source_parts(source, place))
+    chain = chain_part(monitor.chain)
+    parts = MonitorParts(
+        title=f"monitor of {len(monitor.inputs)} channels",
+        digest=str(monitor.provenance.get("digest", "")) or digest_of(chain),
+        promise=f"{monitor.limit.sentence()}.",
+        inputs=monitor.channels,
+        rate_hz=monitor.rate_hz,
+        residuals=monitor.residual_names,
+        reads=[tuple(place[n] for n in reads) for source in monitor.sources for reads in source.reads],
+        sources=sources,
+        chain=chain,
+        golden_chain=golden_chain(monitor.chain, chain),
+        golden_residuals=golden_residuals(monitor),
+    )
+    return parts
+
+
+def digest_of(chain: ChainPart) -> str:
+    """Content address of a chain."""
+    import hashlib
+
+    state = hashlib.blake2b(digest_size=16)
+    for watch in chain.watches:
+        state.update(watch.matrix.astype("<f8").tobytes() + watch.mean.astype("<f8").tobytes())
+    for values in (chain.centre, chain.spread, chain.scale, chain.usual, chain.wide):
+        state.update(np.ascontiguousarray(values).astype("<f8").tobytes())
+    return state.hexdigest()
+
+
+# ---- sources ---------------------------------------------------------------------------------------------------------
+
+
+def source_parts(source: ResidualSource, place: Mapping[str, int]) -> list[SourcePart]:
+    """A source as parts whose residuals stand in its order.
+
+    Raises:
+        ExportError: it has no form in C.
+    """
+    if isinstance(source, VirtualSensors):
+        return [_virtual(source, bundle, place) for bundle in source.bundles.values()]
+    if isinstance(source, Balances):
+        return [_balances(source, place)]
+    raise ExportError(
+        f"residuals of kind '{type(source).__name__}' have no form in C; fit the monitor without them, or run it in "
+        "Python"
+    )
+
+
+def _virtual(source: VirtualSensors, bundle: Bundle, place: Mapping[str, int]) -> NetworkPart:
+    own = {name: i for i, name in enumerate(source.inputs)}
+    reads, targets = bundle.task.inputs, bundle.task.targets
+    return NetworkPart(
+        bundle=bundle,
+        reads=tuple(place[name] for name in reads),
+        middle=source.middle[[own[name] for name in reads]],
+        judged=tuple(place[name] for name in targets),
+        results=tuple(range(len(targets))),
+        delays=(0,) * len(targets),
+        widths=np.ones(len(targets), np.float32),
+    )
+
+
+def _balances(source: Balances, place: Mapping[str, int]) -> BalancePart:
+    return BalancePart(
+        reads=tuple(place[name] for name in source.inputs),
+        middle=source.middle,
+        levels=tuple(source.pairs[:, 0].tolist()),
+        rates=tuple(source.pairs[:, 1].tolist()),
+        steps=source.gains / source.rate_hz,
+        left=1.0 - 1.0 / (source.memories_s * source.rate_hz),
+    )
+
+
+# ---- chain -----------------------------------------------------------------------------------------------------------
+
+
+def chain_part(chain: Chain) -> ChainPart:
+    """A chain as numbers.
+
+    Raises:
+        ExportError: a detector without a form in C.
+    """
+    summaries, conditioning = chain.summaries, chain.conditioning
+    return ChainPart(
+        block=summaries.block,
+        centre=summaries.centre,
+        spread=summaries.spread,
+        impossible=IMPOSSIBLE,
+        scale=summaries.scale,
+        change=summaries.change,
+        channel=tuple(summaries.channel.tolist()),
+        level=tuple(summaries.level.tolist()),
+        moving=tuple(summaries.moving.tolist()),
+        point_offset=conditioning.offset,
+        point_width=conditioning.width,
+        point_limit=POINT_LIMIT,
+        usual=conditioning.usual,
+        wide=conditioning.spread,
+        least=conditioning.floor,
+        clip=conditioning.clip,
+        drift_step=chain.drift.step,
+        drift_most=chain.drift.most,
+        watches=tuple(map(_watch, chain.watches)),
+        limit=chain.limit,
+        quiet=chain.quiet,
+        settle=chain.settle,
+    )
+
+
+def _watch(watch: Watch) -> WatchPart:
+    name = REGISTERED.name_of(watch.detector)
+    options = {"cusum": "slack", "ewma": "weight", "glr": "window"}
+    if name not in DETECTORS:
+        raise ExportError(
+            f"detector '{name}' has no form in C; these have: {', '.join(DETECTORS)}. Fit the monitor with one of them"
+        )
+    return WatchPart(name, float(getattr(watch.detector, options[name])), watch.mean, watch.matrix, watch.scale)
+
+
+# ---- self-test -------------------------------------------------------------------------------------------------------
+
+
+def golden_chain(chain: Chain, part: ChainPart) -> GoldenChain:
+    """What the chain makes of drawn rows."""
+    inputs, residuals = drawn_rows(part)
+    verdicts, _ = chain.run(residuals, inputs, chain.initial_state())
+    last = [verdict.evidence for verdict in verdicts if verdict.alarm is not None]
+    return GoldenChain(
+        statistics=np.array([verdict.statistics for verdict in verdicts]),
+        alarms=tuple(-1 if verdict.alarm is None else verdict.alarm for verdict in verdicts),
+        since=tuple(verdict.since for verdict in verdicts),
+        evidence=last[-1] if last else np.zeros(chain.summaries.width),
+    )
+
+
+def golden_residuals(monitor: Monitor) -> GoldenResiduals:
+    """Smooth inputs in the usual range, some of them missing, and the residuals of them."""
+    summaries = monitor.chain.summaries
+    rng = np.random.default_rng(0)
+    value, rows = rng.normal(size=len(monitor.inputs)), []
+    for kick in rng.normal(size=(GOLDEN_TICKS, len(monitor.inputs))):
+        value = 0.9 * value + 0.4 * kick
+        rows.append(summaries.centre + value / summaries.spread)
+    inputs = np.asarray(rows, np.float32)
+    holes = rng.random(inputs.shape) < 0.05
+    holes[: GOLDEN_TICKS // 2] = False
+    inputs[holes] = np.nan
+    residuals, _ = monitor.residuals(inputs, monitor.initial_state())
+    tolerance = np.zeros(residuals.shape[1])
+    first = 0
+    for source in monitor.sources:
+        own = slice(first, first + len(source.names))
+        tolerance[own] = _allowed(source, residuals[:, own], inputs, monitor.inputs)
+        first += len(source.names)
+    return GoldenResiduals(inputs, residuals, tolerance.astype(np.float32))
+
+
+def _allowed(source: ResidualSource, residuals: Rows, inputs: Rows, names: Sequence[str]) -> NDArray[np.float64]:
+    """How far residuals in C may be off: as predictions of networks are; nothing for integers and balances."""
+    if not isinstance(source, VirtualSensors):
+        return np.zeros(len(source.names))
+    parts = []
+    place = {name: i for i, name in enumerate(names)}
+    for bundle in source.bundles.values():
+        if isinstance(bundle.predictor, IntegerPredictor):
+            parts.append(np.zeros(len(bundle.task.targets)))
+            continue
+        sigma = bundle.predictor.code.width.detach().cpu().double().numpy().ravel()
+        measured = np.nanmax(np.abs(inputs[:, [place[name] for name in bundle.task.targets]]), axis=0)
+        # The prediction is the measured value less the residual: its size is at most that of both.
+        largest = measured + np.nanmax(np.abs(residuals[:, : len(sigma)]), axis=0)
+        residuals = residuals[:, len(sigma) :]
+        parts.append(2.0 * SHARE * (sigma + largest) + ROUNDING * measured)
+    return np.concatenate(parts)

@@ -1,0 +1,266 @@
+"""Exported monitors: the chain bit by bit, residuals within tolerance, missing inputs, heap, hostile text, FMU."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.errors import BundleError, ConfigError, ExportError
+from edp.export.monitor import monitor_files, write_monitor
+from edp.export.monitor.golden import drawn_rows
+from edp.monitor.detectors import EDetectorSpec
+from edp.monitor.monitor_file import save_monitor
+from edp.workflows.monitor.export_monitor import chain_part, export_monitor, monitor_parts
+
+OK, WARMING, HELD, RESTARTED, NOT_RESET = range(5)
+M4 = ("-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
+ALLOWED = {"memset", "memcpy", "floorf", "sqrtf", "erff", "log1pf", "expf", "logf"}
+"""What the rig's monitor may ask of the C library: none of it allocates, and the chain asks for the first two only."""
+HOSTILE = ('x*/ int y; /*"\\', "??/\n#error no", "%n ${name} `id`", "\u202eesrever", "x" * 700)
+
+
+@pytest.fixture(scope="module")
+def folder(c, rig_monitor, tmp_path_factory):
+    """The exported monitor."""
+    path = tmp_path_factory.mktemp("monitor")
+    save_monitor(rig_monitor, path / "fitted")
+    export_monitor(path / "fitted", "c", path / "c", "watch")
+    return path / "c"
+
+
+def sources(folder):
+    return sorted(path.name for path in folder.glob("*.c") if path.name not in ("host_test.c", "example_task.c"))
+
+
+@pytest.fixture(scope="module")
+def program(c, folder, tmp_path_factory):
+    """Its self-test under the sanitisers."""
+    c.need("gcc")
+    path = tmp_path_factory.mktemp("program") / "program"
+    flags = ("-O1", "-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
+    c.run("gcc", *c.flags, *flags, *sources(folder), "host_test.c", "-lm", "-o", path, folder=folder)
+    return path
+
+
+def chain_rows(c, program, inputs, residuals, monitor):
+    """Block, since, watch of an alarm or -1, statistics, evidence: a row a block that C judged."""
+    rows = np.concatenate([inputs, residuals], axis=1).astype(np.float32)
+    width = 3 + len(monitor.chain.watches) + monitor.chain.summaries.width
+    return np.frombuffer(c.run(program, "chain", feed=rows.tobytes()), np.float64).reshape(-1, width)
+
+
+def python_rows(verdicts, monitor):
+    evidence, rows = np.zeros(monitor.chain.summaries.width), []
+    for verdict in verdicts:
+        alarm = -1 if verdict.alarm is None else verdict.alarm
+        evidence = verdict.evidence if verdict.alarm is not None else evidence
+        rows.append(np.concatenate([[verdict.block, verdict.since, alarm], verdict.statistics, evidence]))
+    return np.array(rows)
+
+
+def test_the_self_test_passes_under_the_sanitisers(c, program):
+    told = c.run(program).decode()
+    assert "all tests passed" in told
+    # The drawn rows are shifted in their second half, so alarms are compared and not only silence.
+    assert int(re.search(r"blocks, (\d+) alarms", told)[1]) > 0
+    assert float(re.search(r"share of what is allowed: (\S+)", told)[1]) < 0.5
+
+
+@pytest.mark.parametrize(("compiler", "level"), [("gcc", "-O3"), ("clang", "-O2"), ("clang", "-O0")])
+def test_every_compiler_gives_the_bits_of_python(c, compiler, level, folder, tmp_path):
+    c.need(compiler)
+    c.run(compiler, *c.flags, level, *sources(folder), "host_test.c", "-lm", "-o", tmp_path / "p", folder=folder)
+    assert "all tests passed" in c.run(tmp_path / "p").decode()
+
+
+def test_a_recording_with_a_fault_gives_the_bits_of_python(c, program, rig_monitor, rig_fault):
+    residuals, _ = rig_monitor.residuals(rig_fault, rig_monitor.initial_state())
+    verdicts, _ = rig_monitor.chain.run(residuals, rig_fault, rig_monitor.chain.initial_state())
+    expected = python_rows(verdicts, rig_monitor)
+    assert (expected[:, 2] >= 0).any()
+    found = chain_rows(c, program, rig_fault, residuals, rig_monitor)
+    # The last verdict comes while the next block is formed, and there is none behind the last.
+    np.testing.assert_array_equal(found, expected[: len(found)])
+    assert len(found) >= len(expected) - 1
+
+
+def test_any_residuals_and_inputs_give_the_bits_of_python(c, program, rig_monitor):
+    rng = np.random.default_rng(5)
+    inputs, residuals = drawn_rows(chain_part(rig_monitor.chain))
+    inputs, residuals = inputs.copy(), residuals.copy()
+    for rows in (inputs, residuals):
+        rows *= np.exp(rng.normal(0.0, 1.5, (len(rows), 1))).astype(np.float32)
+        rows[rng.random(rows.shape) < 0.2] = np.nan
+        rows[rng.random(rows.shape) < 0.001] = np.float32(1e37)
+    rows[100:400, 0] = np.nan  # whole blocks without a residual
+    verdicts, _ = rig_monitor.chain.run(residuals, inputs, rig_monitor.chain.initial_state())
+    found = chain_rows(c, program, inputs, residuals, rig_monitor)
+    np.testing.assert_array_equal(found, python_rows(verdicts, rig_monitor)[: len(found)])
+
+
+def streamed(c, program, rows, monitor):
+    """Residuals, outputs (alarm, alarms, since, silent, statistics) and status of each tick."""
+    width = len(monitor.residual_names) + 4 + len(monitor.chain.watches) + 1
+    found = c.run(program, "stream", feed=np.ascontiguousarray(rows, np.float32).tobytes())
+    return np.split(np.frombuffer(found, np.float32).reshape(len(rows), width), [len(monitor.residual_names), -1], 1)
+
+
+def test_a_whole_stream_finds_what_python_finds(c, program, rig_monitor, rig_fault):
+    parts = monitor_parts(rig_monitor)
+    residuals, out, status = streamed(c, program, rig_fault, rig_monitor)
+    expected, _ = rig_monitor.residuals(rig_fault, rig_monitor.initial_state())
+    assert (np.abs(residuals - expected) <= parts.golden_residuals.tolerance).all()
+    verdicts, _ = rig_monitor.advance(rig_fault, rig_monitor.initial_state())
+    alarms = [verdict.block for verdict in verdicts if verdict.alarm is not None]
+    assert alarms
+    block = rig_monitor.chain.summaries.block
+    raised = np.flatnonzero(np.diff(out[:, 1]) > 0) // block
+    # A verdict is told during the block behind its own.
+    assert raised[0] == alarms[0]
+    assert out[-1, 1] == pytest.approx(len(alarms), abs=1)
+    assert set(status[:, 0]) == {WARMING, OK}
+
+
+def test_missing_inputs_silence_their_residuals_and_no_others(c, program, rig_monitor, rig_fault):
+    rows = rig_fault[:400].copy()
+    rows[150:160, 2] = np.nan
+    rows[200:203, 3] = (np.inf, -np.inf, 3e30)
+    rows[250] = np.nan
+    residuals, out, status = streamed(c, program, rows, rig_monitor)
+    expected, _ = rig_monitor.residuals(rig_monitor.plausible(rows), rig_monitor.initial_state())
+    np.testing.assert_array_equal(np.isnan(residuals), np.isnan(expected))
+    there = ~np.isnan(expected)
+    assert (np.abs(residuals - expected) <= monitor_parts(rig_monitor).golden_residuals.tolerance)[there].all()
+    np.testing.assert_array_equal(out[:, 3], np.isnan(expected).sum(axis=1))
+    held = np.zeros(400, bool)
+    held[[*range(150, 160), 200, 201, 202, 250]] = True
+    np.testing.assert_array_equal(status[:, 0] == HELD, held)
+
+
+def test_any_bits_of_inputs_break_no_rule_of_c(c, program, rig_monitor, rig_fault):
+    rng = np.random.default_rng(1)
+    wild = rng.integers(0, 2**32, rig_fault.shape, dtype=np.uint32).view(np.float32)
+    rows = np.where(rng.random(rig_fault.shape) < 0.2, wild, rig_fault)
+    _, out, status = streamed(c, program, rows, rig_monitor)
+    assert np.isfinite(out).all()
+    assert set(status[:, 0]) <= {OK, WARMING, HELD}
+
+
+@pytest.mark.parametrize(("compiler", "flags"), [("clang", ()), ("arm-none-eabi-gcc", M4)])
+def test_it_asks_for_no_heap_and_shares_no_memory(c, compiler, flags, folder, tmp_path):
+    c.need(compiler)
+    prefix = "arm-none-eabi-" if compiler.startswith("arm") else ""
+    objects = []
+    for source in [*sources(folder), "example_task.c"]:
+        objects.append(tmp_path / f"{source}.o")
+        c.run(compiler, *c.flags, "-O2", *flags, "-c", source, "-o", objects[-1], folder=folder)
+    listed = c.run(f"{prefix}nm", *objects[:-1]).decode()
+    asked, own = set(re.findall(r" U (\w+)", listed)), set(re.findall(r" [TRDB] (\w+)", listed))
+    outside = {n for n in asked - own if not n.startswith(("__aeabi", "_GLOBAL_OFFSET", "__stack_chk", "platform_"))}
+    assert outside <= ALLOWED
+    assert not re.findall(r" [bBC] (\w+)", listed)
+    chain = c.run(f"{prefix}nm", tmp_path / "edp_chain.c.o").decode()
+    assert {n for n in re.findall(r" U (\w+)", chain) if not n.startswith(("__aeabi", "_GLOBAL"))} <= {
+        "memset",
+        "memcpy",
+    }
+
+
+def test_the_root_is_that_of_ieee_754(c, folder, tmp_path):
+    c.need("gcc")
+    (tmp_path / "root.c").write_text(ROOT)
+    c.run("gcc", *c.flags, "-I", folder, tmp_path / "root.c", folder / "edp_chain.c", "-o", tmp_path / "root")
+    rng = np.random.default_rng(0)
+    any_bits = rng.integers(0, 2**63, 100_000, dtype=np.uint64).view(np.float64)
+    special = [0.0, -0.0, 5e-324, 2.2250738585072014e-308, 1e308, np.inf, *np.arange(200.0) ** 2]
+    x = np.concatenate([any_bits[~np.isnan(any_bits)], rng.random(1000) * 1e-310, special])
+    found = np.frombuffer(c.run(tmp_path / "root", feed=x.tobytes()), np.float64)
+    np.testing.assert_array_equal(found.view(np.uint64), np.sqrt(x).view(np.uint64))
+    negative = np.frombuffer(c.run(tmp_path / "root", feed=np.array([-1.0, np.nan]).tobytes()), np.float64)
+    assert np.isnan(negative).all()
+
+
+ROOT = """
+#include "edp_chain.h"
+#include <stdio.h>
+int main(void) {
+    double x;
+    while (fread(&x, sizeof x, 1u, stdin) == 1u) {
+        x = edp_root(x);
+        (void)fwrite(&x, sizeof x, 1u, stdout);
+    }
+    return 0;
+}
+"""
+
+
+def test_the_folder_builds_with_its_own_cmake_file(c, folder, tmp_path):
+    c.need("cmake", "gcc")
+    c.run("cmake", "-S", folder, "-B", tmp_path / "build")
+    c.run("cmake", "--build", tmp_path / "build")
+    assert b"100% tests passed" in c.run("ctest", "--test-dir", tmp_path / "build")
+
+
+def test_text_of_channels_and_residuals_stays_text(c, rig_monitor, tmp_path):
+    c.need("gcc")
+    parts = monitor_parts(rig_monitor)
+    inputs = tuple(
+        replace(channel, name=f"{HOSTILE[i % 5]}{i}", description=HOSTILE[(i + 1) % 5])
+        for i, channel in enumerate(parts.inputs)
+    )
+    names = tuple(f"{HOSTILE[i % 5]}{i}" for i in range(len(parts.residuals)))
+    hostile = replace(parts, inputs=inputs, residuals=names, title=HOSTILE[0], promise=HOSTILE[1])
+    write_monitor(hostile, "watch", tmp_path)
+    for path in tmp_path.glob("*.[ch]"):
+        assert path.read_text().replace("\n", "").isprintable(), path
+        assert max(map(len, path.read_text().splitlines())) < 4095
+    c.run("gcc", *c.flags, "-shared", "-fPIC", *sources(tmp_path), "-lm", "-o", "w.so", folder=tmp_path)
+    command = [sys.executable, "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(tmp_path / "w.so")]
+    subprocess.run(command, check=True)
+    header = re.sub(r"/\*.*?\*/", "", (tmp_path / "watch.h").read_text(), flags=re.S)
+    assert len(set(re.findall(r"^    (WATCH_IN_\w+) = \d+,", header, re.MULTILINE))) == len(inputs)
+    assert len(set(re.findall(r"^    (WATCH_RES_\w+) = \d+,", header, re.MULTILINE))) == len(names)
+    assert "int y" not in header
+
+
+def test_damaged_constants_are_seen(c, folder, tmp_path):
+    c.need("gcc")
+    text = (folder / "watch_numbers.h").read_text()
+    number = re.search(r"static const double centre\[\d+\] = \{\n    (\S+),", text)[1]
+    (tmp_path / "watch_numbers.h").write_text(text.replace(f"    {number},", "    12345.0,", 1))
+    (tmp_path / "check.c").write_text('#include "watch.h"\nint main(void) { return watch_check() ? 0 : 1; }\n')
+    (tmp_path / "watch.c").write_text((folder / "watch.c").read_text())
+    rest = [folder / name for name in sources(folder) if name != "watch.c"]
+    flags = ("-std=c99", "-I", tmp_path, "-I", folder)
+    c.run("gcc", *flags, tmp_path / "check.c", tmp_path / "watch.c", *rest, "-lm", "-o", tmp_path / "check")
+    assert subprocess.run([str(tmp_path / "check")]).returncode == 1
+
+
+@pytest.mark.parametrize("name", ["", "Upper", "2nd", "../up", "class", "a" * 21, "edp_x"])
+def test_names_that_c_cannot_carry_are_refused(name, rig_monitor):
+    with pytest.raises(ExportError, match="name"):
+        monitor_files(monitor_parts(rig_monitor), name)
+
+
+def test_what_has_no_form_in_c_is_refused(rig_monitor, tmp_path):
+    watch = replace(rig_monitor.chain.watches[0], detector=EDetectorSpec())
+    other = replace(rig_monitor, chain=replace(rig_monitor.chain, watches=(watch,)))
+    with pytest.raises(ExportError, match=r"'e_detector' has no form in C; these have: cusum, ewma, glr"):
+        monitor_parts(other)
+    coarse = replace(rig_monitor.chain.watches[0], mean=rig_monitor.chain.watches[0].mean + 1e-12)
+    fine = replace(rig_monitor, chain=replace(rig_monitor.chain, watches=(coarse,)))
+    with pytest.raises(ExportError, match="no float32 numbers; fit it again"):
+        write_monitor(monitor_parts(fine), "watch", tmp_path / "c")
+    save_monitor(rig_monitor, tmp_path / "fitted")
+    with pytest.raises(ExportError, match="no form 'onnx'"):
+        export_monitor(tmp_path / "fitted", "onnx", tmp_path / "c", "watch")
+    with pytest.raises(ConfigError, match="no such option"):
+        export_monitor(tmp_path / "fitted", "c", tmp_path / "c", "watch", {"tangent": "true"})
+    with pytest.raises(BundleError, match="not a monitor"):
+        export_monitor(tmp_path, "c", tmp_path / "c", "watch")
+    assert not (tmp_path / "c").exists()
