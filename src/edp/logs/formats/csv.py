@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv as text_csv
 import io
 import re
+from collections import Counter
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +27,9 @@ from edp.logs.formats.base import (
     load_column,
     time_factor,
 )
-from edp.logs.formats.csv_table import CsvTable, TextLayout, is_number
+from edp.logs.formats.csv_dates import dates_of
+from edp.logs.formats.csv_preamble import TablePlace, find_table
+from edp.logs.formats.csv_table import CsvTable, TextLayout, is_grouped, is_number
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
 from edp.signals import TIME_UNITS, UNITS, SignalMap
@@ -100,29 +104,90 @@ FORMATS.register("csv")(CsvFormat())
 
 
 def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
-    lines, skip, encoding, stated = _first_lines(path)
+    lines, skip, encoding, stated, remark = _first_lines(path)
     delimiter = signal_map.delimiter or stated or _delimiter(path, lines)
     rows, ends = _rows(path, lines, delimiter)
     if not rows:
         raise DataError(f"'{path}' holds no rows; expected a header row and numbers")
     check_names(path, () if len(rows[0]) <= MOST_COLUMNS else map(str, range(len(rows[0]))))
-    body = rows[1:] if signal_map.header else rows
+    place = find_table(rows, _number_of_any_kind(delimiter), _is_unit_row) or TablePlace(0, 0)
+    named = place.header < place.first
+    rows[place.header] = [*rows[place.header], *[""] * place.padding]
+    head = rows[place.header]
+    body = rows[place.first :] if named else rows[place.header + signal_map.header :]
     decimal = signal_map.decimal
-    # With commas between cells, 1,5 is two cells.
-    if decimal == "." and delimiter != "," and _has_decimal_commas(body):
+    if decimal == "." and _has_decimal_commas(body, delimiter):
         decimal = ","
-    if signal_map.header:
-        names, units, more = _header(path, rows, decimal)
-        skip += ends[more - 1]
-        body = rows[more:]
+    if not signal_map.header:
+        body = rows[place.first :]
+        names, units = _stated_columns(path, body, signal_map)
+        used = place.first
+    elif _holds_numbers_only(head, decimal):
+        names, units, used = *_names_beside(path, rows[place.header :], remark, delimiter, signal_map), place.header
+        body = rows[used:]
     else:
-        names, units = _stated_columns(path, rows, signal_map)
+        names, units, more = _header(rows[place.header :])
+        used = place.first if named else place.header + more
+        if named:
+            units = _units_between(rows[place.header + 1 : place.first], units)
+        body = rows[used:]
+    skip += ends[used - 1] if used else 0
     numeric = tuple(all(is_number(row[i], decimal) for row in body if i < len(row)) for i in range(len(names)))
     return TextLayout(names, units, numeric, delimiter, decimal, skip, encoding)
 
 
-def _first_lines(path: Path) -> tuple[list[str], int, str, str | None]:
-    """The lines behind leading comments, how many are before them, the encoding, and a delimiter that they state."""
+def _number_of_any_kind(delimiter: str) -> Callable[[str], bool]:
+    """Whether a cell holds a number by any decimal sign, before that of the file is known."""
+
+    def is_some_number(cell: str) -> bool:
+        return is_number(cell) or is_number(cell, ",") or is_grouped(cell.strip())
+
+    return is_some_number
+
+
+def _holds_numbers_only(head: list[str], decimal: str) -> bool:
+    filled = [cell for cell in head if cell.strip()]
+    return not filled or all(is_number(cell, decimal) for cell in filled)
+
+
+def _names_beside(
+    path: Path, rows: list[list[str]], remark: str, delimiter: str, signal_map: SignalMap
+) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
+    """Names of columns that no row holds: from the comment above the numbers, else by place where all are taken.
+
+    Raises:
+        DataError: neither.
+    """
+    width = len(rows[0])
+    text = remark.strip().lstrip("#%").strip()
+    # Tools that write a header as a comment often part its names by blanks.
+    for cells in (_rows(path, [text], delimiter)[0][:1], [text.split()]):
+        cells = [[cell.strip() for cell in row] for row in cells]
+        if cells and len(cells[0]) == width and all(cells[0]) and not any(map(is_number, cells[0])):
+            pairs = [_name_and_unit(cell) for cell in cells[0]]
+            return tuple(name for name, _ in pairs), tuple(unit for _, unit in pairs)
+    if signal_map.others and not signal_map.channels:
+        return tuple(f"column_{i + 1}" for i in range(width)), (None,) * width
+    shown = ", ".join(cell[:20] for cell in rows[0][:4])
+    raise DataError(
+        f"'{path}': the first row holds numbers, not names ({shown}); set header = false in the signal map and list "
+        "its columns, or let `edp init` write one"
+    )
+
+
+def _units_between(rows: list[list[str]], units: tuple[str | None, ...]) -> tuple[str | None, ...]:
+    """Units from a row of them below the names, where there is one; else as the names state them."""
+    for row in rows:
+        if _is_unit_row(row):
+            cells = [normalise_unit(cell.strip().strip("[]()")) for cell in row]
+            return tuple(cells[i] or unit if i < len(cells) else unit for i, unit in enumerate(units))
+    return units
+
+
+def _first_lines(path: Path) -> tuple[list[str], int, str, str | None, str]:
+    """The lines behind leading comments, how many are before them, the encoding, a delimiter that they state, and the
+    last comment.
+    """
     for size in _HEAD_BYTES:
         with path.open("rb") as stream:
             head = stream.read(size)
@@ -134,8 +199,9 @@ def _first_lines(path: Path) -> tuple[list[str], int, str, str | None]:
         # The last line may be cut by the end of what was read.
         if not whole or not lines[-1]:
             lines.pop()
-        skip, stated = 0, None
+        skip, stated, remark = 0, None, ""
         while skip < len(lines) and (not lines[skip].strip() or lines[skip].lstrip()[0] in "#%"):
+            remark = lines[skip] or remark
             skip += 1
         if skip < len(lines) and (match := _STATED.fullmatch(lines[skip])):
             # Excel writes the delimiter into the first line.
@@ -146,7 +212,7 @@ def _first_lines(path: Path) -> tuple[list[str], int, str, str | None]:
         if not whole:
             raise DataError(f"'{path}': no row ends within the first {len(head)} bytes; it is no table")
         raise DataError(f"'{path}' holds no rows; expected a header row and numbers")
-    return lines[skip:], skip, encoding, stated
+    return lines[skip:], skip, encoding, stated, remark
 
 
 def _rows(path: Path, lines: list[str], delimiter: str) -> tuple[list[list[str]], list[int]]:
@@ -199,34 +265,53 @@ def _delimiter(path: Path, lines: list[str]) -> str:
         # Four fifths, since comments and a row of units may stand among the first lines.
         if counts[0] > 1 and counts.count(counts[0]) >= 0.8 * len(counts) and counts[0] > most:
             best, most = delimiter, counts[0]
+    return best if most else _delimiter_of_numbers(path, lines)
+
+
+def _delimiter_of_numbers(path: Path, lines: list[str]) -> str:
+    """The delimiter by which the later of the first lines, behind those of a logger, fall into cells of numbers."""
+    filled = [line for line in lines[:_ROWS_LOOKED] if line.strip()]
+    tail = filled[len(filled) // 2 :]
+    best, best_score = ",", (0.0, 0)
+    for delimiter in _DELIMITERS:
+        try:
+            rows = _rows(path, tail, delimiter)[0]
+        except DataError:
+            continue
+        width, count = Counter(map(len, rows)).most_common(1)[0] if rows else (0, 0)
+        if width < 2 or count < 0.8 * len(rows):
+            continue
+        is_some_number = _number_of_any_kind(delimiter)
+        cells = [cell for row in rows for cell in row]
+        score = (round(sum(map(is_some_number, cells)) / len(cells), 2), width)
+        if score > best_score:
+            best, best_score = delimiter, score
     return best
 
 
-def _has_decimal_commas(rows: list[list[str]]) -> bool:
+def _has_decimal_commas(rows: list[list[str]], delimiter: str) -> bool:
+    """Whether the comma is the decimal sign; a point may then part thousands."""
     cells = [cell.strip() for row in rows for cell in row]
-    return any(re.fullmatch(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", cell) for cell in cells) and not any(
-        re.fullmatch(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?", cell) for cell in cells
-    )
+    # 1.234,5 says it whatever stands elsewhere.
+    if any("," in cell and is_grouped(cell) for cell in cells):
+        return True
+    with_comma = [cell for cell in cells if re.fullmatch(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", cell)]
+    with_point = [cell for cell in cells if re.fullmatch(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?", cell)]
+    # 1,234 may have a comma for thousands; 1,5 has none.
+    proven = not all(re.fullmatch(r"[-+]?\d{1,3},\d{3}", cell) for cell in with_comma)
+    if with_point or delimiter == ",":
+        return proven and all(map(is_grouped, with_point))
+    return bool(with_comma)
 
 
-def _header(path: Path, rows: list[list[str]], decimal: str) -> tuple[tuple[str, ...], tuple[str | None, ...], int]:
+def _header(rows: list[list[str]]) -> tuple[tuple[str, ...], tuple[str | None, ...], int]:
     """Names, units and the number of header rows (2 with a row of units)."""
     # A name may be broken into lines where it is quoted.
-    cells = [" ".join(cell.split()) for cell in rows[0]]
-    filled = [cell for cell in cells if cell]
-    if not filled or all(is_number(cell, decimal) for cell in filled):
-        raise DataError(
-            f"'{path}': the first row holds numbers, not names ({', '.join(cells[:4])}); "
-            "set header = false in the signal map and list its columns"
-        )
-    pairs = [_name_and_unit(cell) for cell in cells]
-    names = tuple(name for name, _ in pairs)
-    units: list[str | None] = [unit for _, unit in pairs]
-    if len(rows) > 1 and _is_unit_row(rows[1], decimal):
-        for i, cell in enumerate(rows[1][: len(units)]):
-            units[i] = normalise_unit(cell.strip().strip("[]()")) or units[i]
-        return names, tuple(units), 2
-    return names, tuple(units), 1
+    pairs = [_name_and_unit(" ".join(cell.split())) for cell in rows[0]]
+    names, units = tuple(name for name, _ in pairs), tuple(unit for _, unit in pairs)
+    if len(rows) > 1 and _is_unit_row(rows[1]):
+        return names, _units_between(rows[1:2], units), 2
+    return names, units, 1
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -240,13 +325,13 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
     return (match["name"], unit) if unit in UNITS or unit in TIME_UNITS else (cell, None)
 
 
-def _is_unit_row(row: list[str], decimal: str) -> bool:
+def _is_unit_row(row: list[str]) -> bool:
     cells = [cell.strip().strip("[]()") for cell in row]
     filled = [cell for cell in cells if cell]
     # 1 is a number and the unit of a ratio: by itself it decides nothing.
     words = [cell for cell in filled if cell != "1"]
     is_unit = [normalise_unit(cell) in UNITS or normalise_unit(cell) in TIME_UNITS for cell in words]
-    return any(is_unit) and not any(is_number(cell, decimal) for cell in words)
+    return any(is_unit) and not any(is_number(cell) or is_number(cell, ",") for cell in words)
 
 
 def _stated_columns(
@@ -273,9 +358,12 @@ def _stamps(table: CsvTable, column_index: int, signal_map: SignalMap) -> Column
     name, unit = layout.names[column_index], layout.units[column_index]
     if table.types[table.keys[column_index]] != pa.string():
         return load_column(table, str(column_index), table.rows) * time_factor(name, unit, signal_map)
-    cells = [(cell or "NaT").strip().removesuffix("Z") for cell in table.texts(column_index)]
+    cells = table.texts(column_index)
+    numbers = table.grouped_numbers(column_index)
+    if numbers is not None:
+        return numbers * time_factor(name, unit, signal_map)
     try:
-        dates = np.array(cells, dtype="datetime64[ns]")
+        dates = dates_of(cells)
     except ValueError:
         table.refuse_text(column_index)
         raise

@@ -57,6 +57,25 @@ def is_number(cell: str, decimal: str = ".") -> bool:
     return True
 
 
+_GROUPED = r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?"
+_GERMAN = rf"^({_GROUPED}|[-+]?[0-9]*,?[0-9]+([eE][-+]?[0-9]+)?)$"
+
+
+def is_grouped(cell: str) -> bool:
+    """Whether a cell, without blanks around it, has points for thousands: ``1.234`` or ``1.234,5``."""
+    return re.fullmatch(_GROUPED, cell) is not None
+
+
+def _without_groups(cells: pa.Array) -> pa.Array | None:
+    """Texts as numbers, by decimal comma and points for thousands; None where one is neither a number nor missing."""
+    cells = pc.utf8_trim_whitespace(cells)
+    cells = pc.if_else(pc.is_in(cells, pa.array(NULLS)), pa.scalar(None, pa.string()), cells)
+    if not pc.all(pc.match_substring_regex(cells, _GERMAN)).as_py() and cells.null_count < len(cells):
+        return None
+    plain = pc.replace_substring(pc.replace_substring(cells, ".", ""), ",", ".")
+    return pc.cast(pc.replace_substring_regex(plain, r"^\+", ""), pa.float64())
+
+
 def _all_numbers(cells: pa.Array, nulls: pa.Array, decimal: str) -> bool:
     cells = pc.utf8_trim_whitespace(cells)
     cells = pc.if_else(pc.is_in(cells, nulls), pa.scalar(None, pa.string()), cells)
@@ -155,18 +174,41 @@ class CsvTable:
         """See `edp.logs.formats.base.ColumnTable`."""
         places = [int(name) for name in names]
         keys = [self.keys[column_index] for column_index in places]
-        for column_index in places:
-            if self.types[self.keys[column_index]] == pa.string():
+        texts = [column_index for column_index in places if self.types[self.keys[column_index]] == pa.string()]
+        for column_index in texts:
+            if self.layout.decimal != ",":
                 self.refuse_text(column_index)
+        grouped = {self.keys[column_index]: column_index for column_index in texts}
         first = 0
         for batch in self.stream(list(dict.fromkeys(keys))):
             low, high = max(start - first, 0), min(stop - first, batch.num_rows)
             if high > low:
                 part = batch.slice(low, high - low)
-                yield [np.asarray(part.column(key).to_numpy(zero_copy_only=False), dtype=np.float64) for key in keys]
+                columns = {key: self._grouped(part.column(key), at) for key, at in grouped.items()}
+                arrays = [columns[key] if key in columns else part.column(key) for key in keys]
+                yield [np.asarray(array.to_numpy(zero_copy_only=False), dtype=np.float64) for array in arrays]
             first += batch.num_rows
             if first >= stop:
                 return
+
+    def _grouped(self, cells: pa.Array, column_index: int) -> pa.Array:
+        """Numbers of a column of text, which have points for thousands."""
+        numbers = _without_groups(cells)
+        if numbers is None:
+            self.refuse_text(column_index)
+        return numbers
+
+    def grouped_numbers(self, column_index: int) -> NDArray[np.float64] | None:
+        """A whole column of text as numbers with points for thousands, shape ``(rows,)``; None where it is none."""
+        if self.layout.decimal != ",":
+            return None
+        parts = [_without_groups(batch.column(0)) for batch in self.stream([self.keys[column_index]])]
+        if any(part is None or part.null_count == len(part) for part in parts):
+            return None
+        columns = [
+            np.asarray(part.to_numpy(zero_copy_only=False), dtype=np.float64) for part in parts if part is not None
+        ]
+        return np.concatenate(columns) if columns else None
 
     def texts(self, column_index: int) -> list[str | None]:
         """The cells of a column of text."""
@@ -187,9 +229,10 @@ class CsvTable:
         name, row, key = self.layout.names[column_index], self.layout.skip_rows + 1, self.keys[column_index]
         for batch in self.stream([key]):
             for cell in batch.column(key).to_pylist():
-                if not is_number(cell or "", self.layout.decimal):
+                text = (cell or "").strip()
+                if not is_number(text, self.layout.decimal) and not (self.layout.decimal == "," and is_grouped(text)):
                     raise DataError(
-                        f"'{self.path}': column '{name}' holds text '{cell[:40]}' in line {row}; "
+                        f"'{self.path}': column '{name}' holds text '{text[:40]}' in line {row}; "
                         "expected a number or an empty cell"
                     )
                 row += 1
