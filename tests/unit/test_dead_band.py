@@ -9,7 +9,7 @@ import torch
 from edp.data.task import TargetMode
 from edp.errors import ConfigError
 from edp.networks.backbones import CommitteeSpec
-from edp.networks.heads import DeadBand, LinearHead
+from edp.networks.heads import LinearHead, OutputBand
 from edp.networks.outputs import Quantiles
 from edp.networks.predictor import ModelSpec, check_combination
 from edp.testing.networks import small_network, small_task
@@ -56,7 +56,7 @@ def test_a_stretch_that_would_lose_narrows_it():
 
 
 def test_it_is_zero_then_steep_then_nothing_at_all():
-    module = DeadBand(2, 1)
+    module = OutputBand(2, 1)
     module.width.copy_(torch.tensor([[0.5], [0.0]]))
     y = torch.tensor([-2.0, -1.0, -0.75, -0.5, -0.1, 0.0, 0.4, 0.6, 1.0, 3.0])
     behind = module(torch.stack([y, y], dim=-1).unsqueeze(-1)).squeeze(-1)

@@ -100,7 +100,7 @@ class LinearHead:
 
     Attributes:
         dead_band: small predictions become zero, of changes no change at all, within a width of each output that
-            training on folds chooses (`DeadBand`).
+            training on folds chooses (`OutputBand`).
     """
 
     dead_band: bool = False
@@ -121,10 +121,10 @@ class LinearHead:
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
         """Heads of one linear layer."""
-        return Heads(width, outputs, values, [], 1, mix, DeadBand(values, outputs) if self.dead_band else None)
+        return Heads(width, outputs, values, [], 1, mix, OutputBand(values, outputs) if self.dead_band else None)
 
 
-class DeadBand(nn.Module):
+class OutputBand(nn.Module):
     """``y - 2 clip(y, -b, b) + clip(y, -2b, 2b)``: zero up to b, twice as steep as y up to 2b, then y itself.
 
     Attributes:
@@ -148,9 +148,9 @@ class DeadBand(nn.Module):
         if not bool(b.any()):
             return y
         inner = build.add(Clip, "band.inner", y, low=-b, high=b)
-        taken = build.add(ScaleShift, "band.taken", inner, gain=torch.full_like(b, -2.0), shift=torch.zeros_like(b))
+        doubled = build.add(ScaleShift, "band.doubled", inner, gain=torch.full_like(b, -2.0), shift=torch.zeros_like(b))
         outer = build.add(Clip, "band.outer", y, low=-2.0 * b, high=2.0 * b)
-        beyond = build.combine("band.beyond", BinaryOperation.ADD, y, taken)
+        beyond = build.combine("band.beyond", BinaryOperation.ADD, y, doubled)
         return build.combine("band", BinaryOperation.ADD, beyond, outer)
 
 
@@ -191,7 +191,7 @@ class Heads(Streaming):
         units: Sequence[GatedUnit],
         hidden: int,
         mix: Streaming | None = None,
-        band: DeadBand | None = None,
+        band: OutputBand | None = None,
     ) -> None:
         super().__init__()
         self.outputs, self.units = outputs, tuple(units)

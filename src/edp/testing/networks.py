@@ -18,7 +18,7 @@ from edp.errors import ConfigError
 from edp.networks.backbones import BACKBONES, BackboneSpec, GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.networks.blocks import BLOCKS
 from edp.networks.blocks.base import OUTPUT_SLOTS, BlockSlot, BlockSpec
-from edp.networks.heads import DeadBand, MlpHead
+from edp.networks.heads import MlpHead, OutputBand
 from edp.networks.predictor import ModelSpec, Predictor, build_model, check_combination
 from edp.networks.trees import Trees
 from edp.registry import Registry
@@ -80,7 +80,7 @@ def small_network(model: ModelSpec, task: Task, shake: float = 0.2) -> Predictor
         for part in predictor.modules():
             if isinstance(part, Trees):
                 _draw_tables(part, rng)
-            if isinstance(part, DeadBand):
+            if isinstance(part, OutputBand):
                 # From none to one that takes most of what a small network says.
                 part.width.copy_(torch.linspace(0.0, 1.0, part.width.numel()).view_as(part.width))
     return predictor.eval()

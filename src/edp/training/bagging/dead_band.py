@@ -23,7 +23,7 @@ LEAST_GAIN = 0.005
 
 
 def band(values: DoubleArray, width: float | DoubleArray) -> DoubleArray:
-    """Values behind a dead band, as `edp.networks.heads.DeadBand` has it."""
+    """Values behind a dead band, as `edp.networks.heads.OutputBand` has it."""
     return np.asarray(values - 2.0 * np.clip(values, -width, width) + np.clip(values, -2.0 * width, 2.0 * width))
 
 
@@ -37,7 +37,7 @@ def dead_bands(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.int
             of one stretch may be chance.
     """
     each = zip(predicted.T, truth.T, strict=True)
-    return np.array([_dead_band(values, wanted, owner) for values, wanted in each])
+    return np.array([_dead_band(values, changes, owner) for values, changes in each])
 
 
 def _dead_band(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.integer]) -> float:

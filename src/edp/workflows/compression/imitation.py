@@ -267,10 +267,10 @@ def _write(net: Predictor, last: Tensor, linear_bias: Tensor) -> None:
 
 def _judge(net: Predictor, rows: Tensor, truth: Tensor, data: Prepared) -> dict[str, Any]:
     """The student's error on recorded rows, all of which it learns from."""
-    said = predict_rows(net, rows[: len(truth)])
+    predicted = predict_rows(net, rows[: len(truth)])
     if net.heads.band is not None:
-        said = net.heads.band(said.unflatten(1, net.heads.band.width.shape)).flatten(1)
-    error = said - truth
+        predicted = net.heads.band(predicted.unflatten(1, net.heads.band.width.shape)).flatten(1)
+    error = predicted - truth
     factors = np.tile([KINDS[kind].report_factor for kind in data.target_kinds], len(data.task.horizons))
     each = error.abs().mean(dim=0).numpy() * net.code.width.flatten().numpy() * factors
     return {
