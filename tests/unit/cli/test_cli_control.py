@@ -129,12 +129,12 @@ def test_a_twin_of_another_rate_or_a_soil_is_refused(edp, tmp_path, twin_run):
 def test_a_twin_of_another_machine_is_refused(edp, tmp_path):
     bundle = TwinBundle(TWINS["static"](), sample_excavator_twin(), {"full_strokes_m": [1.0, 1.0, 0.915]})
     save_twin(bundle, tmp_path / "c14" / "twin")
-    words = ("--controller", "inversion", "--twin", tmp_path / "c14", "--seeds", 1)
-    ended = edp("control", tmp_path / "run", *words, *LINE)
-    assert ended.code == 1
-    said = " ".join(ended.err.split())
-    assert "strokes of 1.000, 1.000, 0.915 m, those of M22 have 1.260, 1.504, 1.104 m" in said
-    assert not (tmp_path / "run").exists()
+    for words in (("--controller", "inversion", "--twin"), ("--plant",)):
+        ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE, *words, tmp_path / "c14")
+        assert ended.code == 1
+        said = " ".join(ended.err.split())
+        assert "strokes of 1.000, 1.000, 0.915 m, those of M22 have 1.260, 1.504, 1.104 m" in said
+        assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):

@@ -13,18 +13,12 @@ from edp.config.control import ControlExperiment
 from edp.control.controllers import ControllerSpec
 from edp.control.loop import LoopResult, run_loop, start_options
 from edp.control.models import ControlModels
-from edp.control.plant import PlantInterface, interface_of
-from edp.control.plants import plant_of
+from edp.control.plant import interface_of
+from edp.control.plants import plant_of, twin_of
 from edp.control.tasks import draw_task
 from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_map
 from edp.errors import ConfigError
-from edp.networks.twin import Twin
 from edp.training.bundle import load_bundle
-from edp.training.twin_bundle import load_twin
-from edp.workflows.twin.train_twin import STROKES
-
-SAME_STROKE = 0.01
-"""Share by which a stroke may differ from that of a twin's machine: measured machine files do."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +81,7 @@ class ControlBench:
         valve_map: ValveMap | None = None
         if "valve_map" in self.experiment.controller.needs:
             valve_map = measure_valve_map(probe, self.plant, self.experiment.seed)
-        twin = None if sources.twin is None else _twin_of(sources.twin, self.plant)
+        twin = None if sources.twin is None else twin_of(sources.twin, self.plant.geometry.machine)
         predictor = None if sources.predictor is None else load_bundle(_bundle_of(sources.predictor))
         return ControlModels(valve_map, twin, predictor)
 
@@ -135,27 +129,6 @@ class ControlBench:
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""
         return float(np.mean([result.score.position_rms_mm for result in self.results(spec)]))
-
-
-def _twin_of(run: Path, plant: PlantInterface) -> Twin:
-    """The twin of a controller.
-
-    Raises:
-        EdpError: it cannot be read, or learned from a machine with other cylinders.
-    """
-    bundle = load_twin(run)
-    theirs, ours = bundle.provenance.get(STROKES), plant.geometry.full_m
-    # Logs of real machines do not say it.
-    if isinstance(theirs, list) and all(isinstance(m, int | float) for m in theirs):
-        known = np.array(theirs, float)
-        if known.shape != ours.shape or not np.allclose(known, ours, rtol=SAME_STROKE):
-            said = [", ".join(f"{m:.3f}" for m in strokes) for strokes in (known, ours)]
-            raise ConfigError(
-                f"--twin {run}: it learned from a machine whose cylinders have strokes of {said[0]} m, those of "
-                f"{plant.geometry.machine.name} have {said[1]} m; name its machine with --machine, or let it go on "
-                "with recordings of this one: edp twin LOGS --start RUN"
-            )
-    return bundle.twin
 
 
 def _bundle_of(run: Path) -> Path:

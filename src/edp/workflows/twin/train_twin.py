@@ -25,7 +25,7 @@ from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FittedTwin, FreeRunProgress
-from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
+from edp.training.twin_bundle import STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
@@ -33,8 +33,6 @@ from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
 FOLDER = "twin"
-STROKES = "full_strokes_m"
-"""Of the metadata of simulated recordings, and of the provenance of a twin that learned from them."""
 DATASHEET = "datasheet"
 """Numbers of a grey box with units and intervals, as JSON and as text."""
 
