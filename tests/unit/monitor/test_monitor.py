@@ -228,4 +228,4 @@ def test_a_rig_of_three_channels_and_one_hertz():
 def test_a_fit_is_repeatable(healthy):
     one, two = (fit_to_recordings(healthy[:16], replace(EXPERIMENT, hours_per_false_alarm=0.07)) for _ in range(2))
     assert one.monitor.chain.limit == two.monitor.chain.limit
-    assert TICKS == healthy[0].samples
+    assert healthy[0].samples == TICKS
