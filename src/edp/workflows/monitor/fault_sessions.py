@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edp.monitor.diagnosis.causes import FaultClass
+from edp.monitor.diagnosis.causes import FaultClass, Place
 from edp.recording import Recording
 from edp.sim import Scenario, Simulation
 from edp.sim.excitation import EXCITATIONS
@@ -50,7 +50,7 @@ def fault_classes(kinds: Sequence[str] | None = None) -> tuple[FaultClass, ...]:
     classes = []
     for name in FAULTS if kinds is None else kinds:
         kind = FAULTS[name]
-        place = "machine" if isinstance(kind, MachineFault) else "sensor"
+        place: Place = "machine" if isinstance(kind, MachineFault) else "sensor"
         for site in kind.sites or ("",):
             words = at_site(kind.words, site)
             for sign in (1.0, -1.0) if kind.signed else (1.0,):
@@ -92,8 +92,7 @@ def simulated(
         yield FaultSession(base, -1, 0.0, _session(_scenario(machine, base, before + after, seed, rate_hz), base, seed))
     for n, (place, size) in enumerate(cases_of(classes, seed[1])):
         fault, base = classes[place], (n + seed[1] * 5) % BASES
-        sized = {"size": size, "unit": fault.unit} if fault.sizes else {}
-        spec = FaultSpec(fault.kind, fault.site, **sized, onset_s=before)
+        spec = FaultSpec(fault.kind, fault.site, size if fault.sizes else None, fault.unit, onset_s=before)
         scenario = replace(_scenario(machine, base, before + after, seed, rate_hz), faults=(spec,))
         yield FaultSession(base, place, size, _session(scenario, base, seed))
 
