@@ -23,7 +23,7 @@ class MonitorAlarm:
         limit: that it passed.
         evidence: names of summaries with their mean conditioned deviation since `since_s`, in healthy standard
             deviations, the largest first.
-        causes: the most probable first; empty without a diagnosis.
+        causes: of a diagnosis, the most probable first; empty without one.
         sentence: all of this for a reader.
         severity: one of `SEVERITIES`.
     """

@@ -88,10 +88,11 @@ def simulated(
         rate_hz: of the recordings.
     """
     before, after = seconds
-    for base in range(BASES):
+    cases = cases_of(classes, seed[1])
+    for base in range(max(1, min(BASES, len(cases)))):
         yield FaultSession(base, -1, 0.0, _session(_scenario(machine, base, before + after, seed, rate_hz), base, seed))
-    for n, (place, size) in enumerate(cases_of(classes, seed[1])):
-        fault, base = classes[place], (n + seed[1] * 5) % BASES
+    for n, (place, size) in enumerate(cases):
+        fault, base = classes[place], (n + seed[1] * 5) % min(BASES, len(cases))
         spec = FaultSpec(fault.kind, fault.site, size if fault.sizes else None, fault.unit, onset_s=before)
         scenario = replace(_scenario(machine, base, before + after, seed, rate_hz), faults=(spec,))
         yield FaultSession(base, place, size, _session(scenario, base, seed))

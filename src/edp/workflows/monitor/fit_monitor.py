@@ -176,8 +176,8 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
                 raise DataError(f"healthy log '{recording.name}' has no channel '{name}'{hint}")
     shared = set(first.channel_names).intersection(*(recording.channel_names for recording in recordings))
     offered = [channel for channel in sensed_channels(first.channels) if channel.name in shared]
-    wanted = experiment.channels or tuple(channel.name for channel in offered)
-    channels = tuple(channel for channel in first.channels if channel.name in wanted)
+    chosen = experiment.channels or tuple(channel.name for channel in offered)
+    channels = tuple(channel for channel in first.channels if channel.name in chosen)
     if len(channels) < 2:
         raise DataError(f"{len(channels)} channel can be watched; a monitor compares two at least: map more columns")
     return channels
@@ -203,8 +203,8 @@ def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
     pieces = []
     for recording in recordings:
         longest = round(CUT_S * recording.rate_hz)
-        wanted = -(-2 * LEAST_SESSIONS // len(recordings))
-        count = max(-(-recording.samples // longest), wanted)
+        least = -(-2 * LEAST_SESSIONS // len(recordings))
+        count = max(-(-recording.samples // longest), least)
         edges = np.linspace(0, recording.samples, count + 1).astype(int).tolist()
         pieces += [recording.rows(a, b) for a, b in itertools.pairwise(edges) if b > a]
     return pieces
@@ -229,11 +229,11 @@ def _divided(
 ) -> tuple[list[Recording], list[Recording], list[Recording]]:
     """Sessions that train residuals, that choose among fits, and the rest, drawn at random."""
     order = np.random.default_rng(experiment.seed).permutation(len(sessions)).tolist()
-    total, taken = sum(session.samples for session in sessions), 0
+    total, drawn = sum(session.samples for session in sessions), 0
     count = 0
-    for count, place in enumerate(order, start=1):
-        taken += sessions[place].samples
-        if taken >= experiment.train_share * total and count >= 2:
+    for count, index in enumerate(order, start=1):
+        drawn += sessions[index].samples
+        if drawn >= experiment.train_share * total and count >= 2:
             break
     count = min(count, len(sessions) - 4)
     chosen = [sessions[i] for i in order[:count]]
