@@ -47,9 +47,9 @@ class DictionarySpec:
 
     machine: str = AUTOMATIC
     draws: int = 3
-    before_s: float = 12.0
-    after_s: float = 90.0
-    minutes: float = 30.0
+    before_s: float = 8.0
+    after_s: float = 60.0
+    minutes: float = 15.0
     kinds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -19,10 +19,18 @@ from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.monitor import Monitor
 from edp.recording import MACHINE, Recording
 from edp.sim.machine.machine_files import machine_names
-from edp.workflows.monitor.fault_sessions import FaultSession, cases_of, fault_classes, noise_of, simulated, with_noise
+from edp.workflows.monitor.fault_sessions import (
+    FaultSession,
+    cases_of,
+    fault_classes,
+    mirrors,
+    noise_of,
+    simulated,
+    with_noise,
+)
 
 Array = NDArray[np.float64]
-HEALTHY_SESSIONS = 40
+HEALTHY_SESSIONS = 30
 """From which the scatter of healthy means is taken; more change little."""
 QUIET = ("CylStroke_1", "CylStroke_2", "CylStroke_3", "PumpPressure_1", "PumpPressure_2", "OilTemperature")
 """Channels that the simulator shows without noise: theirs is taken from the healthy logs."""
@@ -110,9 +118,10 @@ def _draw(
     """All sessions of one draw, each less its sound twin."""
     before = plan.seconds[0]
     further = [name for name in FURTHER if name not in monitor.inputs]
-    total = len(cases_of(classes, draw))
+    total, mirrored = len(cases_of(classes)), mirrors(classes)
     sound: dict[int, tuple[Array, dict[str, Array]]] = {}
     faults: list[SimulatedFault] = []
+    done = 0
     for session in simulated(classes, plan.machine, plan.seconds, (plan.seed, draw), monitor.rate_hz):
         noisy = with_noise(session.recording, plan.added, [plan.seed, draw, session.base])
         seen = _after(monitor, noisy, before), _shown(session, further, before)
@@ -123,9 +132,18 @@ def _draw(
         change = np.nan_to_num(seen[0] - features, nan=0.0)
         shown = {name: seen[1][name] - sensors[name] for name in further}
         faults.append(SimulatedFault(draw, session.fault, session.size, change, shown))
+        done += 1
+        if session.fault in mirrored:
+            faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirrored(change), shown))
         if note is not None:
-            note(f"faults on {plan.machine}, draw {draw + 1}", len(faults), total)
+            note(f"faults on {plan.machine}, draw {draw + 1}", done, total)
     return _standardised(faults, sound)
+
+
+def _mirrored(change: Array) -> Array:
+    """The change by a fault of the other sign: means change their sign, sizes do not."""
+    means, sizes = np.split(change, 2, axis=1)
+    return np.concatenate([-means, sizes], axis=1)
 
 
 def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
