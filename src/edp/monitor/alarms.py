@@ -23,7 +23,7 @@ class MonitorAlarm:
         limit: that it passed.
         evidence: names of summaries with their mean conditioned deviation since `since_s`, in healthy standard
             deviations, the largest first.
-        causes: dataclasses of a diagnosis, the most probable first; empty without one.
+        causes: of a diagnosis, the most probable first; empty without one.
         sentence: all of this for a reader.
         severity: one of `SEVERITIES`.
     """
@@ -35,7 +35,7 @@ class MonitorAlarm:
     statistic: float
     limit: float
     evidence: tuple[tuple[str, float], ...]
-    causes: tuple[Any, ...] = ()
+    causes: tuple[Cause, ...] = ()
     sentence: str = ""
     severity: str = "warning"
 

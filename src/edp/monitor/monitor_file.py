@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from edp import __version__
 from edp.errors import BundleError
 from edp.monitor.calibration import AlarmLimit
 from edp.monitor.chain import MonitorChain
+from edp.monitor.diagnosis.signatures import load_dictionary, remove_dictionary, save_dictionary
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
 from edp.signals import Channel, Kind
@@ -78,9 +79,12 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         "chain": monitor.chain.to_plain(),
         "limit": facts,
         "arrays": entry,
-        "diagnosis": monitor.diagnosis,
         "provenance": dict(monitor.provenance),
     }
+    if monitor.diagnosis is None:
+        remove_dictionary(path)
+    else:
+        save_dictionary(monitor.diagnosis, path)
     write_json(path / HEADER, header | {HASH: header_digest(header)})
     _remove_old(path, entry["file"], written)
     return path
@@ -124,6 +128,7 @@ def load_monitor(folder: str | Path) -> Monitor:
 
     Raises:
         BundleError: not a monitor, another schema, damaged numbers, or parts that this version does not know.
+        StorageError: its dictionary is damaged, or of another monitor.
     """
     path = Path(folder)
     if not os.path.lexists(path / HEADER):
@@ -137,7 +142,8 @@ def load_monitor(folder: str | Path) -> Monitor:
                 "newer one, or fit it again"
             )
         check_hash(header, path / HEADER)
-        return _assembled(header, path)
+        monitor = _assembled(header, path)
+    return replace(monitor, diagnosis=load_dictionary(path, monitor.summary_names))
 
 
 def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
@@ -161,7 +167,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
         raise ValueError("the means of its sessions have another shape, are not finite, or have no width")
     provenance = object_with(header["provenance"], (), "its provenance")
     limit = _limit(object_with(header["limit"], LIMIT, "its limit"))
-    return Monitor(channels, float(rate_hz), sources, chain, limit, means, header.get("diagnosis"), provenance)
+    return Monitor(channels, float(rate_hz), sources, chain, limit, means, None, provenance)
 
 
 def _check_fit(sources: tuple[ResidualSource, ...], chain: MonitorChain, names: list[str]) -> None:

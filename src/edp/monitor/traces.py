@@ -95,8 +95,8 @@ def read_traces(folder: Path) -> RunTraces:
     """
     header, arrays = read_stored(folder, TRACES, SCHEMA)
     where = f"'{folder / TRACES}.json'"
-    block_s = header.get("block_s")
-    if not _is_number(block_s) or not 0.0 < block_s < 1e4:
+    block_s = _number(header.get("block_s"))
+    if not 0.0 < block_s < 1e4:
         raise StorageError(f"{where}: block_s must be a number of seconds; run the monitor again")
     detectors, groups = (_names(header.get(key), f"{where}: {key}") for key in ("detectors", "groups"))
     entries = header.get("recordings")
@@ -107,12 +107,13 @@ def read_traces(folder: Path) -> RunTraces:
         at = f"{where}, recording {n}"
         ratios = _rows(arrays.get(f"ratios_{n}"), len(detectors), at)
         levels = _rows(arrays.get(f"groups_{n}"), len(groups), at)
-        if not isinstance(entry, dict) or len(levels) != len(ratios) or not _is_number(entry.get("duration_s")):
+        duration_s = _number(entry.get("duration_s")) if isinstance(entry, dict) else math.nan
+        if not isinstance(entry, dict) or len(levels) != len(ratios) or not duration_s >= 0.0:
             raise StorageError(f"{at}: its entry or arrays do not fit each other; run the monitor again")
         name, start = (_text(entry.get(key), at) for key in ("name", "start"))
         silent = _names(entry.get("silent"), at)
-        recordings.append(RecordingTrace(name, start, float(entry["duration_s"]), ratios, levels, silent))
-    return RunTraces(float(block_s), detectors, groups, tuple(recordings))
+        recordings.append(RecordingTrace(name, start, duration_s, ratios, levels, silent))
+    return RunTraces(block_s, detectors, groups, tuple(recordings))
 
 
 def _rows(values: NDArray[Any] | None, columns: int, where: str) -> FloatArray:
@@ -133,8 +134,9 @@ def _text(value: Any, where: str) -> str:
     return value
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _number(value: Any) -> float:
+    """A number as it is; NaN for anything else."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 
 def pooled(values: FloatArray, most: int) -> tuple[FloatArray, int]:

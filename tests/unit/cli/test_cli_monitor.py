@@ -63,16 +63,21 @@ def test_alarms_are_logged_and_end_with_exit_code_5(edp, fitted, tmp_path):
     values = faulty.values.copy()
     values[800:, 3] += np.float32(4e6)
     where = write([replace(faulty, values=values)], tmp_path / "today")
-    out = tmp_path / "alarms.jsonl"
+    out = tmp_path / "watched"
     ended = edp("monitor", "run", folder, where, "--out", out)
     assert ended.code == 5
-    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    rows = [json.loads(line) for line in (out / "alarms.jsonl").read_text().splitlines()]
     assert rows
     assert all(row["recording"] == faulty.name for row in rows)
     assert any(row["raised_s"] > 8.0 and row["sentence"] for row in rows)
-    with (tmp_path / "alarms.csv").open(newline="") as file:
+    with (out / "alarms.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert [float(row["raised_s"]) for row in table] == [row["raised_s"] for row in rows]
+    shown = edp("monitor", "report", out, "--json")
+    assert shown.code == 0, shown.err
+    facts = json.loads(shown.out)
+    assert facts["headline"].startswith(f"{len(rows)} alarm")
+    assert faulty.name in (out / "report.html").read_text()
     as_json = edp("monitor", "run", folder, where, "--json")
     assert as_json.code == 5
     assert len(json.loads(as_json.out)["alarms"]) == len(rows)
@@ -99,6 +104,7 @@ def test_bad_input_is_one_message(edp, fitted, healthy, tmp_path):
     for arguments in (
         ("monitor", "run", tmp_path, healthy),
         ("monitor", "run", folder, tmp_path / "nothing"),
+        ("monitor", "report", tmp_path),
         ("monitor", "fit", tmp_path / "no_run", healthy, "--out", tmp_path / "m"),
         ("monitor", "fit", healthy, "--out", tmp_path / "m", "--set", "chain.block=2"),
     ):

@@ -22,36 +22,30 @@ MOST_ROWS = 180
 """Blocks that name a cause: of a longer stretch the last ones, and no onset."""
 
 
-def diagnosed(
-    alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, fresh: bool = True, start: datetime | None = None
-) -> MonitorAlarm:
+def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: datetime | None = None) -> MonitorAlarm:
     """The alarm with causes, sentence and severity.
 
     Args:
         alarm: as the chain raised it.
         dictionary: of the monitor.
         rows: conditioned rows since the onset, shape (blocks, summaries).
-        fresh: whether they begin at an onset.
         start: of the recording, as a time of day.
     """
-    late = len(rows) > MOST_ROWS
-    found = match(dictionary, rows[-MOST_ROWS:], fresh and not late)
+    found = match(dictionary, rows[-MOST_ROWS:], fresh=len(rows) <= MOST_ROWS)
     causes = causes_of(dictionary, found)
     sentence = alarm_sentence(causes, alarm.since_s, start)
     return replace(alarm, causes=causes, sentence=sentence, severity=severity(causes))
 
 
-def onset_of(since: int, alarms: Sequence[tuple[int, int]]) -> tuple[int, bool]:
-    """Block after which a fault began, and whether it is known.
-
-    A fault that stays alarms again after each reset: its onset is that of the first alarm of the row.
+def onset_of(since: int, earlier: Sequence[tuple[int, int]]) -> int:
+    """Block after which a fault began: one that stays alarms again after each reset, and its first alarm knows.
 
     Args:
         since: block after which the deviation of this alarm began.
-        alarms: (since, raised) of the alarms before, in order.
+        earlier: blocks since which and at which the alarms before were raised, in order.
     """
-    for earlier_since, raised in reversed(alarms):
+    for began, raised in reversed(earlier):
         if since != raised:
             break
-        since = earlier_since
-    return since, True
+        since = began
+    return since

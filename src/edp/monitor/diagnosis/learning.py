@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edp.monitor.diagnosis.causes import FaultClass
 from edp.monitor.diagnosis.evidence import ONSET, Scatter, mean_features
-from edp.monitor.diagnosis.matching import Seen, match_directions
+from edp.monitor.diagnosis.matching import Match, Seen, match_directions
 from edp.monitor.diagnosis.signatures import Dictionary, signatures_of
 from edp.monitor.diagnosis.structure import confusions
 
@@ -76,7 +76,7 @@ def fit_dictionary(
     if len(draws) < 2:
         return whole
     judged = _left_out(summaries, classes, faults, scatter, healthy, seed)
-    whole = replace(whole, **_chosen(judged, whole))
+    whole = _chosen(judged, whole)
     return replace(whole, confusions=_confusions(judged, whole))
 
 
@@ -138,22 +138,26 @@ def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
     return any(float(np.max(change[part] ** 2 / noise[part])) > LEAST_CHANGE**2 for part in (0, 1))
 
 
-def _chosen(judged: Sequence[_Judged], whole: Dictionary) -> dict[str, float]:
-    """Share of change and temperature with the least logarithmic loss, and the misfit that hardly any session has."""
-    best: tuple[float, dict[str, float]] = (np.inf, {})
-    if not judged:
-        return {}
+def _chosen(judged: Sequence[_Judged], whole: Dictionary) -> Dictionary:
+    """With the share of change and the temperature of the least logarithmic loss, and a misfit that few have."""
+    best, least = whole, np.inf
     for changing in CHANGING:
         for temperature in TEMPERATURES:
-            numbers = {"changing": changing, "temperature": temperature, "strange": 1e6}
+            tried = replace(whole, changing=changing, temperature=temperature)
             loss, misfits = 0.0, []
             for case in judged:
-                found = match_directions(replace(case.without, **numbers), case.seen)
+                found = _found(case, tried)
                 loss -= float(np.log(max(found.probabilities[case.fault.owner], 1e-6)))
                 misfits.append(found.misfit)
-            if loss < best[0]:
-                best = loss, numbers | {"strange": max(float(np.quantile(misfits, UNUSUAL)), 1.0)}
-    return best[1]
+            if misfits and loss < least:
+                best, least = replace(tried, strange=max(float(np.quantile(misfits, UNUSUAL)), 1.0)), loss
+    return best
+
+
+def _found(case: _Judged, numbers: Dictionary) -> Match:
+    """What the dictionary without the session's draw makes of it, with the numbers of another one."""
+    without = replace(case.without, changing=numbers.changing, temperature=numbers.temperature, strange=np.inf)
+    return match_directions(without, case.seen)
 
 
 def _confusions(judged: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]:
@@ -165,9 +169,7 @@ def _confusions(judged: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]
     columns = np.array([place[_name(fault)] for fault in whole.classes])
     probabilities = np.zeros((len(judged), len(names)))
     for row, case in enumerate(judged):
-        numbers = {"changing": whole.changing, "temperature": whole.temperature, "strange": 1e6}
-        found = match_directions(replace(case.without, **numbers), case.seen)
-        np.add.at(probabilities[row], columns, found.probabilities)
+        np.add.at(probabilities[row], columns, _found(case, whole).probabilities)
     truth = np.array([columns[case.fault.owner] for case in judged])
     further = sorted(judged[0].fault.sensors)
     sensors = {name: np.array([case.fault.sensors[name] for case in judged]) for name in further}

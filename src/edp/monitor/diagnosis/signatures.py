@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError, StorageError
 from edp.monitor.diagnosis.causes import FaultClass, class_of
 from edp.monitor.diagnosis.evidence import Scatter
-from edp.monitor.diagnosis.structure import Confusion
+from edp.monitor.diagnosis.structure import Confusion, confusion_of
 from edp.monitor.stored_arrays import read_stored, shaped, write_stored
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ def save_dictionary(dictionary: Dictionary, folder: Path) -> None:
         StorageError: a file cannot be written.
     """
     scatter = dictionary.scatter
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "signatures": dictionary.signatures.astype(np.float32),
         "owner": dictionary.owner.astype(np.float32),
         "sizes": dictionary.sizes,
@@ -108,6 +108,12 @@ def save_dictionary(dictionary: Dictionary, folder: Path) -> None:
         "provenance": dict(dictionary.provenance),
     }
     write_stored(folder, FILE, header, arrays)
+
+
+def remove_dictionary(folder: Path) -> None:
+    """Remove the dictionary of an earlier monitor from a folder."""
+    for suffix in (".json", ".safetensors"):
+        (folder / f"{FILE}{suffix}").unlink(missing_ok=True)
 
 
 def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None:
@@ -133,7 +139,7 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
         raise StorageError(f"{where}: signatures must be a number from 1 to {MOST_SIGNATURES}; fit the monitor again")
     try:
         classes = tuple(class_of(entry, where) for entry in entries)
-        pairs = tuple(_confusion(entry, where) for entry in header.get("confusions", []))
+        pairs = tuple(confusion_of(entry, where) for entry in header.get("confusions", []))
     except (DataError, TypeError) as error:
         raise StorageError(f"{where} is damaged: {error}; fit the monitor again") from error
     width = 2 * len(summaries)
@@ -154,18 +160,6 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
         tuple(summaries), classes, scatter, signatures, owner, sizes, **numbers, confusions=pairs,
         provenance=provenance if isinstance(provenance, dict) else {},
     )  # fmt: skip
-
-
-def _confusion(entry: Any, where: str) -> Confusion:
-    pair = Confusion(**entry)
-    shares = (pair.error, 0.0 if pair.sensor_error is None else pair.sensor_error)
-    texts = (pair.first, pair.second, pair.sensor)
-    if not all(isinstance(text, str) and len(text) <= 300 for text in texts):
-        raise DataError(f"{where}: a name of a fault that cannot be told apart is no text")
-    for share in shares:
-        if not isinstance(share, int | float) or not 0.0 <= share <= 1.0:
-            raise DataError(f"{where}: an error of faults that cannot be told apart is no share")
-    return pair
 
 
 def _positive(value: Any, where: str) -> float:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from edp.errors import DataError
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 APART = 0.25
 """Largest share of wrong answers of a test between two faults that can be told apart; a coin has 0.5."""
 MOST_PAIRS = 400
+LONGEST_NAME = 300
 LEAST_SESSIONS = 2
 """Of each of two faults, without which nothing is said about them."""
 
@@ -33,6 +37,24 @@ class Confusion:
     error: float
     sensor: str = ""
     sensor_error: float | None = None
+
+
+def confusion_of(entry: Any, where: str) -> Confusion:
+    """A pair from plain data.
+
+    Raises:
+        DataError: it is none.
+    """
+    if not isinstance(entry, Mapping) or set(entry) != {field.name for field in fields(Confusion)}:
+        raise DataError(f"{where}: a pair of faults that cannot be told apart is damaged")
+    pair = Confusion(**entry)
+    texts, shares = (pair.first, pair.second, pair.sensor), (pair.error, pair.sensor_error or 0.0)
+    if not all(isinstance(text, str) and len(text) <= LONGEST_NAME for text in texts):
+        raise DataError(f"{where}: a name of a fault that cannot be told apart is no text")
+    for share in shares:
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share <= 1.0:
+            raise DataError(f"{where}: an error of faults that cannot be told apart is no share")
+    return pair
 
 
 def confusions(

@@ -7,6 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from edp.monitor.diagnosis.sentences import clock
 from edp.report.common.templates import template
 from edp.report.common.wording import unbroken
 from edp.report.monitor import facts as words
@@ -62,8 +63,8 @@ def _alarm(facts: MonitorFacts, alarm: words.AlarmFacts) -> dict[str, Any]:
         "sentence": unbroken(alarm.sentence),
         "severity": alarm.severity,
         "recording": alarm.recording,
-        "raised": words.clock(alarm.raised_s, facts.start_of(alarm.recording)),
-        "since": words.clock(alarm.since_s, facts.start_of(alarm.recording)),
+        "raised": clock(alarm.raised_s, facts.start_of(alarm.recording)),
+        "since": clock(alarm.since_s, facts.start_of(alarm.recording)),
         "detector": alarm.detector,
         "evidence": evidence(alarm) if alarm.evidence else None,
         "causes": sheet.table() if sheet is not None else None,

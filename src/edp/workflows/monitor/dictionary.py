@@ -10,17 +10,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.config.monitor import AUTOMATIC, NO_MACHINE, DictionarySpec
 from edp.errors import ConfigError, DataError
+from edp.monitor.diagnosis.causes import FaultClass
 from edp.monitor.diagnosis.evidence import ONSET, mean_features, parts_of
 from edp.monitor.diagnosis.learning import SimulatedFault, fit_dictionary
 from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.monitor import Monitor
-from edp.recording import Recording
-from edp.settings.bounds import above, check_bounds, integer, span
-from edp.workflows.monitor.fault_sessions import FaultSession, cases_of, fault_classes, noise_of, simulated, with_noise
+from edp.recording import MACHINE, Recording
+from edp.sim.machine.machine_files import machine_names
+from edp.workflows.monitor.fault_sessions import (
+    FaultSession,
+    cases_of,
+    fault_classes,
+    mirrors,
+    noise_of,
+    simulated,
+    with_noise,
+)
 
 Array = NDArray[np.float64]
-HEALTHY_SESSIONS = 40
+HEALTHY_SESSIONS = 30
 """From which the scatter of healthy means is taken; more change little."""
 QUIET = ("CylStroke_1", "CylStroke_2", "CylStroke_3", "PumpPressure_1", "PumpPressure_2", "OilTemperature")
 """Channels that the simulator shows without noise: theirs is taken from the healthy logs."""
@@ -34,45 +44,25 @@ FURTHER = (
 Note = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class DictionarySpec:
-    """How a dictionary is made.
-
-    Attributes:
-        machine: name or file of the machine that is simulated.
-        draws: sessions of each fault and size; two at least, so that some are left out.
-        before_s: of a session until its fault begins.
-        after_s: of a session from there on.
-        minutes: of processor time; no further draw is begun when it would take longer, two are made in any case.
-        kinds: of faults; empty for all.
-        seed: root of every random choice.
-
-    Raises:
-        ConfigError: a value is out of its bounds.
-    """
-
-    machine: str = "M22"
-    draws: int = 3
-    before_s: float = 12.0
-    after_s: float = 90.0
-    minutes: float = 30.0
-    kinds: tuple[str, ...] = ()
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_bounds(
-            "dictionary",
-            self,
-            draws=integer(2, 100),
-            before_s=span(0.0, 3600.0),
-            after_s=span(5.0, 3600.0),
-            minutes=above(0.0, 1e5),
-            seed=integer(0, 2**31),
-        )
+def machine_of(spec: DictionarySpec, recordings: Sequence[Recording]) -> str:
+    """The machine to simulate: that of the settings, or the one that all logs name; empty for none."""
+    if spec.machine == NO_MACHINE:
+        return ""
+    if spec.machine != AUTOMATIC:
+        return spec.machine
+    named = {str(recording.meta.get(MACHINE, "")) for recording in recordings}
+    only = next(iter(named)) if len(named) == 1 else ""
+    # A name of a file that came with a log is not followed to wherever it leads.
+    return only if only in machine_names() else ""
 
 
 def build_dictionary(
-    monitor: Monitor, healthy: Sequence[Recording], spec: DictionarySpec, note: Note | None = None
+    monitor: Monitor,
+    healthy: Sequence[Recording],
+    machine: str,
+    spec: DictionarySpec,
+    seed: int = 0,
+    note: Note | None = None,
 ) -> Dictionary:
     """Simulate every fault at every site and size on a machine and learn what the monitor sees of it.
 
@@ -81,7 +71,9 @@ def build_dictionary(
     Args:
         monitor: fitted.
         healthy: sessions that its networks were not fitted to.
+        machine: name or file.
         spec: how.
+        seed: root of every random choice.
         note: called with what is done, how much of it is, and how much there is.
 
     Raises:
@@ -94,39 +86,45 @@ def build_dictionary(
     if not rows:
         raise DataError("a dictionary needs healthy sessions that no network was fitted to; bring more")
     classes = fault_classes(spec.kinds or None)
-    added = _missing_noise(monitor, healthy, spec)
+    plan = _Plan(machine, (spec.before_s, spec.after_s), seed, _missing_noise(monitor, healthy, machine, seed))
     faults: list[SimulatedFault] = []
     draws = 0
     for draw in range(spec.draws):
         spent = time.process_time() - began
         if draw >= 2 and spent * (draw + 1) / draw > 60.0 * spec.minutes:
             break
-        faults += _draw(monitor, classes, spec, draw, added, note)
+        faults += _draw(monitor, classes, plan, draw, note)
         draws += 1
     provenance: dict[str, Any] = {
-        "machine": spec.machine, "seed": spec.seed, "draws": draws, "sessions": len(faults),
+        "machine": machine, "seed": seed, "draws": draws, "sessions": len(faults),
         "seconds_each": spec.before_s + spec.after_s, "processor_s": round(time.process_time() - began, 1),
     }  # fmt: skip
-    return fit_dictionary(monitor.summary_names, classes, faults, rows, provenance, spec.seed)
+    return fit_dictionary(monitor.summary_names, classes, faults, rows, provenance, seed)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What all draws share: machine, seconds before and after the onset, seed, noise by channel."""
+
+    machine: str
+    seconds: tuple[float, float]
+    seed: int
+    added: dict[str, float]
 
 
 def _draw(
-    monitor: Monitor,
-    classes: Sequence[Any],
-    spec: DictionarySpec,
-    draw: int,
-    added: dict[str, float],
-    note: Note | None,
+    monitor: Monitor, classes: Sequence[FaultClass], plan: _Plan, draw: int, note: Note | None
 ) -> list[SimulatedFault]:
     """All sessions of one draw, each less its sound twin."""
-    seconds, seed = (spec.before_s, spec.after_s), (spec.seed, draw)
+    before = plan.seconds[0]
     further = [name for name in FURTHER if name not in monitor.inputs]
-    total = len(cases_of(classes, draw))
+    total, mirrored = len(cases_of(classes)), mirrors(classes)
     sound: dict[int, tuple[Array, dict[str, Array]]] = {}
     faults: list[SimulatedFault] = []
-    for session in simulated(classes, spec.machine, seconds, seed, monitor.rate_hz):
-        noisy = with_noise(session.recording, added, [spec.seed, draw, session.base])
-        seen = _after(monitor, noisy, spec.before_s), _shown(session, further, spec.before_s)
+    done = 0
+    for session in simulated(classes, plan.machine, plan.seconds, (plan.seed, draw), monitor.rate_hz):
+        noisy = with_noise(session.recording, plan.added, [plan.seed, draw, session.base])
+        seen = _after(monitor, noisy, before), _shown(session, further, before)
         if session.fault < 0:
             sound[session.base] = seen
             continue
@@ -134,9 +132,18 @@ def _draw(
         change = np.nan_to_num(seen[0] - features, nan=0.0)
         shown = {name: seen[1][name] - sensors[name] for name in further}
         faults.append(SimulatedFault(draw, session.fault, session.size, change, shown))
+        done += 1
+        if session.fault in mirrored:
+            faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirrored(change), shown))
         if note is not None:
-            note(f"faults on {spec.machine}, draw {draw + 1}", len(faults), total)
+            note(f"faults on {plan.machine}, draw {draw + 1}", done, total)
     return _standardised(faults, sound)
+
+
+def _mirrored(change: Array) -> Array:
+    """The change by a fault of the other sign: means change their sign, sizes do not."""
+    means, sizes = np.split(change, 2, axis=1)
+    return np.concatenate([-means, sizes], axis=1)
 
 
 def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
@@ -173,14 +180,14 @@ def _standardised(
     ]  # fmt: skip
 
 
-def _missing_noise(monitor: Monitor, healthy: Sequence[Recording], spec: DictionarySpec) -> dict[str, float]:
+def _missing_noise(monitor: Monitor, healthy: Sequence[Recording], machine: str, seed: int) -> dict[str, float]:
     """Noise that healthy logs have on channels which the simulator shows without."""
     names = [name for name in QUIET if name in monitor.inputs]
-    session = next(simulated((), spec.machine, (0.0, 60.0), (spec.seed, 0), monitor.rate_hz)).recording
+    session = next(simulated((), machine, (0.0, 60.0), (seed, 0), monitor.rate_hz)).recording
     lacking = [name for name in monitor.inputs if name not in session.channel_names]
     if len(lacking) == len(monitor.inputs):
         raise ConfigError(
-            f"dictionary: the simulated machine '{spec.machine}' has none of the monitor's channels, such as "
+            f"dictionary: the simulated machine '{machine}' has none of the monitor's channels, such as "
             f"'{lacking[0]}'; map the logs to the names of Table A.1, or leave the dictionary out (--machine none)"
         )
     shown = noise_of(session, names)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edp.monitor.diagnosis.causes import FaultClass
+from edp.monitor.diagnosis.causes import FaultClass, Place
 from edp.recording import Recording
 from edp.sim import Scenario, Simulation
 from edp.sim.excitation import EXCITATIONS
@@ -50,7 +50,7 @@ def fault_classes(kinds: Sequence[str] | None = None) -> tuple[FaultClass, ...]:
     classes = []
     for name in FAULTS if kinds is None else kinds:
         kind = FAULTS[name]
-        place = "machine" if isinstance(kind, MachineFault) else "sensor"
+        place: Place = "machine" if isinstance(kind, MachineFault) else "sensor"
         for site in kind.sites or ("",):
             words = at_site(kind.words, site)
             for sign in (1.0, -1.0) if kind.signed else (1.0,):
@@ -60,19 +60,27 @@ def fault_classes(kinds: Sequence[str] | None = None) -> tuple[FaultClass, ...]:
     return tuple(classes)
 
 
-def cases_of(classes: Sequence[FaultClass], draw: int) -> list[tuple[int, float]]:
-    """Class and size of each session of a draw.
+def cases_of(classes: Sequence[FaultClass]) -> list[tuple[int, float]]:
+    """Class and size of each session of a draw: the two largest sizes, between which and nothing all others lie.
 
-    Sizes that are hardly visible are left out where a kind has three or more: what cannot be found needs no name.
-    Negative sizes mirror positive ones, so that one of them a draw, in turn, is enough.
+    Negative sizes mirror positive ones (`mirrors`), and have no sessions.
     """
-    cases = []
-    for n, fault in enumerate(classes):
-        sizes = fault.sizes[1:] if len(fault.sizes) > 2 else fault.sizes
-        if fault.sizes and fault.sizes[0] < fault.neutral:
-            sizes = (sizes[draw % len(sizes)],)
-        cases += [(n, size) for size in sizes or (fault.neutral,)]
-    return cases
+    return [
+        (n, size)
+        for n, fault in enumerate(classes)
+        if not _is_negative(fault)
+        for size in fault.sizes[-2:] or (fault.neutral,)
+    ]
+
+
+def mirrors(classes: Sequence[FaultClass]) -> dict[int, int]:
+    """Place of the class of negative sizes by that of positive ones."""
+    places = {(fault.kind, fault.site): n for n, fault in enumerate(classes) if not _is_negative(fault)}
+    return {places[fault.kind, fault.site]: n for n, fault in enumerate(classes) if _is_negative(fault)}
+
+
+def _is_negative(fault: FaultClass) -> bool:
+    return bool(fault.sizes) and fault.sizes[0] < fault.neutral
 
 
 def simulated(
@@ -88,12 +96,12 @@ def simulated(
         rate_hz: of the recordings.
     """
     before, after = seconds
-    for base in range(BASES):
+    cases = cases_of(classes)
+    for base in range(max(1, min(BASES, len(cases)))):
         yield FaultSession(base, -1, 0.0, _session(_scenario(machine, base, before + after, seed, rate_hz), base, seed))
-    for n, (place, size) in enumerate(cases_of(classes, seed[1])):
-        fault, base = classes[place], (n + seed[1] * 5) % BASES
-        sized = {"size": size, "unit": fault.unit} if fault.sizes else {}
-        spec = FaultSpec(fault.kind, fault.site, **sized, onset_s=before)
+    for n, (place, size) in enumerate(cases):
+        fault, base = classes[place], (n + seed[1] * 5) % min(BASES, len(cases))
+        spec = FaultSpec(fault.kind, fault.site, size if fault.sizes else None, fault.unit, onset_s=before)
         scenario = replace(_scenario(machine, base, before + after, seed, rate_hz), faults=(spec,))
         yield FaultSession(base, place, size, _session(scenario, base, seed))
 

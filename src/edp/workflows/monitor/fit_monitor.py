@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,12 @@ from edp.storage import check_writable, write_bytes
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
+from edp.workflows.monitor.dictionary import build_dictionary, machine_of
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
+NOTED_SESSIONS = 25
+"""Simulated sessions of the dictionary between two notes."""
 CUT_S = 480.0
 """Where there are too few sessions, longer ones are cut into pieces of this length."""
 
@@ -143,7 +146,25 @@ def fit_to_recordings(
         session_means(channels, sessions),
         provenance=provenance,
     )
+    healthy = [session for session in rest if session.name not in fitted.doubtful]
+    monitor = _with_dictionary(monitor, healthy, experiment, note)
     return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began)
+
+
+def _with_dictionary(
+    monitor: Monitor, healthy: Sequence[Recording], experiment: MonitorExperiment, note: Callable[[str], None]
+) -> Monitor:
+    """The monitor with a dictionary of faults, where there is a machine to simulate them on."""
+    machine = machine_of(experiment.dictionary, healthy)
+    if not machine:
+        return monitor
+
+    def noted(what: str, done: int, total: int) -> None:
+        if done % NOTED_SESSIONS == 0 or done == total:
+            note(f"{what}: {done} of {total} sessions")
+
+    dictionary = build_dictionary(monitor, healthy, machine, experiment.dictionary, experiment.seed, noted)
+    return replace(monitor, diagnosis=dictionary)
 
 
 def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
