@@ -24,11 +24,13 @@ from numpy.typing import NDArray
 
 from common import Verdict, finish, in_folder, parser, table, verdict
 from edp.config.monitor import load_monitor_experiment
+from edp.errors import DataError
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.chain import Chain, ChainState
 from edp.monitor.fitting import SessionBlocks, blocks_of, fit_from_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
+from edp.recording import Recording
 from edp.sim.faults import FAULTS, parse_fault
 from edp.sim.plan import ordered
 from edp.storage import make_folder, read_json, write_bytes, write_json
@@ -137,11 +139,20 @@ def _monitor(folder: Path) -> Monitor:
     return load_monitor(folder)
 
 
+def refused(monitor: Monitor, recording: Recording) -> bool:
+    """Whether the monitor takes a session for one of another machine; a user gets that error in place of alarms."""
+    try:
+        monitor.check(recording)
+    except DataError:
+        return True
+    return False
+
+
 def _summarise(job: _Job) -> str:
     monitor, recording = _monitor(job.monitor), read_session(job.folder, job.name).recording
     part = blocks_of(monitor.chain.summaries, monitor.sources, monitor.channels, recording)
     buffer = BytesIO()
-    np.savez(buffer, summaries=part.summaries, points=part.points)
+    np.savez(buffer, summaries=part.summaries, points=part.points, refused=refused(monitor, recording))
     write_bytes(job.cache, buffer.getvalue())
     return job.name
 
@@ -175,9 +186,15 @@ def alarms_of(monitor: Monitor, part: SessionBlocks, chain: Chain | None = None)
 
 
 def watched(plan: Plan, names: Sequence[str]) -> dict[str, list[MonitorAlarm]]:
-    """Alarms of test sessions by name."""
+    """Alarms of test sessions by name; none where the monitor refuses a session as that of another machine."""
     monitor = load_monitor(plan.monitor)
-    return {part.name: alarms_of(monitor, part) for part in blocks(plan, "test", names)}
+    found = {part.name: alarms_of(monitor, part) for part in blocks(plan, "test", names)}
+    for name in names:
+        with np.load(plan.monitor / "blocks" / "test" / f"{name}.npz", allow_pickle=False) as arrays:
+            if arrays["refused"]:
+                print(f"{name}: refused as a session of another machine")
+                found[name] = []
+    return found
 
 
 def same_alarms(plan: Plan, found: dict[str, list[MonitorAlarm]], count: int = 6) -> tuple[int, int]:

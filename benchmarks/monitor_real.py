@@ -57,7 +57,11 @@ KINDS = {"P": Kind.PRESSURE, "F": Kind.FLOW, "T": Kind.TEMPERATURE}
 BEST_PYOD = ("KNN", "GMM")
 MINUTES = 0.3
 """Processor time of the networks of a monitor here: there are minutes of data."""
-SETS = ("faster", "hanging_load", "motor", "cylinders", "emps", "sjoberg", "tanks")
+SETS = ("faster", "hanging_load", "motor", "cylinders", "sjoberg")
+"""Those in which one channel follows from others at the same time: of the axis EMPS and of the tanks only the input is
+measured beside the integral of what it does."""
+BLOCK_TICKS, MEMORY_BLOCKS = 10, 2
+SPANS_TICKS = (1, 2, 4, 8, 16, 32)
 QUICK_SETS = ("cylinders", "sjoberg")
 COMMANDS = ("u", "valve", "current", "reference", "r0", "r1")
 """Columns that no sensor shows."""
@@ -242,6 +246,18 @@ def injected(values: Values, column: int, kind: str, size: float, onset: int, rn
     return changed
 
 
+def short_settings(rate_hz: float) -> tuple[str, ...]:
+    """Settings of a monitor for minutes of logs, in place of hours."""
+    spans, block_s = [ticks / rate_hz for ticks in SPANS_TICKS], BLOCK_TICKS / rate_hz
+    memory = f"memory_s={MEMORY_BLOCKS * block_s}"
+    return (
+        f'residuals=[{{kind="virtual_sensors", units=16, lags_s={spans}}}, {{kind="balances"}}]',
+        f"chain.block_s={block_s}",
+        "chain.settle_s=0.0",
+        f'chain.watches=[{{detector={{kind="ewma", weight=0.5}}}}, {{detector={{kind="cusum"}}, {memory}}}]',
+    )
+
+
 def set_results(name: str, seed: int) -> dict[str, Any]:
     """Shares found of one set, by detector, kind and size, and false alarms."""
     recordings = DataSource.of(EXAMPLES / f"{name}.toml").read()
@@ -250,9 +266,14 @@ def set_results(name: str, seed: int) -> dict[str, Any]:
     hours = sum(part.duration_s for part in healthy) / 3600.0
     # Two thirds of what is left behind the residuals: one false alarm more than the limit's own in as long.
     promised = 0.6 * hours
-    monitor = fit_to_recordings(healthy, experiment_of(promised, seed)).monitor
-    detectors = {"edp.monitor": lambda part: [alarm.raised_s for alarm in _alarms(monitor, part)]}
-    detectors |= rival_detectors(healthy, monitor, promised)
+    detectors: dict[str, Any] = {}
+    try:
+        monitor = fit_to_recordings(healthy, experiment_of(promised, seed, short_settings(rate_hz))).monitor
+        detectors["edp.monitor"] = lambda part: [alarm.raised_s for alarm in _alarms(monitor, part)]
+    except DataError as error:
+        print(f"{name}: the monitor refuses: {error}")
+        detectors["edp.monitor"] = lambda part: []
+    detectors |= rival_detectors(healthy, rate_hz, promised)
     channels = [name for name in recordings[0].channel_names if name not in COMMANDS]
     cases = list(cases_of(test, channels, seed))
     results: dict[str, Any] = {"hours": hours, "promised_hours": promised, "rate_hz": rate_hz, "cases": len(cases)}
@@ -306,10 +327,10 @@ def cases_of(test: Sequence[Recording], channels: Sequence[str], seed: int) -> A
                     yield changed, kind, size, onset / part.rate_hz
 
 
-def rival_detectors(healthy: Sequence[Recording], monitor: Monitor, promised: float) -> dict[str, Any]:
+def rival_detectors(healthy: Sequence[Recording], rate_hz: float, promised: float) -> dict[str, Any]:
     """Rivals with the blocks of the monitor; two thirds of the healthy pieces fit, as many as of the monitor limit."""
-    ticks = monitor.chain.summaries.block
-    rate = monitor.rate_hz / ticks
+    ticks = BLOCK_TICKS
+    rate = rate_hz / ticks
     pieces = [piece for part in healthy for piece in np.array_split(part.values, 12)]
     learning, limiting = pieces[::3], [piece for i, piece in enumerate(pieces) if i % 3]
     made: dict[str, Any] = {}
