@@ -9,7 +9,7 @@ from edp.signals import EXTRA_CHANNELS, TABLE_A1
 from edp.sim import Scenario, Simulation, Snapshot, load_machine, simulate
 from edp.sim.environment import ExcavatorEnv, VectorExcavatorEnv
 from edp.sim.environment.spec import EnvironmentSpec
-from edp.sim.faults import FAULTS, FaultSpec, MachineFault, SensorFault, fault_text, ladder, parse_fault
+from edp.sim.faults import FAULTS, FaultSpec, MachineFault, SensorFault, at_site, fault_text, ladder, parse_fault
 from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at
 from edp.sim.machine import layout as at
 from edp.sim.sensors import chain, draws, sensors
@@ -97,6 +97,22 @@ def test_places_units_and_ladder_are_sound(name):
         channels = {site: kind.channels(site) for site in kind.sites or ("",)}
         assert len(set(channels.values())) == len(channels)
         assert all(0 <= channel < chain.SENSED for pair in channels.values() for channel in pair)
+
+
+@pytest.mark.parametrize("name", list(FAULTS))
+def test_parts_and_words_are_whole_sentences_at_every_site(name):
+    kind = FAULTS[name]
+    for site in kind.sites or ("",):
+        words = at_site(kind.words, site)
+        assert "{" not in kind.component(site)
+        # A size is reported where there is one, and its sign where it may have either.
+        assert ("{size}" in words) == bool(kind.units)
+        assert ("{high}" in words or "{large}" in words) == kind.signed
+        for key in ("{size}", "{high}", "{large}"):
+            words = words.replace(key, "x")
+        assert "{" not in words
+    parts = {kind.component(site) for site in kind.sites or ("",)}
+    assert len(parts) > 1 or len(kind.sites) < 2 or name == "velocities_swapped"
 
 
 @pytest.mark.parametrize("name", [name for name, kind in FAULTS.items() if isinstance(kind, MachineFault)])

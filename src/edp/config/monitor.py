@@ -14,7 +14,7 @@ from edp.monitor.fitting import ChainSpec
 from edp.monitor.residuals import RESIDUALS, ResidualSpec
 from edp.monitor.residuals.balances import BalancesSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
-from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count
+from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
 from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
 
 MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS}, what="settings")
@@ -25,6 +25,45 @@ def default_residuals() -> tuple[ResidualSpec, ...]:
     return VirtualSensorsSpec(), BalancesSpec()
 
 
+AUTOMATIC, NO_MACHINE = "", "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DictionarySpec:
+    """How the dictionary of faults is simulated, from which causes of alarms are named.
+
+    Attributes:
+        machine: name or file of the machine that is simulated; empty takes the one that the logs name, ``none`` makes
+            no dictionary.
+        draws: sessions of each fault and size; two at least, so that some are left out.
+        before_s: of a session until its fault begins.
+        after_s: of a session from there on.
+        minutes: of processor time; a draw that would take longer is not begun, two are made in any case.
+        kinds: of faults; empty for all.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    machine: str = AUTOMATIC
+    draws: int = 3
+    before_s: float = 8.0
+    after_s: float = 60.0
+    minutes: float = 15.0
+    kinds: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "dictionary",
+            self,
+            draws=integer(2, 100),
+            before_s=span(0.0, 3600.0),
+            after_s=span(20.0, 3600.0),
+            minutes=above(0.0, 1e5),
+        )
+        check_count("dictionary", "kinds", self.kinds, MOST_NAMES)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MonitorExperiment:
     """Everything that settles a monitor.
@@ -32,6 +71,7 @@ class MonitorExperiment:
     Attributes:
         residuals: sources, each a registered part.
         chain: from residuals to alarms.
+        dictionary: of faults, that names causes.
         channels: names of the channels that are watched; empty takes all that sensors can give.
         groups: names of channels that virtual sensors judge together; empty where names and kinds are to tell.
         hours_per_false_alarm: operating hours to one false alarm that are promised.
@@ -45,6 +85,7 @@ class MonitorExperiment:
 
     residuals: tuple[ResidualSpec, ...] = field(default_factory=default_residuals)
     chain: ChainSpec = field(default_factory=ChainSpec)
+    dictionary: DictionarySpec = field(default_factory=DictionarySpec)
     channels: tuple[str, ...] = ()
     groups: tuple[tuple[str, ...], ...] = ()
     hours_per_false_alarm: float = 8.0

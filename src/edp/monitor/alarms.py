@@ -5,28 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from edp.monitor.diagnosis.causes import Cause
+
 SEVERITIES = ("note", "warning", "stop")
-
-
-@dataclass(frozen=True)
-class Cause:
-    """What may be wrong.
-
-    Attributes:
-        kind: of the fault.
-        site: where it sits.
-        size: estimate of it, in `unit`; None where there is none.
-        unit: of the size.
-        probability: 0 to 1.
-        place: ``sensor`` or ``machine``; empty where that is not known.
-    """
-
-    kind: str
-    site: str = ""
-    size: float | None = None
-    unit: str = ""
-    probability: float = 0.0
-    place: str = ""
 
 
 @dataclass(frozen=True)
@@ -42,7 +23,7 @@ class MonitorAlarm:
         limit: that it passed.
         evidence: names of summaries with their mean conditioned deviation since `since_s`, in healthy standard
             deviations, the largest first.
-        causes: the most probable first; empty without a diagnosis.
+        causes: of a diagnosis, the most probable first; empty without one.
         sentence: all of this for a reader.
         severity: one of `SEVERITIES`.
     """

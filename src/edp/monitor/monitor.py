@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,9 @@ from numpy.typing import NDArray
 from edp.errors import DataError, closest
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.calibration import AlarmLimit
-from edp.monitor.chain import BlockVerdict, Chain, ChainState
+from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
+from edp.monitor.diagnosis.diagnose import AFTER_S, MOST_ROWS, diagnosed, onset_of
+from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.residuals.base import ResidualSource, Rows, SourceState, rows_of
 from edp.recording import Recording
 from edp.settings.bounds import shown
@@ -66,6 +70,21 @@ class Verdict:
 
 
 @dataclass(frozen=True, eq=False)
+class Watched:
+    """What a monitor made of a recording.
+
+    Attributes:
+        alarms: in order.
+        statistics: of each watch over its scale, shape (blocks, watches).
+        rows: conditioned summaries, NaN where missing, shape (blocks, summaries).
+    """
+
+    alarms: tuple[MonitorAlarm, ...]
+    statistics: Array
+    rows: Rows
+
+
+@dataclass(frozen=True, eq=False)
 class Monitor:
     """A fitted monitor.
 
@@ -77,17 +96,17 @@ class Monitor:
         limit: what is known of its false alarms.
         session_means: mean over healthy sessions of each channel's mean in a session, and its deviation between
             sessions, shape (2, inputs).
-        diagnosis: plain values and arrays of a diagnosis, where one is there.
+        diagnosis: dictionary of faults that names causes; None where alarms have none.
         provenance: what it was fitted to.
     """
 
     channels: tuple[Channel, ...]
     rate_hz: float
     sources: tuple[ResidualSource, ...]
-    chain: Chain
+    chain: MonitorChain
     limit: AlarmLimit
     session_means: Array
-    diagnosis: Any = None
+    diagnosis: Dictionary | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -124,10 +143,10 @@ class Monitor:
 
     def residuals(self, rows: Rows, state: MonitorState) -> tuple[Rows, tuple[SourceState, ...]]:
         """Residuals of a stretch of one machine, shape (ticks, residuals), and the states of the sources behind it."""
-        place = {name: i for i, name in enumerate(self.inputs)}
+        index = {name: i for i, name in enumerate(self.inputs)}
         parts, states = [], []
         for source, before in zip(self.sources, state.sources, strict=True):
-            part, after = source.run(rows[None, :, [place[name] for name in source.inputs]], before)
+            part, after = source.run(rows[None, :, [index[name] for name in source.inputs]], before)
             parts.append(part[0])
             states.append(after)
         return np.concatenate(parts, axis=1), tuple(states)
@@ -163,9 +182,40 @@ class Monitor:
         Raises:
             DataError: another rate, or a log of another machine.
         """
-        return [
-            self.alarm(verdict, recording.name) for verdict in self.verdicts(recording) if verdict.alarm is not None
-        ]
+        return list(self.watch(recording).alarms)
+
+    def watch(self, recording: Recording, start: datetime | None = None) -> Watched:
+        """Alarms of a recording with their causes, and what led to them block by block.
+
+        Causes are named from the rows up to `AFTER_S` behind an alarm, as far as the recording has them.
+
+        Args:
+            recording: of this machine.
+            start: of the recording, as a time of day for the sentences.
+
+        Raises:
+            DataError: another rate, or a log of another machine.
+        """
+        statistics, rows, raised = [], [], []
+        for verdict in self.verdicts(recording):
+            statistics.append(verdict.statistics)
+            rows.append(verdict.row.astype(np.float32))
+            if verdict.alarm is not None:
+                raised.append(verdict)
+        table = np.array(rows, np.float32).reshape(len(rows), self.chain.summaries.width)
+        alarms: list[MonitorAlarm] = []
+        earlier: list[tuple[int, int]] = []
+        behind = round(AFTER_S / self.block_s)
+        for verdict in raised:
+            onset = onset_of(verdict.since, earlier)
+            earlier.append((verdict.since, verdict.block))
+            alarm = self.alarm(verdict, recording.name)
+            if self.diagnosis is not None:
+                seen = table[onset : verdict.block + behind].astype(np.float64)
+                alarm = diagnosed(alarm, self.diagnosis, seen, start)
+            alarms.append(alarm)
+        shape = (len(rows), len(self.chain.watches))
+        return Watched(tuple(alarms), np.array(statistics).reshape(shape), table)
 
     def conditioned_rows(self, recording: Recording) -> Array:
         """Conditioned summaries of each block, NaN where missing, shape (blocks, summaries); see `summary_names`."""
@@ -258,11 +308,15 @@ class MonitorStream:
     def __init__(self, monitor: Monitor) -> None:
         self.monitor, self.state = monitor, monitor.initial_state()
         self._statistics = (0.0,) * len(monitor.chain.watches)
+        self._rows: deque[Array] = deque(maxlen=MOST_ROWS)
+        self._earlier: deque[tuple[int, int]] = deque(maxlen=MOST_ROWS)
 
     def reset(self) -> None:
         """Start anew."""
         self.state = self.monitor.initial_state()
         self._statistics = (0.0,) * len(self.monitor.chain.watches)
+        self._rows.clear()
+        self._earlier.clear()
 
     def step(self, row: Mapping[str, float] | Sequence[float] | NDArray[Any]) -> Verdict:
         """Take one tick.
@@ -278,10 +332,19 @@ class MonitorStream:
         alarm = None
         for verdict in verdicts:
             self._statistics = verdict.statistics
-            alarm = self.monitor.alarm(verdict) if verdict.alarm is not None else None
+            self._rows.append(verdict.row)
+            alarm = self._alarm(verdict) if verdict.alarm is not None else None
         gone = ~np.isfinite(values)
         silent = tuple(name for name, missing in zip(self.monitor.inputs, gone, strict=True) if missing)
         return Verdict(alarm, silent, self._statistics, bool(verdicts))
+
+    def _alarm(self, verdict: BlockVerdict) -> MonitorAlarm:
+        """The alarm with the causes that the rows up to now name."""
+        alarm, onset = self.monitor.alarm(verdict), onset_of(verdict.since, tuple(self._earlier))
+        self._earlier.append((verdict.since, verdict.block))
+        if self.monitor.diagnosis is None:
+            return alarm
+        return diagnosed(alarm, self.monitor.diagnosis, np.array(self._rows)[-max(verdict.block - onset, 1) :])
 
     def _row(self, row: Mapping[str, float] | Sequence[float] | NDArray[Any]) -> NDArray[np.float32]:
         inputs = self.monitor.inputs

@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from safetensors.numpy import save as save_arrays
 from edp import __version__
 from edp.errors import BundleError
 from edp.monitor.calibration import AlarmLimit
-from edp.monitor.chain import Chain
+from edp.monitor.chain import MonitorChain
+from edp.monitor.diagnosis.signatures import load_dictionary, remove_dictionary, save_dictionary
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
 from edp.signals import Channel, Kind
@@ -56,9 +57,9 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
     arrays: dict[str, Any] = {f"chain.{name}": values for name, values in monitor.chain.arrays().items()}
     arrays["session_means"] = monitor.session_means
     sources, written = [], set()
-    for place, source in enumerate(monitor.sources):
+    for index, source in enumerate(monitor.sources):
         parts = source.parts()
-        arrays |= {f"source.{place}.{name}": values for name, values in parts.arrays.items()}
+        arrays |= {f"source.{index}.{name}": values for name, values in parts.arrays.items()}
         networks = {name: _write_network(path, bundle) for name, bundle in parts.bundles.items()}
         written |= {entry["folder"] for entry in networks.values()}
         sources.append({"kind": _kind_of(source), "plain": dict(parts.plain), "networks": networks})
@@ -78,9 +79,12 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         "chain": monitor.chain.to_plain(),
         "limit": facts,
         "arrays": entry,
-        "diagnosis": monitor.diagnosis,
         "provenance": dict(monitor.provenance),
     }
+    if monitor.diagnosis is None:
+        remove_dictionary(path)
+    else:
+        save_dictionary(monitor.diagnosis, path)
     write_json(path / HEADER, header | {HASH: header_digest(header)})
     _remove_old(path, entry["file"], written)
     return path
@@ -124,6 +128,7 @@ def load_monitor(folder: str | Path) -> Monitor:
 
     Raises:
         BundleError: not a monitor, another schema, damaged numbers, or parts that this version does not know.
+        StorageError: its dictionary is damaged, or of another monitor.
     """
     path = Path(folder)
     if not os.path.lexists(path / HEADER):
@@ -137,7 +142,8 @@ def load_monitor(folder: str | Path) -> Monitor:
                 "newer one, or fit it again"
             )
         check_hash(header, path / HEADER)
-        return _assembled(header, path)
+        monitor = _assembled(header, path)
+    return replace(monitor, diagnosis=load_dictionary(path, monitor.summary_names))
 
 
 def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
@@ -154,17 +160,17 @@ def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
     arrays = load_arrays(read_arrays(path, header["arrays"]))
     sources = _sources(header["sources"], arrays, path)
     chain_arrays = {k.removeprefix("chain."): v for k, v in arrays.items() if k.startswith("chain.")}
-    chain = Chain.of(object_with(header["chain"], (), "its chain"), chain_arrays)
+    chain = MonitorChain.of(object_with(header["chain"], (), "its chain"), chain_arrays)
     _check_fit(sources, chain, names)
     means = np.asarray(arrays["session_means"], np.float64)
     if means.shape != (2, len(channels)) or not np.isfinite(means).all() or not (means[1] > 0.0).all():
         raise ValueError("the means of its sessions have another shape, are not finite, or have no width")
     provenance = object_with(header["provenance"], (), "its provenance")
     limit = _limit(object_with(header["limit"], LIMIT, "its limit"))
-    return Monitor(channels, float(rate_hz), sources, chain, limit, means, header.get("diagnosis"), provenance)
+    return Monitor(channels, float(rate_hz), sources, chain, limit, means, None, provenance)
 
 
-def _check_fit(sources: tuple[ResidualSource, ...], chain: Chain, names: list[str]) -> None:
+def _check_fit(sources: tuple[ResidualSource, ...], chain: MonitorChain, names: list[str]) -> None:
     """Refuse parts that do not belong together."""
     if chain.summaries.residuals != sum(len(source.names) for source in sources):
         raise ValueError("its chain is for another number of residuals than its sources give")
@@ -180,9 +186,9 @@ def _sources(entries: Any, arrays: Mapping[str, Any], path: Path) -> tuple[Resid
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_SOURCES:
         raise ValueError(f"it has no list of 1 to {MOST_SOURCES} sources of residuals")
     sources = []
-    for place, entry in enumerate(entries):
+    for index, entry in enumerate(entries):
         spec = RESIDUALS[_text(entry["kind"])]
-        prefix = f"source.{place}."
+        prefix = f"source.{index}."
         own = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         networks = object_with(entry["networks"], (), "its networks")
         if len(networks) > MOST_NETWORKS:

@@ -81,12 +81,12 @@ class SourceState:
 
     Attributes:
         last: the last value of each input that was there, shape (streams, inputs).
-        known: whether there was one, shape (streams, inputs).
+        ever: whether there was one, shape (streams, inputs).
         own: what the source itself carries.
     """
 
     last: Rows
-    known: NDArray[np.bool_]
+    ever: NDArray[np.bool_]
     own: Any
 
 
@@ -140,13 +140,13 @@ class ResidualSource(ABC):
             return np.empty((*rows.shape[:2], len(self.names)), np.float32), state
         there = np.isfinite(rows)
         filled, last = self._filled(rows, there, state)
-        residuals, own = self._run(filled, state.own)
+        residuals, own = self._run(filled, there, state.own)
         # A fresh array: sources may give views of what they keep.
         residuals = np.array(residuals, dtype=np.float32)
         if not there.all():
             gone = (~there).astype(np.float32) @ self._read_by.astype(np.float32)
             residuals[gone > 0.0] = np.nan
-        return residuals, SourceState(last, state.known | there.any(axis=1), own)
+        return residuals, SourceState(last, state.ever | there.any(axis=1), own)
 
     @property
     def _read_by(self) -> NDArray[np.bool_]:
@@ -172,8 +172,8 @@ class ResidualSource(ABC):
         """What the source itself carries, at the start."""
 
     @abstractmethod
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
-        """`run` on finite rows."""
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
+        """`run` on finite rows; `there` says which of their values were measured and did not have to be held."""
 
     @abstractmethod
     def parts(self) -> SourceParts:

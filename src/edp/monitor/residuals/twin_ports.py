@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.monitor.residuals.base import (
     RESIDUALS,
@@ -49,9 +50,9 @@ class TwinPorts(ResidualSource):
         channels = bundle.twin.channels
         answers = [channel.name for channel in channels.answers]
         units = {channel.name: channel.unit for channel in channels.answers}
-        place = {name: i for i, name in enumerate(self.inputs)}
-        self._commands = [place[channel.name] for channel in channels.commands]
-        self._answers = [place[name] for name in answers]
+        index = {name: i for i, name in enumerate(self.inputs)}
+        self._commands = [index[channel.name] for channel in channels.commands]
+        self._answers = [index[name] for name in answers]
         self._free = [[answers.index(name) for name in group] for group in self.groups]
         judged = [name for group in self.groups for name in group]
         self.names = tuple(f"twin:{name}" for name in judged)
@@ -63,7 +64,7 @@ class TwinPorts(ResidualSource):
         # None until the first tick, which tells the state that the machines begin in.
         return None
 
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
         twin = self.bundle.twin
         commands, measured = rows[..., self._commands], rows[..., self._answers]
         if own is None:

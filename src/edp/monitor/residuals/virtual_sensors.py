@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from edp.data.features import FeatureSet
 from edp.data.prepared import Prepared
@@ -64,9 +65,9 @@ class VirtualSensors(ResidualSource):
                 reads.append((target, *bundle.task.inputs))
                 units.append(Channel(target, kind).unit)
         self.names, self.judged, self.reads, self.units = tuple(names), tuple(judged), tuple(reads), tuple(units)
-        place = {name: i for i, name in enumerate(self.inputs)}
+        index = {name: i for i, name in enumerate(self.inputs)}
         self._columns = [
-            ([place[name] for name in bundle.task.inputs], [place[name] for name in bundle.task.targets])
+            ([index[name] for name in bundle.task.inputs], [index[name] for name in bundle.task.targets])
             for bundle in self.bundles.values()
         ]
 
@@ -76,7 +77,7 @@ class VirtualSensors(ResidualSource):
             for bundle in self.bundles.values()
         ]
 
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
         parts, states = [], []
         with torch.inference_mode():
             for bundle, (fed, judged), state in zip(self.bundles.values(), self._columns, own, strict=True):
@@ -176,12 +177,12 @@ class VirtualSensorsSpec(ResidualSpec):
         data = self._prepared(group, group.judged, material)
         fitted = fit(data, self.model(material.rate_hz), self.training(minutes, material))
         explained = _explained(fitted.predictor, data.validation or data.train)
-        kept = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)
-        if not kept:
+        remaining = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)
+        if not remaining:
             return None
-        if len(kept) < len(group.judged):
+        if len(remaining) < len(group.judged):
             # The others cost a training once more: a network whose outputs are cut off would be another network.
-            data = self._prepared(group, kept, material)
+            data = self._prepared(group, remaining, material)
             fitted = fit(data, self.model(material.rate_hz), self.training(minutes, material))
         facts = {"seconds": fitted.seconds}
         return Bundle(fitted.predictor, data.inputs, data.target_kinds, data.descriptions, facts)

@@ -1,6 +1,6 @@
 """Faults of the machine and of its sensors, for scenarios and environments; each kind is a file and a registration."""
 
-from edp.sim.faults.base import FAULTS, FaultKind, FaultSpec, MachineFault, SensorFault, ladder
+from edp.sim.faults.base import FAULTS, FaultKind, FaultSpec, MachineFault, SensorFault, at_site, ladder
 from edp.sim.faults.machine import attachment_mass as attachment_mass
 from edp.sim.faults.machine import check_leak as check_leak
 from edp.sim.faults.machine import cooler as cooler
@@ -47,6 +47,7 @@ __all__ = [
     "FaultSpec",
     "MachineFault",
     "SensorFault",
+    "at_site",
     "fault_text",
     "faults_of",
     "ladder",

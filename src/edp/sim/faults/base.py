@@ -85,6 +85,9 @@ class FaultKind(ABC):
 
     Attributes:
         text: what is wrong, for tables and messages.
+        part: what a mechanic would look at; ``{site}``, ``{axis}``, ``{side}`` and ``{pair}`` are words of a site.
+        words: how a fault is reported, with these, ``{size}`` and, for either sign, ``{high}`` or ``{large}``.
+        grave: whether a load may fall or a movement may not stop.
         sites: where it can sit; empty where a machine has one such part only.
         units: units of the size with their factors to SI; empty where it is there or not.
         ladder: sizes from hardly visible to gross, in the first unit.
@@ -93,6 +96,9 @@ class FaultKind(ABC):
     """
 
     text: ClassVar[str]
+    part: ClassVar[str]
+    words: ClassVar[str]
+    grave: ClassVar[bool] = False
     sites: ClassVar[tuple[str, ...]] = AXES
     units: ClassVar[Units]
     ladder: ClassVar[tuple[float, ...]] = ()
@@ -100,9 +106,18 @@ class FaultKind(ABC):
     neutral: ClassVar[float] = 0.0
 
     @property
+    def signed(self) -> bool:
+        """Whether a size may be negative."""
+        return self.bound.low < 0.0
+
+    @property
     def unit(self) -> str:
         """The unit of bounds and ladder; empty where there is no size."""
         return next(iter(self.units), "")
+
+    def component(self, site: str) -> str:
+        """The part that is at fault, such as ``boom valve``: kinds of one part are not told apart by it."""
+        return at_site(self.part, site)
 
 
 class MachineFault(FaultKind):
@@ -211,6 +226,16 @@ class FaultSpec:
             # A size of zero is a size.
             {} if self.size is None else {"size": self.size}
         )
+
+
+def at_site(text: str, site: str) -> str:
+    """A text with the words of a site in it."""
+    axis, _, side = site.partition("_")
+    whole = "both pumps" if site == "both" else site.replace("_", " ")
+    words = {"{site}": whole, "{axis}": axis, "{side}": side, "{pair}": f"{axis} and {side}"}
+    for key, word in words.items():
+        text = text.replace(key, word)
+    return text
 
 
 def among(name: str, options: Iterable[str]) -> str:

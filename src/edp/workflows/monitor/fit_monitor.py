@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,12 @@ from edp.storage import check_writable, write_bytes
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
+from edp.workflows.monitor.dictionary import build_dictionary, machine_of
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
+NOTED_SESSIONS = 25
+"""Simulated sessions of the dictionary between two notes."""
 CUT_S = 480.0
 """Where there are too few sessions, longer ones are cut into pieces of this length."""
 
@@ -133,7 +136,25 @@ def fit_to_recordings(
         session_means(channels, sessions),
         provenance=provenance,
     )
+    healthy = [session for session in rest if session.name not in fitted.doubtful]
+    monitor = _with_dictionary(monitor, healthy, experiment, note)
     return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began)
+
+
+def _with_dictionary(
+    monitor: Monitor, healthy: Sequence[Recording], experiment: MonitorExperiment, note: Callable[[str], None]
+) -> Monitor:
+    """The monitor with a dictionary of faults, where there is a machine to simulate them on."""
+    machine = machine_of(experiment.dictionary, healthy)
+    if not machine:
+        return monitor
+
+    def noted(what: str, done: int, total: int) -> None:
+        if done % NOTED_SESSIONS == 0 or done == total:
+            note(f"{what}: {done} of {total} sessions")
+
+    dictionary = build_dictionary(monitor, healthy, machine, experiment.dictionary, experiment.seed, noted)
+    return replace(monitor, diagnosis=dictionary)
 
 
 def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperiment) -> tuple[Channel, ...]:
@@ -155,8 +176,8 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
                 raise DataError(f"healthy log '{recording.name}' has no channel '{name}'{hint}")
     shared = set(first.channel_names).intersection(*(recording.channel_names for recording in recordings))
     offered = [channel for channel in sensed_channels(first.channels) if channel.name in shared]
-    wanted = experiment.channels or tuple(channel.name for channel in offered)
-    channels = tuple(channel for channel in first.channels if channel.name in wanted)
+    chosen = experiment.channels or tuple(channel.name for channel in offered)
+    channels = tuple(channel for channel in first.channels if channel.name in chosen)
     if len(channels) < 2:
         raise DataError(f"{len(channels)} channel can be watched; a monitor compares two at least: map more columns")
     return channels
@@ -182,8 +203,8 @@ def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
     pieces = []
     for recording in recordings:
         longest = round(CUT_S * recording.rate_hz)
-        wanted = -(-2 * LEAST_SESSIONS // len(recordings))
-        count = max(-(-recording.samples // longest), wanted)
+        least = -(-2 * LEAST_SESSIONS // len(recordings))
+        count = max(-(-recording.samples // longest), least)
         edges = np.linspace(0, recording.samples, count + 1).astype(int).tolist()
         pieces += [recording.rows(a, b) for a, b in itertools.pairwise(edges) if b > a]
     return pieces
@@ -208,11 +229,11 @@ def _divided(
 ) -> tuple[list[Recording], list[Recording], list[Recording]]:
     """Sessions that train residuals, that choose among fits, and the rest, drawn at random."""
     order = np.random.default_rng(experiment.seed).permutation(len(sessions)).tolist()
-    total, taken = sum(session.samples for session in sessions), 0
+    total, drawn = sum(session.samples for session in sessions), 0
     count = 0
-    for count, place in enumerate(order, start=1):
-        taken += sessions[place].samples
-        if taken >= experiment.train_share * total and count >= 2:
+    for count, index in enumerate(order, start=1):
+        drawn += sessions[index].samples
+        if drawn >= experiment.train_share * total and count >= 2:
             break
     count = min(count, len(sessions) - 4)
     chosen = [sessions[i] for i in order[:count]]

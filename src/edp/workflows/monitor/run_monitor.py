@@ -1,24 +1,35 @@
-"""A monitor along logs: alarms as JSON lines and as CSV."""
+"""A monitor along logs: alarms as JSON lines and as CSV, and traces for the page."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from edp import __version__
 from edp.logs.source import DataSource
 from edp.monitor.alarms import MonitorAlarm
-from edp.monitor.monitor import Monitor
+from edp.monitor.monitor import Monitor, Watched
 from edp.monitor.monitor_file import load_monitor
-from edp.storage import write_bytes
+from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
+from edp.recording import Recording
+from edp.report.monitor.facts import start_time
+from edp.storage import check_writable, write_bytes, write_json
+
+ALARM_LOG, RUN = "alarms.jsonl", "run.json"
+START = "start"
+"""Where the meta of a recording says when it began, as ISO 8601 text."""
 
 COLUMNS = (
     *("recording", "raised_s", "since_s", "severity", "sentence", "detector", "statistic", "limit"),
-    *("kind", "site", "size", "unit", "probability", "place", "evidence"),
+    *("kind", "site", "size", "unit", "probability", "index", "evidence"),
 )
 """Of the CSV file; of the causes the most probable one."""
 
@@ -33,6 +44,7 @@ class MonitorRun:
         hours: that it watched.
         recordings: names of them.
         silent: by recording, channels that it lacks.
+        traces: statistics and levels of residual groups, block by block.
     """
 
     monitor: Monitor
@@ -40,6 +52,7 @@ class MonitorRun:
     hours: float
     recordings: tuple[str, ...]
     silent: dict[str, tuple[str, ...]]
+    traces: RunTraces
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values."""
@@ -63,13 +76,19 @@ def run_monitor(
     Args:
         folder: of the monitor.
         source: the logs.
-        out: file for the alarm log: JSON lines, and beside it a CSV file of the same name.
+        out: folder for the alarm log as JSON lines and as CSV, and for what `edp monitor report` shows.
         on_recording: called with the name of the recording that begins, how many are done, and how many there are.
 
     Raises:
         EdpError: monitor or logs that cannot be used, or a file that cannot be written.
     """
-    monitor, alarms, silent, hours, names = load_monitor(folder), [], {}, 0.0, []
+    monitor, hours = load_monitor(folder), 0.0
+    alarms: list[MonitorAlarm] = []
+    silent: dict[str, tuple[str, ...]] = {}
+    traces: list[RecordingTrace] = []
+    if out is not None:
+        check_writable(out)
+    groups = groups_of(monitor)
     recordings = source.read()
     for done, recording in enumerate(recordings):
         if on_recording is not None:
@@ -77,13 +96,71 @@ def run_monitor(
         lacking = monitor.check(recording)
         if lacking:
             silent[recording.name] = lacking
-        alarms += monitor.run(recording)
+        start = str(recording.meta.get(START, ""))
+        watched = monitor.watch(recording, start_time(start))
+        alarms += watched.alarms
+        traces.append(trace_of(monitor, recording, watched, groups, start))
         hours += recording.duration_s / 3600.0
-        names.append(recording.name)
-    run = MonitorRun(monitor, tuple(alarms), hours, tuple(names), silent)
+    detectors = tuple(f"{name} {n + 1}" for n, name in enumerate(_detectors(monitor)))
+    names = tuple(recording.name for recording in recordings)
+    run = MonitorRun(
+        monitor, tuple(alarms), hours, names, silent,
+        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)),
+    )  # fmt: skip
     if out is not None:
-        write_alarms(run.alarms, out)
+        _write(run, Path(out), str(folder))
     return run
+
+
+def _detectors(monitor: Monitor) -> list[str]:
+    return [type(watch.detector).__name__.removesuffix("Spec").lower() for watch in monitor.chain.watches]
+
+
+def groups_of(monitor: Monitor) -> dict[str, list[int]]:
+    """Groups of residuals, by source and kind of the channels that they judge, with the places of their summaries."""
+    kinds = {channel.name: str(channel.kind).replace("_", " ") for channel in monitor.channels}
+    groups: dict[str, list[int]] = {}
+    for place, name in enumerate(monitor.summary_names):
+        residual = name.rpartition(".")[0]
+        source, _, judged = residual.partition(":")
+        group = f"{source}: {kinds.get(judged, judged)}"
+        groups.setdefault(group, []).append(place)
+    return groups
+
+
+def trace_of(
+    monitor: Monitor, recording: Recording, watched: Watched, groups: Mapping[str, list[int]], start: str
+) -> RecordingTrace:
+    """What the page shows of a recording."""
+    rows = watched.rows.astype(np.float64)
+    levels = np.full((len(rows), len(groups)), np.nan)
+    for column, places in enumerate(groups.values()):
+        part = rows[:, places]
+        there = np.isfinite(part)
+        counts = there.sum(axis=1)
+        squares = np.where(there, part, 0.0) ** 2
+        levels[:, column] = np.where(counts > 0, np.sqrt(squares.sum(axis=1) / np.maximum(counts, 1)), np.nan)
+    silent = tuple(name for column, name in enumerate(groups) if np.isnan(levels[:, column]).all())
+    ratios = (watched.statistics / monitor.chain.limit).astype(np.float32)
+    return RecordingTrace(recording.name, start, recording.duration_s, ratios, levels.astype(np.float32), silent)
+
+
+def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
+    """Alarms, traces, and where they come from."""
+    known = run.monitor.diagnosis
+    write_alarms(run.alarms, folder / ALARM_LOG)
+    write_traces(folder, run.traces)
+    facts = {
+        "monitor": monitor,
+        "promise": run.monitor.limit.sentence(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "edp_version": __version__,
+        "recordings": len(run.recordings),
+        "silent": {name: list(channels) for name, channels in run.silent.items()},
+        "classes": 0 if known is None else len(known.classes),
+        "confusions": [] if known is None else [asdict(pair) for pair in known.confusions],
+    }
+    write_json(folder / RUN, facts)
 
 
 def write_alarms(alarms: tuple[MonitorAlarm, ...], out: str | Path) -> tuple[Path, Path]:

@@ -12,6 +12,8 @@ class AttachmentMass(MachineFault):
     """Mass and inertia of the bucket grow in proportion; its centre stays."""
 
     text = "the attachment is heavier than it is known to be"
+    part = "attachment"
+    words = "the attachment is {size} heavier than it is known to be"
     sites = ()
     units = MASS
     ladder = (100.0, 300.0, 900.0)

@@ -11,6 +11,9 @@ class CheckLeak(MachineFault):
     """The share of their opening that load checks let pass backwards grows, in all sections of one axis."""
 
     text = "load checks of an axis let oil back; the size is the share of the opening that stays"
+    part = "{axis} valve"
+    words = "the load checks of the {axis} let oil back: {size} of the opening stay"
+    grave = True
     units = SHARE
     ladder = (2.0, 5.0, 10.0, 15.0)
     bound = span(0.0, 100.0)

@@ -11,6 +11,8 @@ class Cooler(MachineFault):
     """The oil gives less heat to the air, and becomes warmer in the course of minutes."""
 
     text = "the oil cooler takes away less heat; the size is the share that is lost"
+    part = "oil cooler"
+    words = "the oil cooler takes away {size} less heat"
     sites = ()
     units = SHARE
     ladder = (50.0, 80.0, 100.0)

@@ -11,6 +11,8 @@ class DeadBand(MachineFault):
     """The dead band of one spool grows to both sides, to 95 % of the travel at most."""
 
     text = "a spool opens too late; the size is added to its dead band, in shares of travel"
+    part = "{axis} valve"
+    words = "the {site} spool opens late: {size} of its travel are added to the dead band"
     sites = SPOOLS
     units = SHARE
     ladder = (2.0, 4.0, 8.0, 16.0)

@@ -14,6 +14,9 @@ class ExternalLeak(MachineFault):
     """A laminar gap from one chamber to the pressure of the tank: its flow goes with 1 / viscosity."""
 
     text = "oil leaves a chamber or its hose"
+    part = "{axis} cylinder"
+    words = "the {site} of the cylinder or its hose leaks outward: {size} at 200 bar"
+    grave = True
     sites = CHAMBERS
     units = FLOW
     ladder = (0.3, 1.0, 3.0, 10.0)

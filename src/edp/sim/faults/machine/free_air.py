@@ -11,6 +11,8 @@ class FreeAir(MachineFault):
     """The share of free air grows, and the oil becomes softer."""
 
     text = "there is more free air in the oil"
+    part = "oil"
+    words = "there is {size} more free air in the oil"
     sites = ()
     units = SHARE
     ladder = (1.0, 3.0, 6.0, 12.0)

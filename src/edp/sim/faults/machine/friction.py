@@ -11,6 +11,8 @@ class MoreFriction(MachineFault):
     """Coulomb, static and viscous friction of one cylinder grow by a factor."""
 
     text = "an axis rubs more, by a factor"
+    part = "{axis} cylinder"
+    words = "the {axis} rubs more: by a factor of {size}"
     units = FACTOR
     ladder = (1.3, 2.0, 4.0)
     bound = span(1.0, 20.0)

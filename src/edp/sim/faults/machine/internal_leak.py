@@ -14,6 +14,9 @@ class InternalLeak(MachineFault):
     """A laminar gap beside the piston: its flow goes with the pressure across it and with 1 / viscosity."""
 
     text = "oil passes the seals of the piston"
+    part = "{axis} cylinder"
+    words = "the {axis} cylinder leaks inside: {size} at 200 bar"
+    grave = True
     units = FLOW
     ladder = (0.3, 1.0, 3.0, 10.0)
     bound = span(0.0, 100.0)

@@ -11,6 +11,8 @@ class MainRelief(MachineFault):
     """Its setting falls, though not below the pressure of the tank."""
 
     text = "the main relief valve opens too early; the size is the fall of its setting"
+    part = "main relief valve"
+    words = "the main relief valve opens {size} too early"
     sites = ()
     units = PRESSURE
     ladder = (20.0, 50.0, 100.0, 150.0)

@@ -11,6 +11,9 @@ class PortRelief(MachineFault):
     """Its setting falls, though not below the pressure of the tank."""
 
     text = "a port relief valve opens too early; the size is the fall of its setting"
+    part = "{axis} valve"
+    words = "the port relief valve of {site} opens {size} too early"
+    grave = True
     sites = CHAMBERS
     units = PRESSURE
     ladder = (100.0, 150.0, 200.0, 250.0)

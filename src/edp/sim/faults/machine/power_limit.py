@@ -11,6 +11,8 @@ class PowerLimit(MachineFault):
     """The common power limit of the pumps falls by a share of itself."""
 
     text = "the power limit of the pumps is too low; the size is the share that is lost"
+    part = "pump control"
+    words = "the power limit of the pumps is {size} too low"
     sites = ()
     units = SHARE
     ladder = (5.0, 10.0, 20.0, 40.0)

@@ -11,6 +11,8 @@ class PumpEfficiency(MachineFault):
     """The volumetric efficiency falls by a share of itself."""
 
     text = "a pump delivers less; the size is the share that is lost"
+    part = "{site}"
+    words = "the flow of {site} is {size} too low"
     sites = ("pump_1", "pump_2", "both")
     units = SHARE
     ladder = (3.0, 6.0, 12.0, 25.0)

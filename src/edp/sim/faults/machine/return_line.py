@@ -11,6 +11,8 @@ class ReturnLine(MachineFault):
     """The pressure of the return gallery rises, whatever flows."""
 
     text = "the pressure of the return line is too high"
+    part = "return line"
+    words = "the pressure of the return line is {size} too high"
     sites = ()
     units = PRESSURE
     ladder = (2.0, 5.0, 10.0)

@@ -11,6 +11,8 @@ class SlowSpool(MachineFault):
     """The natural frequency of one spool falls by a factor; its pilot stays."""
 
     text = "a spool moves more slowly, by a factor"
+    part = "{axis} valve"
+    words = "the {site} spool moves slowly: by a factor of {size}"
     sites = SPOOLS
     units = FACTOR
     ladder = (1.25, 1.5, 2.0, 3.0)

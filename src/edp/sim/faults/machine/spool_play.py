@@ -11,6 +11,8 @@ class SpoolPlay(MachineFault):
     """The half width of the play between pilot and spool grows."""
 
     text = "a spool follows its pilot with play; the size is added to the half width, in shares of travel"
+    part = "{axis} valve"
+    words = "the {site} spool follows its pilot with play: {size} of its travel"
     sites = SPOOLS
     units = SHARE
     ladder = (1.0, 2.0, 4.0, 8.0)

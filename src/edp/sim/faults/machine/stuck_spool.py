@@ -13,6 +13,9 @@ class StuckSpool(MachineFault):
     """The travel of one spool behind its dead band ends early, so that a share of its opening is never reached."""
 
     text = "a spool sticks before it is open; the size is the share of the opening that is lost"
+    part = "{axis} valve"
+    words = "the {site} spool sticks: {size} of its opening are lost"
+    grave = True
     sites = SPOOLS
     units = SHARE
     ladder = (10.0, 25.0, 50.0, 80.0)

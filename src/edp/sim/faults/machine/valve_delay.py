@@ -10,6 +10,8 @@ class ValveDelay(MachineFault):
     """The dead time of one spool grows."""
 
     text = "the command of a spool arrives late"
+    part = "{axis} valve"
+    words = "the command of the {site} spool arrives {size} late"
     sites = SPOOLS
     units = TIME
     ladder = (10.0, 20.0, 50.0, 100.0)

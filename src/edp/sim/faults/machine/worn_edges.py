@@ -11,6 +11,8 @@ class WornEdges(MachineFault):
     """The openings from both chambers to the tank grow by a factor, and the load falls or runs ahead faster."""
 
     text = "the meter-out edges of a spool are worn, and let out more by a factor"
+    part = "{axis} valve"
+    words = "the meter-out edges of the {axis} spool let out more: by a factor of {size}"
     units = FACTOR
     ladder = (1.1, 1.2, 1.4, 1.6)
     bound = span(1.0, 5.0)

@@ -10,6 +10,8 @@ class HeadRodSwapped(SensorFault):
     """Head and rod pressure of one cylinder change places."""
 
     text = "head and rod pressure of a cylinder are interchanged"
+    part = "sensors of {axis} pressures"
+    words = "head and rod pressure of the {axis} are interchanged"
     units = NO_UNIT
     operation = alterations.SWAP
 

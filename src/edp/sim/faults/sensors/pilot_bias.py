@@ -14,6 +14,8 @@ class PilotBias(SensorFault):
     """An offset of one one-sided pilot pressure; what the valve gets stays."""
 
     text = "a pilot pressure is shown with an offset"
+    part = "sensor of pilot pressure {site}"
+    words = "pilot pressure {site} reads {size} too {high}"
     sites = PILOTS
     units = PRESSURE
     ladder = (0.5, 1.0, 3.0)

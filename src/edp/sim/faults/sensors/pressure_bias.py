@@ -11,6 +11,8 @@ class PressureBias(SensorFault):
     """An offset of one chamber's pressure, before range and converter."""
 
     text = "a cylinder pressure is shown with an offset"
+    part = "sensor of {site} pressure"
+    words = "{side} pressure of the {axis} reads {size} too {high}"
     sites = CHAMBERS
     units = PRESSURE
     ladder = (1.0, 3.0, 10.0, 30.0)

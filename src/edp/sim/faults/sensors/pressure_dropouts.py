@@ -13,6 +13,8 @@ class PressureDropouts(SensorFault):
     """Single ticks at random show 0; the size is their share."""
 
     text = "a cylinder pressure shows 0 for single ticks; the size is their share"
+    part = "sensor of {site} pressure"
+    words = "{side} pressure of the {axis} drops to 0 at {size} of the ticks"
     sites = CHAMBERS
     units = SHARE
     ladder = (0.1, 1.0)

@@ -13,6 +13,8 @@ class PressureLag(SensorFault):
     """A first-order lag of one chamber's pressure."""
 
     text = "a cylinder pressure follows with a lag"
+    part = "sensor of {site} pressure"
+    words = "{side} pressure of the {axis} follows with a lag of {size}"
     sites = CHAMBERS
     units = TIME
     ladder = (20.0, 50.0, 150.0)

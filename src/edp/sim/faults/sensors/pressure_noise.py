@@ -13,6 +13,8 @@ class PressureNoise(SensorFault):
     """The white noise of one transmitter grows by a factor; one without noise stays silent."""
 
     text = "the noise of a cylinder pressure is larger by a factor"
+    part = "sensor of {site} pressure"
+    words = "{side} pressure of the {axis} is noisy: by a factor of {size}"
     sites = CHAMBERS
     units = FACTOR
     ladder = (3.0, 10.0)

@@ -11,6 +11,8 @@ class PressureScale(SensorFault):
     """A share of one chamber's pressure is added, before range and converter."""
 
     text = "a cylinder pressure is shown too large by a share"
+    part = "sensor of {site} pressure"
+    words = "{side} pressure of the {axis} reads {size} too {large}"
     sites = CHAMBERS
     units = SHARE
     ladder = (1.0, 3.0, 10.0)

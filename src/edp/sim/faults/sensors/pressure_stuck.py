@@ -10,6 +10,8 @@ class PressureStuck(SensorFault):
     """One chamber's pressure stays at the value that was shown last."""
 
     text = "a cylinder pressure stays as it was"
+    part = "sensor of {site} pressure"
+    words = "{side} pressure of the {axis} stays as it was"
     sites = CHAMBERS
     units = NO_UNIT
     operation = alterations.STUCK

@@ -11,6 +11,8 @@ class PumpPressureBias(SensorFault):
     """An offset of one pump's delivery pressure."""
 
     text = "a pump pressure is shown with an offset"
+    part = "sensor of {site} pressure"
+    words = "pressure of {site} reads {size} too {high}"
     sites = ("pump_1", "pump_2")
     units = PRESSURE
     ladder = (3.0, 10.0, 30.0)

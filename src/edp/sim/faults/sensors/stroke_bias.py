@@ -11,6 +11,8 @@ class StrokeBias(SensorFault):
     """An offset of one cylinder's stroke."""
 
     text = "a stroke is shown with an offset"
+    part = "sensor of {axis} stroke"
+    words = "stroke of the {axis} reads {size} too {high}"
     units = LENGTH
     ladder = (2.0, 5.0, 20.0)
     bound = span(-2000.0, 2000.0)

@@ -11,6 +11,8 @@ class StrokeScale(SensorFault):
     """A share of one cylinder's stroke is added."""
 
     text = "a stroke is shown too large by a share"
+    part = "sensor of {axis} stroke"
+    words = "stroke of the {axis} reads {size} too {large}"
     units = SHARE
     ladder = (1.0, 3.0, 10.0)
     bound = span(-100.0, 100.0)

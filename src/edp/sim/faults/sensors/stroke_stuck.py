@@ -10,6 +10,8 @@ class StrokeStuck(SensorFault):
     """One cylinder's stroke stays at the value that was shown last."""
 
     text = "a stroke stays as it was"
+    part = "sensor of {axis} stroke"
+    words = "stroke of the {axis} stays as it was"
     units = NO_UNIT
     operation = alterations.STUCK
 

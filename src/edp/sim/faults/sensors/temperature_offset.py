@@ -11,6 +11,8 @@ class TemperatureOffset(SensorFault):
     """An offset of the oil temperature; the oil stays as warm as it is."""
 
     text = "the oil temperature is shown with an offset"
+    part = "sensor of oil temperature"
+    words = "oil temperature reads {size} too {high}"
     sites = ()
     units = TEMPERATURE
     ladder = (5.0, 15.0)

@@ -12,6 +12,8 @@ class VelocitiesSwapped(SensorFault):
     """Velocities of two cylinders change places, and with them their accelerations."""
 
     text = "velocities of two cylinders are interchanged"
+    part = "sensors of velocities"
+    words = "velocities of {pair} are interchanged"
     sites = tuple(PAIRS)
     units = NO_UNIT
     operation = alterations.SWAP

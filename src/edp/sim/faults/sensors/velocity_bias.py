@@ -11,6 +11,8 @@ class VelocityBias(SensorFault):
     """An offset of one cylinder's velocity; its acceleration shows the step."""
 
     text = "a velocity is shown with an offset"
+    part = "sensor of {axis} velocity"
+    words = "velocity of the {axis} reads {size} too {high}"
     units = VELOCITY
     ladder = (0.5, 2.0, 10.0)
     bound = span(-5000.0, 5000.0)

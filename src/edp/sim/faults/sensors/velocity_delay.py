@@ -13,6 +13,8 @@ class VelocityDelay(SensorFault):
     """A dead time of one cylinder's velocity; between ticks the value is interpolated."""
 
     text = "a velocity is shown late"
+    part = "sensor of {axis} velocity"
+    words = "velocity of the {axis} is shown {size} late"
     units = TIME
     ladder = (10.0, 20.0, 50.0)
     bound = span(0.0, 1000.0)

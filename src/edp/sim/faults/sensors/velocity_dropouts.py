@@ -13,6 +13,8 @@ class VelocityDropouts(SensorFault):
     """Single ticks at random show 0; the size is their share."""
 
     text = "a velocity shows 0 for single ticks; the size is their share"
+    part = "sensor of {axis} velocity"
+    words = "velocity of the {axis} drops to 0 at {size} of the ticks"
     units = SHARE
     ladder = (0.1, 1.0)
     bound = span(0.0, 100.0)

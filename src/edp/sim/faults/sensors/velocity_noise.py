@@ -13,6 +13,8 @@ class VelocityNoise(SensorFault):
     """The white errors of one joint rate and of its velocity grow by a factor."""
 
     text = "the noise of a velocity is larger by a factor"
+    part = "sensor of {axis} velocity"
+    words = "velocity of the {axis} is noisy: by a factor of {size}"
     units = FACTOR
     ladder = (3.0, 10.0)
     bound = span(1.0, 1000.0)

@@ -11,6 +11,8 @@ class VelocityScale(SensorFault):
     """A share of one cylinder's velocity is added; its acceleration follows."""
 
     text = "a velocity is shown too large by a share"
+    part = "sensor of {axis} velocity"
+    words = "velocity of the {axis} reads {size} too {large}"
     units = SHARE
     ladder = (1.0, 3.0, 10.0)
     bound = span(-100.0, 100.0)

@@ -10,6 +10,8 @@ class VelocityStuck(SensorFault):
     """One cylinder's velocity stays at the value that was shown last."""
 
     text = "a velocity stays as it was"
+    part = "sensor of {axis} velocity"
+    words = "velocity of the {axis} stays as it was"
     units = NO_UNIT
     operation = alterations.STUCK
 

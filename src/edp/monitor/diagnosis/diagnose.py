@@ -1,0 +1,51 @@
+"""An alarm with its causes, in words: from the rows since its onset and the dictionary of its monitor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.monitor.alarms import MonitorAlarm
+from edp.monitor.diagnosis.matching import causes_of, match
+from edp.monitor.diagnosis.sentences import alarm_sentence
+from edp.monitor.diagnosis.severity import severity
+from edp.monitor.diagnosis.signatures import Dictionary
+
+Array = NDArray[np.float64]
+AFTER_S = 60.0
+"""Time after an alarm whose rows name its cause where a log has them: a change at once is alarmed within a block."""
+MOST_ROWS = 180
+"""Blocks that name a cause: of a longer stretch the last ones, and no onset."""
+
+
+def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: datetime | None = None) -> MonitorAlarm:
+    """The alarm with causes, sentence and severity.
+
+    Args:
+        alarm: as the chain raised it.
+        dictionary: of the monitor.
+        rows: conditioned rows since the onset, shape (blocks, summaries).
+        start: of the recording, as a time of day.
+    """
+    found = match(dictionary, rows[-MOST_ROWS:], fresh=len(rows) <= MOST_ROWS)
+    causes = causes_of(dictionary, found)
+    sentence = alarm_sentence(causes, alarm.since_s, start)
+    return replace(alarm, causes=causes, sentence=sentence, severity=severity(causes))
+
+
+def onset_of(since: int, earlier: Sequence[tuple[int, int]]) -> int:
+    """Block after which a fault began: one that stays alarms again after each reset, and its first alarm knows.
+
+    Args:
+        since: block after which the deviation of this alarm began.
+        earlier: blocks since which and at which the alarms before were raised, in order.
+    """
+    for began, raised in reversed(earlier):
+        if since != raised:
+            break
+        since = began
+    return since

@@ -1,0 +1,116 @@
+"""From conditioned rows since an onset to numbers that a fault is recognised by, and their scatter without one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+
+Array = NDArray[np.float64]
+SHORT, LONG = 8, 40
+"""Blocks of the windows over which the scatter of means is measured."""
+SHRUNK = 0.2
+"""Share of the identity in the correlations: there are fewer healthy sessions than summaries."""
+LEAST_SESSIONS = 4
+ONSET = 6
+"""Blocks from the onset on that are looked at apart: a step of a sensor shows in them only."""
+
+
+def features(rows: Array) -> Array:
+    """What each block says: its conditioned summaries and their sizes, shape (blocks, 2 * summaries).
+
+    Sizes tell faults that come and go or change their sign with the motion, whose means vanish. A missing summary
+    counts as healthy: 0, and as large as it usually is is unknown, so it stays NaN for `mean_features` to leave out.
+    """
+    rows = np.asarray(rows, dtype=np.float64)
+    return np.concatenate([rows, np.abs(rows)], axis=1)
+
+
+def mean_features(rows: Array) -> Array:
+    """Mean features over blocks, NaN for summaries that were never there, shape (2 * summaries,)."""
+    values = features(rows)
+    there = np.isfinite(values)
+    counts = there.sum(axis=0)
+    sums = np.where(there, values, 0.0).sum(axis=0)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+def parts_of(rows: Array, fresh: bool = True) -> tuple[Array | None, Array | None]:
+    """Rows at the onset and those after it; None where there are none.
+
+    Args:
+        rows: conditioned rows since the onset, shape (blocks, summaries).
+        fresh: whether they begin at an onset, not at an earlier alarm of a fault that has stayed.
+    """
+    if not fresh:
+        return None, rows
+    return rows[:ONSET], rows[ONSET:] if len(rows) > ONSET else None
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Means of features on healthy sessions: where they lie, and how they scatter over few and over many blocks.
+
+    Attributes:
+        mean: shape (features,).
+        lasting: variance that stays however long the mean is, of each direction, shape (features,).
+        passing: variance that falls with the number of blocks, for one block, shape (features,).
+        matrix: features to directions in which both are uncorrelated as nearly as can be, shape (features, features).
+    """
+
+    mean: Array
+    lasting: Array
+    passing: Array
+    matrix: Array
+
+    @staticmethod
+    def fit(sessions: Sequence[Array]) -> Scatter:
+        """From conditioned rows of healthy sessions, shape (blocks, summaries) each.
+
+        Raises:
+            DataError: too few sessions of `LONG` blocks.
+        """
+        windows = {length: _windows(sessions, length) for length in (SHORT, LONG)}
+        if len(windows[LONG]) < LEAST_SESSIONS:
+            raise DataError(
+                f"{len(windows[LONG])} stretches of {LONG} healthy blocks are too few for a diagnosis; bring "
+                f"{LEAST_SESSIONS} at least"
+            )
+        mean = windows[SHORT].mean(axis=0)
+        short = np.cov(windows[SHORT], rowvar=False)
+        size = np.sqrt(np.maximum(np.diag(short), 1e-12))
+        correlation = (1.0 - SHRUNK) * short / np.outer(size, size) + SHRUNK * np.eye(len(size))
+        values, vectors = np.linalg.eigh(correlation)
+        matrix = vectors / np.sqrt(values) / size[:, None]
+        # Two lengths tell both parts: variance = lasting + passing / length.
+        over_short = ((windows[SHORT] - mean) @ matrix).var(axis=0)
+        over_long = ((windows[LONG] - mean) @ matrix).var(axis=0)
+        passing = np.maximum((over_short - over_long) / (1.0 / SHORT - 1.0 / LONG), 0.05 * SHORT * over_short)
+        lasting = np.maximum(over_short - passing / SHORT, 0.05 * over_short)
+        return Scatter(mean, lasting, passing, matrix)
+
+    def directions(self, mean: Array) -> Array:
+        """Mean features in the directions; what was never there counts as healthy."""
+        away = np.asarray(mean, dtype=np.float64) - self.mean
+        turned: Array = np.where(np.isfinite(away), away, 0.0) @ self.matrix
+        return turned
+
+    def variance(self, blocks: int) -> Array:
+        """Variance of the directions of a mean over so many blocks."""
+        return self.lasting + self.passing / max(blocks, 1)
+
+
+def _windows(sessions: Sequence[Array], length: int) -> Array:
+    """Mean features of stretches of so many blocks; rows with missing summaries count as healthy zeros."""
+    means = []
+    for session in sessions:
+        rows = np.nan_to_num(np.asarray(session, dtype=np.float64), nan=0.0)
+        count = len(rows) // length
+        if count:
+            values = features(rows[: count * length])
+            means.append(values.reshape(count, length, -1).mean(axis=1))
+    return np.concatenate(means) if means else np.zeros((0, 0))

@@ -1,0 +1,180 @@
+"""A dictionary from simulated fault sessions: signatures, and numbers that are chosen on sessions left out of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.monitor.diagnosis.causes import FaultClass
+from edp.monitor.diagnosis.evidence import ONSET, Scatter, mean_features
+from edp.monitor.diagnosis.matching import Match, Seen, match_directions
+from edp.monitor.diagnosis.signatures import Dictionary, signatures_of
+from edp.monitor.diagnosis.structure import confusions
+
+Array = NDArray[np.float64]
+CHANGING = (0.1, 0.3, 1.0)
+TEMPERATURES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+WINDOW = 40
+"""Healthy blocks under a signature of a left-out session: what an alarm has after some half a minute."""
+LEAST_CHANGE = 3.0
+"""Size of a signature, in healthy standard deviations of such a mean, below which it would not have been found."""
+UNUSUAL = 0.98
+"""Share of left-out sessions that some fault must explain."""
+MOST_JUDGED = 400
+"""Left-out sessions that numbers are chosen on."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedFault:
+    """What a fault did in one session.
+
+    Attributes:
+        draw: of the session.
+        owner: place of the fault in the classes.
+        size: of the fault.
+        change: mean features at the onset and after it, less those of the sound twin, shape (2, features).
+        sensors: what further channels show, less what they show of the sound twin, by name; standardised.
+    """
+
+    draw: int
+    owner: int
+    size: float
+    change: Array
+    sensors: Mapping[str, Array]
+
+
+def fit_dictionary(
+    summaries: Sequence[str],
+    classes: Sequence[FaultClass],
+    faults: Sequence[SimulatedFault],
+    healthy: Sequence[Array],
+    provenance: Mapping[str, Any],
+    seed: int = 0,
+) -> Dictionary:
+    """Signatures from all sessions; temperature, share of change and bounds from sessions that were left out.
+
+    A left-out session is judged as an alarm would be: its change on top of a stretch of a healthy session.
+
+    Args:
+        summaries: names of the monitor's summaries.
+        classes: the faults.
+        faults: their sessions, of one draw or more.
+        healthy: conditioned rows of healthy sessions, shape (blocks, summaries) each.
+        provenance: machine, seed, sessions.
+        seed: of the stretches that are drawn.
+
+    Raises:
+        DataError: too few healthy sessions, or a fault without a session.
+    """
+    scatter = Scatter.fit(healthy)
+    whole = _dictionary(summaries, classes, faults, scatter, provenance)
+    draws = sorted({fault.draw for fault in faults})
+    if len(draws) < 2:
+        return whole
+    judged = _left_out(summaries, classes, faults, scatter, healthy, seed)
+    whole = _chosen(judged, whole)
+    return replace(whole, confusions=_confusions(judged, whole))
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """A left-out session: the dictionary without its draw, and what an alarm would see of it."""
+
+    without: Dictionary
+    fault: SimulatedFault
+    seen: tuple[Seen, Seen]
+
+
+def _dictionary(
+    summaries: Sequence[str],
+    classes: Sequence[FaultClass],
+    faults: Sequence[SimulatedFault],
+    scatter: Scatter,
+    provenance: Mapping[str, Any],
+) -> Dictionary:
+    changes = np.array([fault.change for fault in faults]) @ scatter.matrix
+    owner, sizes = [fault.owner for fault in faults], [fault.size for fault in faults]
+    signatures = signatures_of(classes, owner, sizes, changes)
+    return Dictionary(tuple(summaries), tuple(classes), scatter, *signatures, provenance=provenance)
+
+
+def _left_out(
+    summaries: Sequence[str],
+    classes: Sequence[FaultClass],
+    faults: Sequence[SimulatedFault],
+    scatter: Scatter,
+    healthy: Sequence[Array],
+    seed: int,
+) -> list[_Judged]:
+    """Sessions whose change is large enough to be found, each on top of a healthy stretch."""
+    chance = np.random.default_rng([seed, 23])
+    noise = [scatter.variance(blocks) for blocks in (ONSET, WINDOW)]
+    long = [session for session in healthy if len(session) >= ONSET + WINDOW]
+    judged = []
+    for draw in sorted({fault.draw for fault in faults}):
+        others = [fault for fault in faults if fault.draw != draw]
+        if {fault.owner for fault in others} != set(range(len(classes))):
+            continue
+        without = _dictionary(summaries, classes, others, scatter, {})
+        for fault in faults:
+            if fault.draw != draw or not _would_be_found(fault.change @ scatter.matrix, noise):
+                continue
+            session = long[int(chance.integers(len(long)))]
+            first = int(chance.integers(len(session) - ONSET - WINDOW + 1))
+            ends = first, first + ONSET, first + ONSET + WINDOW
+            means = [mean_features(session[ends[part] : ends[part + 1]]) for part in (0, 1)]
+            at, after = ((scatter.directions(means[part] + fault.change[part]), noise[part]) for part in (0, 1))
+            judged.append(_Judged(without, fault, (at, after)))
+    keep = chance.permutation(len(judged))[:MOST_JUDGED]
+    return [judged[place] for place in sorted(keep.tolist())]
+
+
+def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
+    """Whether a direction is far enough off at the onset or after it."""
+    return any(float(np.max(change[part] ** 2 / noise[part])) > LEAST_CHANGE**2 for part in (0, 1))
+
+
+def _chosen(judged: Sequence[_Judged], whole: Dictionary) -> Dictionary:
+    """With the share of change and the temperature of the least logarithmic loss, and a misfit that few have."""
+    best, least = whole, np.inf
+    for changing in CHANGING:
+        for temperature in TEMPERATURES:
+            tried = replace(whole, changing=changing, temperature=temperature)
+            loss, misfits = 0.0, []
+            for case in judged:
+                found = _found(case, tried)
+                loss -= float(np.log(max(found.probabilities[case.fault.owner], 1e-6)))
+                misfits.append(found.misfit)
+            if misfits and loss < least:
+                best, least = replace(tried, strange=max(float(np.quantile(misfits, UNUSUAL)), 1.0)), loss
+    return best
+
+
+def _found(case: _Judged, numbers: Dictionary) -> Match:
+    """What the dictionary without the session's draw makes of it, with the numbers of another one."""
+    without = replace(case.without, changing=numbers.changing, temperature=numbers.temperature, strange=np.inf)
+    return match_directions(without, case.seen)
+
+
+def _confusions(judged: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]:
+    """Pairs of faults that left-out sessions confuse; both signs of a fault count as one."""
+    names = sorted({_name(fault) for fault in whole.classes})
+    if not judged:
+        return ()
+    place = {name: n for n, name in enumerate(names)}
+    columns = np.array([place[_name(fault)] for fault in whole.classes])
+    probabilities = np.zeros((len(judged), len(names)))
+    for row, case in enumerate(judged):
+        np.add.at(probabilities[row], columns, _found(case, whole).probabilities)
+    truth = np.array([columns[case.fault.owner] for case in judged])
+    further = sorted(judged[0].fault.sensors)
+    sensors = {name: np.array([case.fault.sensors[name] for case in judged]) for name in further}
+    return confusions(names, probabilities, truth, sensors)
+
+
+def _name(fault: FaultClass) -> str:
+    return ":".join(filter(None, (fault.kind, fault.site)))

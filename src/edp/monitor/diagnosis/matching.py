@@ -1,0 +1,151 @@
+"""Which faults of the dictionary explain the rows since an onset, how large they would be, and how likely each is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause, FaultClass
+from edp.monitor.diagnosis.evidence import mean_features, parts_of
+from edp.monitor.diagnosis.sentences import UNKNOWN, cause_words
+from edp.monitor.diagnosis.signatures import Dictionary
+
+Array = NDArray[np.float64]
+Seen = tuple[Array, Array]
+"""Directions of a mean, and their healthy variance."""
+GRID = 12
+"""Sizes of a fault that are tried, evenly spread in their logarithm from the smallest of its ladder on."""
+BEYOND = 1.3
+"""Largest size that is tried, over the largest of the ladder: signatures are not followed further."""
+LEAST_SIZE = 0.5
+"""Smallest size that is tried, over the smallest of the ladder."""
+MOST_CAUSES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """How well each fault explains the evidence.
+
+    Attributes:
+        probabilities: of each fault, shape (faults,); with `none` they sum to 1.
+        sizes: the most likely size of each fault, NaN for faults without, shape (faults,).
+        none: probability that no fault of the dictionary explains the evidence.
+        misfit: mean squared misfit of a direction under the best fault, in its own variance.
+    """
+
+    probabilities: Array
+    sizes: Array
+    none: float
+    misfit: float
+
+
+def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
+    """Compare the rows since an onset with all signatures.
+
+    A fault's likelihood is the mean over its sizes of a normal density around its signatures at the onset and after it,
+    which are interpolated between the sizes that were simulated. Its variance is that of a healthy mean over so many
+    blocks, and a share of the squared signature: the same fault looks otherwise from session to session.
+
+    Args:
+        dictionary: of the monitor.
+        rows: conditioned rows since the onset, NaN where missing, shape (blocks, summaries).
+        fresh: whether they begin at an onset, not at an earlier alarm of a fault that has stayed.
+    """
+    seen: list[Seen | None] = []
+    for part in parts_of(rows, fresh):
+        if part is None:
+            seen.append(None)
+        else:
+            directions = dictionary.scatter.directions(mean_features(part))
+            seen.append((directions, dictionary.scatter.variance(len(part))))
+    return match_directions(dictionary, seen)
+
+
+def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
+    """`match` from the directions at the onset and after it on; None where there are no rows of a part."""
+    scores, sizes, misfits = [], [], []
+    for place, fault in enumerate(dictionary.classes):
+        tried, signatures = candidates(dictionary, place, fault)
+        likelihoods, off, count = np.zeros(len(tried)), np.zeros(len(tried)), 0
+        for part, entry in enumerate(seen):
+            if entry is None:
+                continue
+            directions, noise = entry
+            variance = noise + dictionary.changing * signatures[part] ** 2
+            squares = (directions - signatures[part]) ** 2 / variance
+            likelihoods -= 0.5 * (squares + np.log(variance)).sum(axis=1) / dictionary.temperature
+            off += squares.mean(axis=1)
+            count += 1
+        best = int(likelihoods.argmax())
+        scores.append(float(logsumexp(likelihoods)) - np.log(len(likelihoods)))
+        sizes.append(tried[best])
+        misfits.append(float(off[best]) / max(count, 1))
+    logs = np.array(scores)
+    shares = np.exp(logs - logsumexp(logs))
+    misfit = misfits[int(logs.argmax())]
+    # Even odds at the misfit that hardly any left-out session reached, certainty at half as much again.
+    none = float(np.clip(misfit / dictionary.strange - 0.5, 0.0, 1.0))
+    return Match((1.0 - none) * shares, np.array(sizes), none, misfit)
+
+
+def candidates(dictionary: Dictionary, place: int, fault: FaultClass) -> tuple[Array, Array]:
+    """Sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
+    rows = dictionary.rows_of(place)
+    signatures = dictionary.signatures[:, rows]
+    if not fault.sizes:
+        return np.array([np.nan]), signatures[:, :1]
+    away = np.abs(dictionary.sizes[rows] - fault.neutral)
+    sign = -1.0 if fault.sizes[0] < fault.neutral else 1.0
+    ends = abs(fault.sizes[0] - fault.neutral), abs(fault.sizes[-1] - fault.neutral)
+    tried = np.geomspace(LEAST_SIZE * ends[0], BEYOND * ends[1], GRID)
+    # From nothing at the neutral size; beyond the largest size that was simulated it stays as it was there.
+    known = np.concatenate([[0.0], away])
+    values = np.concatenate([np.zeros((2, 1, signatures.shape[2])), signatures], axis=1)
+    upper = np.clip(np.searchsorted(known, tried), 1, len(known) - 1)
+    share = np.clip((tried - known[upper - 1]) / (known[upper] - known[upper - 1]), 0.0, 1.0)[:, None]
+    between = (1.0 - share) * values[:, upper - 1] + share * values[:, upper]
+    return fault.neutral + sign * tried, between
+
+
+def causes_of(dictionary: Dictionary, found: Match, most: int = MOST_CAUSES) -> tuple[Cause, ...]:
+    """The most likely causes, the first of them from the most likely part.
+
+    A part may have many kinds of faults that look alike: what a mechanic looks at first is the part whose faults
+    together are the most likely, and of it the likeliest fault.
+    """
+    causes = [
+        _cause(fault, float(found.probabilities[place]), float(found.sizes[place]))
+        for place, fault in enumerate(dictionary.classes)
+    ]
+    parts: dict[str, float] = {}
+    for cause in causes:
+        parts[cause.component] = parts.get(cause.component, 0.0) + cause.probability
+    causes.append(Cause(NONE_OF_THESE, "", "", "none", None, "", found.none, UNKNOWN))
+    parts[""] = found.none
+    return tuple(_by_part(causes, parts)[:most])
+
+
+def _by_part(causes: Sequence[Cause], parts: dict[str, float]) -> list[Cause]:
+    """The likeliest fault of each of the three likeliest parts, then all others by their probability."""
+    order = sorted(causes, key=lambda cause: (-cause.probability, cause.kind, cause.site))
+    first = []
+    for part in sorted(parts, key=lambda name: (-parts[name], name))[:3]:
+        first.append(next(cause for cause in order if cause.component == part))
+    return first + [cause for cause in order if cause not in first]
+
+
+def _cause(fault: FaultClass, probability: float, size: float) -> Cause:
+    if not fault.sizes:
+        return Cause(
+            fault.kind, fault.site, fault.component, fault.place, None, "", probability, fault.words, None, fault.grave
+        )
+    steps = np.abs(np.array(fault.sizes) - fault.neutral)
+    grade = float(np.interp(np.log(abs(size - fault.neutral)), np.log(steps), np.linspace(0.0, 1.0, len(steps))))
+    return Cause(
+        fault.kind, fault.site, fault.component, fault.place, size, fault.unit, probability, cause_words(fault, size),
+        grade, fault.grave,
+    )  # fmt: skip

@@ -1,0 +1,33 @@
+"""How grave an alarm is: a note, a warning, or a reason to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
+
+Severity = Literal["note", "warning", "stop"]
+SMALL, LARGE = 0.34, 0.67
+"""Grades on the ladder of a kind: the first of four sizes is a note, the upper ones may be a reason to stop."""
+ENOUGH = 0.5
+"""Probability of grave causes from which on a machine should stop."""
+
+
+def severity(causes: Sequence[Cause]) -> Severity:
+    """The severity of an alarm with these causes, the most likely one first.
+
+    `stop`: faults by which a load may fall or a movement may not stop are more likely than not, and large. `note`: the
+    most likely cause is hardly larger than what can be seen at all. All else, and what has no name, is a warning.
+    """
+    grave = sum(cause.probability for cause in causes if cause.grave and _grade(cause) >= LARGE)
+    if grave >= ENOUGH:
+        return "stop"
+    if causes and causes[0].kind != NONE_OF_THESE and _grade(causes[0]) < SMALL:
+        return "note"
+    return "warning"
+
+
+def _grade(cause: Cause) -> float:
+    # A fault without sizes is there whole.
+    return 1.0 if cause.grade is None else cause.grade

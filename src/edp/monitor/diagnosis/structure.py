@@ -1,0 +1,112 @@
+"""What cannot be told apart with the present sensors, and which further sensor would separate it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+APART = 0.25
+"""Largest share of wrong answers of a test between two faults that can be told apart; a coin has 0.5."""
+MOST_PAIRS = 400
+LONGEST_NAME = 300
+LEAST_SESSIONS = 2
+"""Of each of two faults, without which nothing is said about them."""
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """Two faults that cannot be told apart.
+
+    Attributes:
+        first: kind and site of one, and `second` of the other.
+        error: share of wrong answers between the two on sessions that nothing was fitted to.
+        sensor: channel that would separate them best; empty where none does.
+        sensor_error: the same share with it; None without one.
+    """
+
+    first: str
+    second: str
+    error: float
+    sensor: str = ""
+    sensor_error: float | None = None
+
+
+def confusion_of(entry: Any, where: str) -> Confusion:
+    """A pair from plain data.
+
+    Raises:
+        DataError: it is none.
+    """
+    if not isinstance(entry, Mapping) or set(entry) != {field.name for field in fields(Confusion)}:
+        raise DataError(f"{where}: a pair of faults that cannot be told apart is damaged")
+    pair = Confusion(**entry)
+    texts, shares = (pair.first, pair.second, pair.sensor), (pair.error, pair.sensor_error or 0.0)
+    if not all(isinstance(text, str) and len(text) <= LONGEST_NAME for text in texts):
+        raise DataError(f"{where}: a name of a fault that cannot be told apart is no text")
+    for share in shares:
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share <= 1.0:
+            raise DataError(f"{where}: an error of faults that cannot be told apart is no share")
+    return pair
+
+
+def confusions(
+    names: Sequence[str], probabilities: Array, truth: Numbers, sensors: Mapping[str, Array]
+) -> tuple[Confusion, ...]:
+    """Pairs of faults that cannot be told apart, the worst first.
+
+    Args:
+        names: of the faults.
+        probabilities: of each fault for sessions that nothing was fitted to, shape (sessions, faults).
+        truth: which fault each session has, shape (sessions,).
+        sensors: what a further channel shows of each session, by its name, shape (sessions, values); standardised.
+    """
+    logits = np.log(np.maximum(probabilities, 1e-12))
+    rows = {fault: np.flatnonzero(truth == fault) for fault in range(len(names))}
+    pairs = []
+    for a in range(len(names)):
+        for b in range(a + 1, len(names)):
+            if min(len(rows[a]), len(rows[b])) < LEAST_SESSIONS:
+                continue
+            error = 0.5 * (_behind(logits[rows[a]], a, b) + _behind(logits[rows[b]], b, a))
+            if error > APART:
+                pairs.append((error, a, b))
+    pairs.sort(key=lambda pair: (-pair[0], pair[1], pair[2]))
+    result = []
+    for error, a, b in pairs[:MOST_PAIRS]:
+        sensor, sensor_error = _best_sensor(rows[a], rows[b], sensors)
+        helps = sensor_error is not None and sensor_error <= min(APART, 0.5 * error)
+        result.append(Confusion(names[a], names[b], error, *((sensor, sensor_error) if helps else ("", None))))
+    return tuple(result)
+
+
+def _behind(logits: Array, right: int, wrong: int) -> float:
+    """Share of sessions of `right` for which `wrong` is more likely; ties count half."""
+    lead = logits[:, right] - logits[:, wrong]
+    return float(np.mean((lead < 0.0) + 0.5 * (lead == 0.0)))
+
+
+def _best_sensor(first: Numbers, second: Numbers, sensors: Mapping[str, Array]) -> tuple[str, float | None]:
+    """The channel with the fewest wrong answers between two groups of sessions; each is left out of its own mean."""
+    best: tuple[str, float | None] = "", None
+    for name in sorted(sensors):
+        values = sensors[name]
+        error = 0.5 * (_left_out(values[first], values[second]) + _left_out(values[second], values[first]))
+        if best[1] is None or error < best[1]:
+            best = name, error
+    return best
+
+
+def _left_out(own: Array, other: Array) -> float:
+    """Share of sessions nearer to the mean of the others than to that of their own without them."""
+    means = (own.sum(axis=0) - own) / (len(own) - 1)
+    to_own = ((own - means) ** 2).sum(axis=1)
+    to_other = ((own - other.mean(axis=0)) ** 2).sum(axis=1)
+    return float(np.mean(to_own >= to_other))

@@ -1,0 +1,78 @@
+"""A JSON header and its arrays on disk, under one hash: what the diagnosis and a monitor's runs keep."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from edp.errors import StorageError, brief
+from edp.storage import object_with, read_bytes, read_json, write_bytes, write_json
+
+Arrays = Mapping[str, NDArray[Any]]
+ARRAY_BYTES = 512 * 2**20
+"""Of a file of arrays; a day of traces takes a tenth of it."""
+HASH, ARRAYS = "blake2b", "arrays_blake2b"
+
+
+def write_stored(folder: Path, name: str, header: Mapping[str, Any], arrays: Arrays) -> None:
+    """Write ``NAME.safetensors`` and ``NAME.json``; the header last.
+
+    Raises:
+        StorageError: a file cannot be written.
+    """
+    data = save({key: np.ascontiguousarray(values) for key, values in arrays.items()})
+    write_bytes(folder / f"{name}.safetensors", data)
+    whole = dict(header) | {ARRAYS: _digest(data)}
+    write_json(folder / f"{name}.json", whole | {HASH: _header_digest(whole)})
+
+
+def read_stored(folder: Path, name: str, schema: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header and arrays, checked against their hashes; nothing in them is executed.
+
+    Raises:
+        StorageError: missing, damaged, changed, too large, or of another schema.
+    """
+    file = folder / f"{name}.json"
+    header = object_with(read_json(file), ("schema", HASH, ARRAYS), f"'{file}'")
+    if type(header["schema"]) is not int or header["schema"] != schema:
+        raise StorageError(f"'{file}' has schema {str(header['schema'])[:40]}, this EDP reads {schema}; write it anew")
+    if header[HASH] != _header_digest({key: value for key, value in header.items() if key != HASH}):
+        raise StorageError(f"'{file}' does not match its hash: it was cut off or changed by hand; write it anew")
+    data = read_bytes(folder / f"{name}.safetensors", ARRAY_BYTES)
+    if _digest(data) != header[ARRAYS]:
+        raise StorageError(f"'{folder / name}.safetensors' does not match its hash: cut off or changed; write it anew")
+    try:
+        arrays = load(data)
+    except (SafetensorError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise StorageError(f"'{folder / name}.safetensors' is damaged: {brief(error)}; write it anew") from error
+    return header, arrays
+
+
+def shaped(arrays: Arrays, name: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+    """One array as float64, checked for its shape and for values that are not finite.
+
+    Raises:
+        StorageError: it is missing, of another shape, no floats, or not finite.
+    """
+    values = arrays.get(name)
+    if values is None or values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
+        raise StorageError(f"{where}: array '{name}' must hold finite numbers of shape {shape}; write it anew")
+    return values.astype(np.float64)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def _header_digest(header: Mapping[str, Any]) -> str:
+    # One round through JSON: the hash is over what a reader will see, tuples as lists.
+    plain = json.loads(json.dumps(dict(header), allow_nan=False))
+    return _digest(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode())

@@ -1,0 +1,221 @@
+"""A monitor's run as a reader sees it: sentences, key figures and tables."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
+from edp.monitor.diagnosis.sentences import clock
+from edp.monitor.diagnosis.structure import Confusion
+from edp.monitor.traces import RecordingTrace, RunTraces
+from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.report.common.wording import MISSING, count_text, listed, number, short_label
+
+MOST_ALARMS = 40
+"""With evidence each on a page; all of them stand in the log."""
+MOST_CAUSES = 5
+MOST_SILENT = 6
+
+
+@dataclass(frozen=True)
+class AlarmFacts:
+    """One alarm.
+
+    Attributes:
+        recording: its name.
+        raised_s: when it was raised and `since_s` when the change began by its estimate, s from the start.
+        detector: which raised it.
+        statistic: that passed `limit`.
+        evidence: summaries of residuals and how far they are off since then, in standard deviations of healthy
+            blocks, the largest first.
+        causes: the most likely first; empty without a dictionary.
+        sentence: all of it in one.
+        severity: ``note``, ``warning`` or ``stop``.
+    """
+
+    recording: str
+    raised_s: float
+    since_s: float
+    detector: str
+    statistic: float
+    limit: float
+    evidence: tuple[tuple[str, float], ...]
+    causes: tuple[Cause, ...]
+    sentence: str
+    severity: str
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorFacts:
+    """A run of a monitor over logs.
+
+    Attributes:
+        title: of the page.
+        traces: statistics and levels of all recordings.
+        alarms: in the order in which they were raised.
+        promise: the sentence of the calibration.
+        confusions: faults of the dictionary that cannot be told apart; empty without one.
+        classes: how many faults the dictionary has; 0 without one.
+        provenance: name and text of where it comes from.
+    """
+
+    title: str
+    traces: RunTraces
+    alarms: Sequence[AlarmFacts]
+    promise: str
+    confusions: Sequence[Confusion] = ()
+    classes: int = 0
+    provenance: Sequence[tuple[str, str]] = ()
+
+    def trace_of(self, alarm: AlarmFacts) -> RecordingTrace | None:
+        """The trace of the recording of an alarm."""
+        return next((trace for trace in self.traces.recordings if trace.name == alarm.recording), None)
+
+    def start_of(self, recording: str) -> datetime | None:
+        """When a recording began, where that is known."""
+        trace = next((trace for trace in self.traces.recordings if trace.name == recording), None)
+        return start_time(trace.start) if trace is not None else None
+
+
+def start_time(text: str) -> datetime | None:
+    """The time that ISO 8601 text stands for; None for anything else."""
+    try:
+        return datetime.fromisoformat(text) if text else None
+    except ValueError:
+        return None
+
+
+def headline(facts: MonitorFacts) -> str:
+    """The answer first: how many alarms in which time, and what they say."""
+    hours = hours_text(facts.traces.hours)
+    if not facts.alarms:
+        return f"No alarm in {hours}"
+    count = f"{len(facts.alarms)} alarm{'s' * (len(facts.alarms) > 1)} in {hours}"
+    said = Counter(_subject(alarm) for alarm in facts.alarms)
+    parts = [text if times == 1 else f"{text} ({times} times)" for text, times in said.most_common(2)]
+    more = f"; {len(said) - 2} more" if len(said) > 2 else ""
+    return f"{count}: {'; '.join(parts)}{more}"
+
+
+def _subject(alarm: AlarmFacts) -> str:
+    """What an alarm is of, without its time."""
+    if not alarm.causes:
+        return "unnamed changes"
+    first = alarm.causes[0]
+    if first.kind == NONE_OF_THESE:
+        return "changes that no fault of the dictionary explains"
+    return first.words if first.probability >= 0.5 else f"perhaps {first.words}"
+
+
+def hours_text(hours: float) -> str:
+    """A time of operation."""
+    return f"{hours:.1f} h" if hours >= 1.0 else f"{hours * 60.0:.3g} min"
+
+
+def verdict(facts: MonitorFacts) -> list[str]:
+    """Sentences behind the headline."""
+    lines = [f"Limits: {facts.promise}." if facts.promise else ""]
+    silent = sorted({name for trace in facts.traces.recordings for name in trace.silent})
+    if silent:
+        shown = listed(silent[:MOST_SILENT]) + (f" and {len(silent) - MOST_SILENT} more" * (len(silent) > MOST_SILENT))
+        lines.append(f"Silent for want of channels in some recordings: {shown}; faults that only they show go unseen.")
+    if facts.classes == 0 and facts.alarms:
+        lines.append("The monitor has no dictionary of faults: alarms say which residuals changed, not why.")
+    return [line for line in lines if line]
+
+
+def tiles(facts: MonitorFacts) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, what it is."""
+    grades = Counter(alarm.severity for alarm in facts.alarms)
+    with_alarms = {alarm.recording for alarm in facts.alarms}
+    quiet = sum(trace.name not in with_alarms for trace in facts.traces.recordings)
+    delays = [alarm.raised_s - alarm.since_s for alarm in facts.alarms]
+    rows = [
+        (count_text(len(facts.alarms)), "", "alarms"),
+        *((count_text(grades[name]), "", text) for name, text in SEVERITIES if grades[name]),
+        (f"{quiet} of {len(facts.traces.recordings)}", "", "recordings without an alarm"),
+    ]
+    if delays:
+        middle = sorted(delays)[len(delays) // 2]
+        rows.append((number(middle, 0), "s", "from the estimated onset to the alarm (median)"))
+    return rows
+
+
+SEVERITIES = (("stop", "reasons to stop"), ("warning", "warnings"), ("note", "notes"))
+
+
+def alarm_sheet(facts: MonitorFacts) -> Sheet:
+    """A row an alarm."""
+    rows: list[tuple[Value, ...]] = []
+    for alarm in facts.alarms[: 10 * MOST_ALARMS]:
+        start = facts.start_of(alarm.recording)
+        first = alarm.causes[0] if alarm.causes else None
+        rows.append((
+            short_label(alarm.recording), clock(alarm.since_s, start), clock(alarm.raised_s, start), alarm.severity,
+            first.words if first else MISSING, first.probability if first else None, alarm.detector,
+            alarm.statistic / alarm.limit if alarm.limit > 0.0 else None,
+        ))  # fmt: skip
+    share = figures([], decimals=2)
+    heads = (
+        Column("Recording"), Column("Since"), Column("Raised"), Column("Severity"), Column("Most likely"),
+        Column("Probability", "", share), Column("Detector"), Column("Statistic over limit", "", share),
+    )  # fmt: skip
+    return Sheet("alarms", "Alarms in the order in which they were raised", heads, tuple(rows))
+
+
+def cause_sheet(alarm: AlarmFacts) -> Sheet | None:
+    """What an alarm could be, the most likely cause first; None without a dictionary."""
+    rows: list[tuple[Value, ...]] = [
+        (cause.words, cause.component or MISSING, cause.place if cause.place != "none" else MISSING, cause.probability)
+        for cause in alarm.causes[:MOST_CAUSES]
+    ]
+    if not rows:
+        return None
+    heads = (
+        Column("What it could be"),
+        Column("Part"),
+        Column("Where"),
+        Column("Probability", "", figures([], False, 2)),
+    )
+    return Sheet("causes", "Causes", heads, tuple(rows), frozenset({0}))
+
+
+def confusions_of(facts: MonitorFacts, alarm: AlarmFacts) -> list[str]:
+    """Sentences on what the most likely cause of an alarm cannot be told from with the present sensors."""
+    if not alarm.causes:
+        return []
+    first = alarm.causes[0]
+    mine = ":".join(filter(None, (first.kind, first.site)))
+    found = [pair for pair in facts.confusions if mine in (pair.first, pair.second)]
+    lines = []
+    for pair in found[:3]:
+        other = pair.second if pair.first == mine else pair.first
+        helps = f"; {pair.sensor} would separate them" if pair.sensor else ""
+        lines.append(f"With the present sensors {mine} is hard to tell from {other}{helps}.")
+    return lines
+
+
+def confusion_sheet(facts: MonitorFacts) -> Sheet:
+    """Faults that cannot be told apart, the worst pairs first."""
+    rows: list[tuple[Value, ...]] = [
+        (pair.first, pair.second, pair.error, pair.sensor or MISSING, pair.sensor_error) for pair in facts.confusions
+    ]
+    share = figures([], decimals=2)
+    heads = (
+        Column("Fault"), Column("Not told apart from"), Column("Error between the two", "", share),
+        Column("Further sensor that separates them"), Column("Error with it", "", share),
+    )  # fmt: skip
+    return Sheet("confusions", "Faults that cannot be told apart with the present sensors", heads, tuple(rows))
+
+
+def provenance_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Where a run comes from, as name and text."""
+    names = (
+        ("Monitor", "monitor"), ("Logs", "logs"), ("Written", "created"), ("Command", "command"),
+        ("EDP", "edp_version"),
+    )  # fmt: skip
+    return [(name, str(content[key])) for name, key in names if content.get(key)]

@@ -1,0 +1,196 @@
+"""The dictionary of a monitor: faults simulated on the user's machine, seen through the monitor."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.config.monitor import AUTOMATIC, NO_MACHINE, DictionarySpec
+from edp.errors import ConfigError, DataError
+from edp.monitor.diagnosis.causes import FaultClass
+from edp.monitor.diagnosis.evidence import ONSET, mean_features, parts_of
+from edp.monitor.diagnosis.learning import SimulatedFault, fit_dictionary
+from edp.monitor.diagnosis.signatures import Dictionary
+from edp.monitor.monitor import Monitor
+from edp.recording import MACHINE, Recording
+from edp.sim.machine.machine_files import machine_names
+from edp.workflows.monitor.fault_sessions import (
+    FaultSession,
+    cases_of,
+    fault_classes,
+    mirrors,
+    noise_of,
+    simulated,
+    with_noise,
+)
+
+Array = NDArray[np.float64]
+HEALTHY_SESSIONS = 30
+"""From which the scatter of healthy means is taken; more change little."""
+QUIET = ("CylStroke_1", "CylStroke_2", "CylStroke_3", "PumpPressure_1", "PumpPressure_2", "OilTemperature")
+"""Channels that the simulator shows without noise: theirs is taken from the healthy logs."""
+FURTHER = (
+    *QUIET,
+    *(f"JointAngle_{axis}" for axis in (1, 2, 3)),
+    *(f"PumpDisplacement_{pump}" for pump in (1, 2)),
+    *(f"SpoolPos_{spool}" for spool in range(1, 7)),
+)
+"""Channels that a machine may have sensors for, beyond Table A.1."""
+Note = Callable[[str, int, int], None]
+
+
+def machine_of(spec: DictionarySpec, recordings: Sequence[Recording]) -> str:
+    """The machine to simulate: that of the settings, or the one that all logs name; empty for none."""
+    if spec.machine == NO_MACHINE:
+        return ""
+    if spec.machine != AUTOMATIC:
+        return spec.machine
+    named = {str(recording.meta.get(MACHINE, "")) for recording in recordings}
+    only = next(iter(named)) if len(named) == 1 else ""
+    # A name of a file that came with a log is not followed to wherever it leads.
+    return only if only in machine_names() else ""
+
+
+def build_dictionary(
+    monitor: Monitor,
+    healthy: Sequence[Recording],
+    machine: str,
+    spec: DictionarySpec,
+    seed: int = 0,
+    note: Note | None = None,
+) -> Dictionary:
+    """Simulate every fault at every site and size on a machine and learn what the monitor sees of it.
+
+    The same seed gives the same dictionary, unless the time allows fewer draws; it says how many there were.
+
+    Args:
+        monitor: fitted.
+        healthy: sessions that its networks were not fitted to.
+        machine: name or file.
+        spec: how.
+        seed: root of every random choice.
+        note: called with what is done, how much of it is, and how much there is.
+
+    Raises:
+        ConfigError: a machine that lacks the monitor's channels.
+        DataError: too few healthy sessions.
+    """
+    began = time.process_time()
+    rows = [monitor.conditioned_rows(session) for session in healthy[:HEALTHY_SESSIONS]]
+    rows = [part[np.isfinite(part).any(axis=1)] for part in rows]
+    if not rows:
+        raise DataError("a dictionary needs healthy sessions that no network was fitted to; bring more")
+    classes = fault_classes(spec.kinds or None)
+    plan = _Plan(machine, (spec.before_s, spec.after_s), seed, _missing_noise(monitor, healthy, machine, seed))
+    faults: list[SimulatedFault] = []
+    draws = 0
+    for draw in range(spec.draws):
+        spent = time.process_time() - began
+        if draw >= 2 and spent * (draw + 1) / draw > 60.0 * spec.minutes:
+            break
+        faults += _draw(monitor, classes, plan, draw, note)
+        draws += 1
+    provenance: dict[str, Any] = {
+        "machine": machine, "seed": seed, "draws": draws, "sessions": len(faults),
+        "seconds_each": spec.before_s + spec.after_s, "processor_s": round(time.process_time() - began, 1),
+    }  # fmt: skip
+    return fit_dictionary(monitor.summary_names, classes, faults, rows, provenance, seed)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What all draws share: machine, seconds before and after the onset, seed, noise by channel."""
+
+    machine: str
+    seconds: tuple[float, float]
+    seed: int
+    added: dict[str, float]
+
+
+def _draw(
+    monitor: Monitor, classes: Sequence[FaultClass], plan: _Plan, draw: int, note: Note | None
+) -> list[SimulatedFault]:
+    """All sessions of one draw, each less its sound twin."""
+    before = plan.seconds[0]
+    further = [name for name in FURTHER if name not in monitor.inputs]
+    total, mirrored = len(cases_of(classes)), mirrors(classes)
+    sound: dict[int, tuple[Array, dict[str, Array]]] = {}
+    faults: list[SimulatedFault] = []
+    done = 0
+    for session in simulated(classes, plan.machine, plan.seconds, (plan.seed, draw), monitor.rate_hz):
+        noisy = with_noise(session.recording, plan.added, [plan.seed, draw, session.base])
+        seen = _after(monitor, noisy, before), _shown(session, further, before)
+        if session.fault < 0:
+            sound[session.base] = seen
+            continue
+        features, sensors = sound[session.base]
+        change = np.nan_to_num(seen[0] - features, nan=0.0)
+        shown = {name: seen[1][name] - sensors[name] for name in further}
+        faults.append(SimulatedFault(draw, session.fault, session.size, change, shown))
+        done += 1
+        if session.fault in mirrored:
+            faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirrored(change), shown))
+        if note is not None:
+            note(f"faults on {plan.machine}, draw {draw + 1}", done, total)
+    return _standardised(faults, sound)
+
+
+def _mirrored(change: Array) -> Array:
+    """The change by a fault of the other sign: means change their sign, sizes do not."""
+    means, sizes = np.split(change, 2, axis=1)
+    return np.concatenate([-means, sizes], axis=1)
+
+
+def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
+    """Mean features of the blocks at an onset and of those after it, shape (2, features)."""
+    rows = monitor.conditioned_rows(recording)
+    at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
+    if at is None or after is None:
+        raise ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {monitor.block_s:g} s")
+    return np.stack([mean_features(at), mean_features(after)])
+
+
+def _shown(session: FaultSession, names: Sequence[str], onset_s: float) -> dict[str, Array]:
+    """What further channels show after an onset: level, width and how fast they change."""
+    shown = {}
+    first = round(onset_s * session.recording.rate_hz)
+    for name in names:
+        values = session.recording.column(name)[first:].astype(np.float64)
+        shown[name] = np.array([values.mean(), values.std(), np.abs(np.diff(values)).mean()])
+    return shown
+
+
+def _standardised(
+    faults: Sequence[SimulatedFault], sound: dict[int, tuple[Array, dict[str, Array]]]
+) -> list[SimulatedFault]:
+    """Changes of further channels over how widely they scatter between sound sessions."""
+    names = sorted(next(iter(sound.values()))[1])
+    width = {name: np.std([sensors[name] for _, sensors in sound.values()], axis=0) for name in names}
+    return [
+        SimulatedFault(
+            fault.draw, fault.owner, fault.size, fault.change,
+            {name: fault.sensors[name] / np.maximum(width[name], 1e-12) for name in names},
+        )
+        for fault in faults
+    ]  # fmt: skip
+
+
+def _missing_noise(monitor: Monitor, healthy: Sequence[Recording], machine: str, seed: int) -> dict[str, float]:
+    """Noise that healthy logs have on channels which the simulator shows without."""
+    names = [name for name in QUIET if name in monitor.inputs]
+    session = next(simulated((), machine, (0.0, 60.0), (seed, 0), monitor.rate_hz)).recording
+    lacking = [name for name in monitor.inputs if name not in session.channel_names]
+    if len(lacking) == len(monitor.inputs):
+        raise ConfigError(
+            f"dictionary: the simulated machine '{machine}' has none of the monitor's channels, such as "
+            f"'{lacking[0]}'; map the logs to the names of Table A.1, or leave the dictionary out (--machine none)"
+        )
+    shown = noise_of(session, names)
+    logs = [noise_of(recording, names) for recording in healthy[:8]]
+    real = {name: float(np.median([sizes[name] for sizes in logs])) for name in names}
+    return {name: float(np.sqrt(max(real[name] ** 2 - shown[name] ** 2, 0.0))) for name in names}
