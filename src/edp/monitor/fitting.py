@@ -86,6 +86,15 @@ class ChainSpec:
 
 
 @dataclass(frozen=True, eq=False)
+class SessionBlocks:
+    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
+
+    name: str
+    summaries: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
 class FittedChain:
     """What came of it.
 
@@ -93,20 +102,13 @@ class FittedChain:
         chain: on all sessions that were kept.
         limit: from sessions that the judging parts were not fitted to.
         doubtful: names of sessions that were left out.
+        sessions: blocks of those that were not.
     """
 
     chain: MonitorChain
     limit: AlarmLimit
     doubtful: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class SessionBlocks:
-    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
-
-    name: str
-    summaries: Array
-    points: Array
+    sessions: tuple[SessionBlocks, ...]
 
 
 def fit_chain(
@@ -181,7 +183,7 @@ def fit_from_blocks(
     limit = calibrated(bank, [_padded(part, bank) for part in white], blocks_per_s, promised_hours)
     quiet = _quiet(bank, [_padded(part, bank) for part in white])
     chain = MonitorChain(summaries, conditioning, drift, watches, limit.limit, quiet, settle)
-    return FittedChain(chain, limit, doubtful)
+    return FittedChain(chain, limit, doubtful, tuple(remaining))
 
 
 def _widths_of(watches: Sequence[Watch]) -> BankSpec:
@@ -221,21 +223,44 @@ def _without_doubtful(
     spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int
 ) -> tuple[list[SessionBlocks], tuple[str, ...]]:
     """Sessions without those whose means lie far from all others, and the names of those."""
-    # As they are: what is usual at an operating point would be learned from the doubtful sessions, too.
-    means = np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in sessions])
-    middle = np.median(means, axis=0)
-    width = 1.4826 * np.median(np.abs(means - middle), axis=0)
-    # A summary that hardly varies between sessions would make every one stand out.
-    width = np.maximum(width, 0.02 + 1e-3 * np.abs(middle))
-    worst = (np.abs(means - middle) / width).max(axis=1)
-    # Healthy sessions differ as well: what is doubtful stands far out among their own largest deviations.
-    usual = float(np.median(worst))
-    bad = worst > spec.doubtful * usual
-    # A fifth at most: where more stand out, they are not exceptions.
-    if bad.sum() > len(sessions) // 5:
-        bad &= worst >= np.sort(worst)[-max(1, len(sessions) // 5)]
+    bad = _doubtful(spec, sessions, sessions, settle)
     remaining = [session for session, out in zip(sessions, bad, strict=True) if not out]
     return remaining, tuple(session.name for session, out in zip(sessions, bad, strict=True) if out)
+
+
+def doubtful_sessions(
+    fitted: FittedChain,
+    spec: ChainSpec,
+    sources: Sequence[ResidualSource],
+    channels: Sequence[Channel],
+    sessions: Sequence[Recording],
+) -> tuple[str, ...]:
+    """Names of further sessions whose means lie far from those that a chain was fitted to, such as of the training."""
+    chain = fitted.chain
+    blocks = [blocks_of(chain.summaries, sources, channels, session) for session in sessions]
+    bad = _doubtful(spec, blocks, fitted.sessions, chain.settle)
+    return tuple(block.name for block, out in zip(blocks, bad, strict=True) if out)
+
+
+def _doubtful(
+    spec: ChainSpec, sessions: Sequence[SessionBlocks], usual: Sequence[SessionBlocks], settle: int
+) -> NDArray[np.bool_]:
+    """Which sessions have means far from the usual ones."""
+    # As they are: what is usual at an operating point would be learned from the doubtful sessions, too.
+    means, others = (
+        np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in part])
+        for part in (sessions, usual)
+    )
+    middle = np.median(others, axis=0)
+    width = 1.4826 * np.median(np.abs(others - middle), axis=0)
+    # A summary that hardly varies between sessions would make every one stand out.
+    width = np.maximum(width, 0.02 + 1e-3 * np.abs(middle))
+    worst, usual_worst = ((np.abs(part - middle) / width).max(axis=1) for part in (means, others))
+    # Healthy sessions differ as well: what is doubtful stands far out among their own largest deviations.
+    bad = worst > spec.doubtful * float(np.median(usual_worst))
+    # A fifth at most: where more stand out, they are not exceptions.
+    most = max(1, len(sessions) // 5)
+    return np.asarray(bad & (worst >= np.sort(worst)[-most]), dtype=bool)
 
 
 def fit_summaries(
