@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.errors import DataError
 from edp.monitor.calibration import AlarmLimit, calibrated
 from edp.monitor.detectors import CusumSpec, EwmaSpec
 from edp.monitor.detectors.base import DetectorSpec, alarms
@@ -32,7 +33,7 @@ PYOD = {
     "CBLOF": {"random_state": 0},
 }
 """Detectors that are tried, with options where the defaults are random or of one component."""
-MOST_ROWS = 8_000
+MOST_ROWS = 5_000
 """Blocks that a PyOD detector is fitted to: neighbours of more take hours."""
 CHARTS: dict[str, DetectorSpec] = {"ewma": EwmaSpec(), "cusum": CusumSpec(slack=0.25)}
 
@@ -42,6 +43,16 @@ def blocks_of(values: NDArray[np.float32], ticks: int) -> Floats:
     whole = len(values) // ticks * ticks
     blocks = values[:whole].astype(float).reshape(-1, ticks, values.shape[1])
     return np.concatenate([blocks.mean(axis=1), blocks.std(axis=1)], axis=1)
+
+
+def white_of(sessions: Sequence[Floats]) -> Whitening:
+    """Whitening; where there are too few rows for a covariance, each column is scaled alone."""
+    try:
+        return Whitening.fit(sessions)
+    except DataError:
+        rows = np.concatenate(list(sessions))
+        size = rows.std(axis=0)
+        return Whitening(rows.mean(axis=0), np.diag(1.0 / np.where(size > 0.0, size, 1.0)))
 
 
 class Rival(ABC):
@@ -67,7 +78,7 @@ class OfBlocks(Rival):
         self.mean, size = rows.mean(axis=0), rows.std(axis=0)
         self.size = np.where(size > 0.0, size, 1.0)
         self.learn((rows - self.mean) / self.size)
-        self.white = Whitening.fit([self.scores((blocks - self.mean) / self.size) for blocks in raw])
+        self.white = white_of([self.scores((blocks - self.mean) / self.size) for blocks in raw])
 
     def rows(self, values: NDArray[np.float32]) -> Floats:
         """See `Rival.rows`."""
@@ -129,16 +140,17 @@ class Linear(Rival):
     def __init__(self, steps: int) -> None:
         self.steps = steps
 
-    def _past(self, values: NDArray[np.float32]) -> tuple[Floats, Floats]:
-        scaled = (values - self.mean) / self.size
+    def _past(self, values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        # In single precision: hours at 100 Hz are many rows.
+        scaled = ((values - self.mean) / self.size).astype(np.float32)
         first, last = max(self.LAGS), len(scaled) - self.steps
         past = np.concatenate([scaled[first - lag : last - lag] for lag in self.LAGS], axis=1)
-        return np.concatenate([past, np.ones((len(past), 1))], axis=1), scaled[first + self.steps :]
+        return np.concatenate([past, np.ones((len(past), 1), np.float32)], axis=1), scaled[first + self.steps :]
 
     def _residual_blocks(self, values: NDArray[np.float32]) -> Floats:
         past, wanted = self._past(values)
         residuals = np.zeros((len(values), values.shape[1]))
-        residuals[len(values) - len(past) :] = wanted - past @ self.weights
+        residuals[len(values) - len(past) :] = wanted - past @ self.weights.astype(np.float32)
         blocks = blocks_of(residuals, self.ticks)
         width = values.shape[1]
         return np.concatenate([blocks[:, :width], np.log(blocks[:, width:] + 1e-6)], axis=1)
@@ -159,7 +171,7 @@ class Linear(Rival):
             product += past.T @ wanted
             count += len(past)
         self.weights = np.linalg.solve(square + self.RIDGE * count * np.eye(width), product)
-        self.white = Whitening.fit([self._residual_blocks(values) for values in sessions[half:] or sessions])
+        self.white = white_of([self._residual_blocks(values) for values in sessions[half:] or sessions])
 
     def rows(self, values: NDArray[np.float32]) -> Floats:
         """See `Rival.rows`."""
