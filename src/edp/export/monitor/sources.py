@@ -32,12 +32,12 @@ static void {own}_residuals({name}_state *s) {{
 AHEAD = """
 /* Predictions wait in a ring until what they are about is measured. */
 static void {own}_residuals({name}_state *s) {{
-    {model}_output out;
-{hold}    const bool known = {model}_step(&s->{own}, s->{own}_in, &out) <= EDP_WARMING;
+    {model}_output *const out = &s->{own}_out;
+{hold}    const bool known = {model}_step(&s->{own}, s->{own}_in, out) <= EDP_WARMING;
     for (uint32_t i = 0; i < {residuals}u; i++) {{
         const uint32_t back = (s->{own}_at + {length}u - {own}_delays[i]) % {length}u;
         const bool due = s->{own}_seen >= {own}_delays[i];
-        s->{own}_past[s->{own}_at][i] = known ? (&out.prediction[0][0])[{own}_results[i]] : (float)edp_unknown();
+        s->{own}_past[s->{own}_at][i] = known ? (&out->prediction[0][0])[{own}_results[i]] : (float)edp_unknown();
 {width}        s->residuals[{first}u + i] = due ? {value} : (float)edp_unknown();
     }}
     s->{own}_at = (s->{own}_at + 1u) % {length}u;
@@ -45,7 +45,7 @@ static void {own}_residuals({name}_state *s) {{
 }}
 """
 WIDTH = """\
-        const float half = 0.5f * ((&out.upper[0][0][0])[{own}_results[i]] - (&out.lower[0][0][0])[{own}_results[i]]);
+        const float half = 0.5f * ((&out->upper[0][0][0])[{own}_results[i]] - (&out->lower[0][0][0])[{own}_results[i]]);
         s->{own}_width[s->{own}_at][i] = (half > {least}) ? half : {least};
 """
 TWIN = """
@@ -145,6 +145,7 @@ class NetworkCode:
     def fields(self) -> list[str]:
         """See `SourceCode`."""
         lines = [f"{self.prefix}_state {self.own};", f"float {self.own}_in[{len(self.part.reads)}];"]
+        lines += [f"{self.prefix}_output {self.own}_out; /* to be read: what the network said last */"]
         if self.ahead:
             lines += [f"uint32_t {self.own}_at;", f"uint32_t {self.own}_seen;"]
             rings = ("past", "width") if self.part.scaled else ("past",)
