@@ -5,14 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edp.control.fmu.environment import FmuEnvironment
 from edp.control.twin_environment import TwinEnvironment
 from edp.errors import ConfigError
 from edp.networks.twin import Twin
 from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
-from edp.training.twin_bundle import load_twin
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_files import load_machine
+from edp.training.twin_bundle import STROKES, load_twin
 
 FMU = ".fmu"
+SAME_STROKE = 0.01
+"""Share by which a stroke may differ from that of a twin's machine: measured machine files do."""
 
 
 def is_fmu(plant: str | Path) -> bool:
@@ -41,16 +47,33 @@ def plant_of(
         if not trusted:
             raise ConfigError(f"FMU '{plant}' is native code, which runs with your rights; pass trusted=True if you do")
         return FmuEnvironment(plant, machine, duration_s, rate_hz)
-    return TwinEnvironment(twin_of(plant, rate_hz), machine, duration_s)
+    return TwinEnvironment(twin_of(plant, load_machine(machine), rate_hz), machine, duration_s)
 
 
-def twin_of(run: str | Path, rate_hz: float) -> Twin:
+def twin_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -> Twin:
     """The twin of a run folder.
 
+    Args:
+        run: folder.
+        machine: that it is to be a twin of.
+        rate_hz: that it must have; None for any.
+
     Raises:
-        EdpError: there is none, or it is of another rate.
+        EdpError: there is none, it learned from a machine with other cylinders, or it is of another rate.
     """
-    return of_rate(load_twin(run).twin, f"twin '{run}'", rate_hz)
+    bundle = load_twin(run)
+    theirs, ours = bundle.provenance.get(STROKES), np.array(machine.cylinders.stroke)
+    # Logs of real machines do not say it.
+    if isinstance(theirs, list) and all(isinstance(m, int | float) for m in theirs):
+        known = np.array(theirs, float)
+        if known.shape != ours.shape or not np.allclose(known, ours, rtol=SAME_STROKE):
+            said = [", ".join(f"{m:.3f}" for m in strokes) for strokes in (known, ours)]
+            raise ConfigError(
+                f"twin '{run}' learned from a machine whose cylinders have strokes of {said[0]} m, those of "
+                f"{machine.name} have {said[1]} m; name its machine with --machine, or let it go on with "
+                "recordings of this one: edp twin LOGS --start RUN"
+            )
+    return bundle.twin if rate_hz is None else of_rate(bundle.twin, f"twin '{run}'", rate_hz)
 
 
 def of_rate(twin: Twin, what: str, rate_hz: float) -> Twin:

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.control.geometry import AXES
+from edp.control.limits import LoopLimits
 from edp.control.plant import VELOCITIES, PlantInterface
+from edp.control.reference import TipReference
 from edp.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -26,6 +28,9 @@ BEGINS = 0.15
 MOVES_M_S = 0.003
 """Mean speed above which a lever moves its cylinder: three times what sensors show at rest."""
 SIDES = (1.0, -1.0)
+CYLINDERS = ("boom", "arm", "bucket")
+NEARLY = 0.8
+"""Share of a reference's speed that levers must give: the map is of mid stroke, elsewhere loads change it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +59,30 @@ class ValveMap:
         side = 0 if lever > 0.0 else 1
         # Below the first position lies the dead band, where the speed is that of the first: zero.
         return float(SIDES[side] * np.interp(abs(lever), self.levers[axis, side], self.speeds[axis, side]))
+
+
+def check_levers(valves: ValveMap, reference: TipReference, limits: LoopLimits) -> None:
+    """Refuse limits of the levers with which a cylinder cannot be nearly as fast as its reference.
+
+    Args:
+        valves: of the plant.
+        reference: that is to be followed.
+        limits: of the levers.
+
+    Raises:
+        ConfigError: names cylinder, speeds and limit.
+    """
+    speeds = reference.speeds()
+    for axis, cylinder in enumerate(CYLINDERS):
+        for side, (name, ends) in enumerate((("lever_high", limits.lever_high), ("lever_low", limits.lever_low))):
+            asked = float((SIDES[side] * speeds[:, axis]).max())
+            given = abs(valves.speed(axis, ends[axis]))
+            # At full levers the reference was held to the cylinder's top speed when it was drawn.
+            if abs(ends[axis]) < 1.0 and asked > max(MOVES_M_S, given / NEARLY):
+                raise ConfigError(
+                    f"limits: {name} = {ends[axis]:g} of the {cylinder} gives {given:.3f} m/s, its reference asks for "
+                    f"{asked:.3f}; allow more, or choose a slower task (task.speed_m_s)"
+                )
 
 
 def measure_valve_map(env: Any, plant: PlantInterface, seed: int = 0) -> ValveMap:
@@ -102,7 +131,7 @@ def map_of_speeds(levels: Array, measured: Array, source: str) -> ValveMap:
             still = np.flatnonzero(measured[axis, side] <= MOVES_M_S)
             first = int(still[-1]) + 1 if len(still) else 0
             if not len(moving) or first >= len(levels):
-                name, way = ("boom", "arm", "bucket")[axis], ("extends", "retracts")[side]
+                name, way = CYLINDERS[axis], ("extends", "retracts")[side]
                 raise ConfigError(f"{source}: no lever position {way} the {name}; a valve map cannot be measured")
             rising = np.maximum.accumulate(measured[axis, side, first:])
             band = _end_of_dead_band(levels, rising, first)

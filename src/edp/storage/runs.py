@@ -24,6 +24,9 @@ from edp.storage.writing import make_folder, remove_unfinished, write_bytes, wri
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
 """Libraries whose versions can change a result."""
+IDENTITY = "run.json"
+LEFT = (".lock", "config.toml")
+"""What a run that was killed before it was bound to its folder leaves there."""
 PARTS = "parts"
 """Folder of a run in which its single trainings stand, where it has several."""
 
@@ -90,7 +93,7 @@ class RunFolder:
         Raises:
             StorageError: the folder holds a run with other settings, data or code version.
         """
-        identity = self.file("run.json")
+        identity = self.file(IDENTITY)
         if identity.exists():
             stored_identity = read_object(identity, ("key",))
             if stored_identity["key"] != key:
@@ -123,6 +126,29 @@ class RunFolder:
         """Write all epochs so far, a JSON line each."""
         check_held(self.file(".lock"), self._lock)
         write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def check_free(path: str | Path, what: str) -> None:
+    """Refuse a folder in which a new run would lie among the files of something else.
+
+    Args:
+        path: of a run folder to be: absent, empty, that of a run, or what a killed run left.
+        what: the command, for the message.
+
+    Raises:
+        StorageError: it is a file, or holds something and no run.
+    """
+    folder = Path(path)
+    if not folder.exists() or (folder / IDENTITY).is_file():
+        return
+    if not folder.is_dir():
+        raise StorageError(f"'{folder}' is a file; {what} writes a folder: choose another name")
+    others = sorted(entry.name for entry in folder.iterdir() if entry.name not in LEFT)
+    if others:
+        raise StorageError(
+            f"folder '{folder}' is not empty and holds no run ('{others[0][:60]}'); nothing was changed. Choose a new "
+            f"or empty folder for {what}"
+        )
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,8 @@ READABLE = (1, 2)
 HEADER = "twin.json"
 PARTS = ("commands", "velocities", "strokes", "pressures")
 RATE = above(0.0, 1e6)
+STROKES = "full_strokes_m"
+"""In the metadata of simulated recordings, and in the provenance of a twin that learned from them."""
 _TREE = SettingsTree({"twin": TWINS}, what="twin")
 
 

@@ -104,6 +104,9 @@ def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, tw
         (("--controller", "inversion", "--predictor", "nowhere"), "there is no such folder"),
         (("--set", "task.slope=3"), "unknown key 'task.slope'"),
         (("--set", "task.limits.lever_low=[0,0,0]", "--set", "task.limits.lever_high=[0,1,1]"), "boom are both 0"),
+        (("--set", "task.limits.stroke_margin=0.4"), "margin >= stroke_margin must hold"),
+        (("--set", "task.limits.lever_high=[1,0.1,1]"), "limits: lever_high = 0.1 of the arm gives 0.000 m/s"),
+        (("--set", "task.limits.pressure_pa=1e5"), "but the machine rests with CylPressures_1 at"),
         (("--set", "controller.proportional=-1"), "0 <= proportional <= 100 must hold"),
         (("--set", "task.length_m=[20,30]"), "none of 200 draws can be done"),
         (("--plant", "nowhere"), "nowhere"),
@@ -123,6 +126,17 @@ def test_a_twin_of_another_rate_or_a_soil_is_refused(edp, tmp_path, twin_run):
     assert "a twin knows no soil" in " ".join(ended.err.split())
 
 
+def test_a_twin_of_another_machine_is_refused(edp, tmp_path):
+    bundle = TwinBundle(TWINS["static"](), sample_excavator_twin(), {"full_strokes_m": [1.0, 1.0, 0.915]})
+    save_twin(bundle, tmp_path / "c14" / "twin")
+    for words in (("--controller", "inversion", "--twin"), ("--plant",)):
+        ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE, *words, tmp_path / "c14")
+        assert ended.code == 1
+        said = " ".join(ended.err.split())
+        assert "strokes of 1.000, 1.000, 0.915 m, those of M22 have 1.260, 1.504, 1.104 m" in said
+        assert not (tmp_path / "run").exists()
+
+
 def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):
     run = tmp_path / "run"
     assert edp("control", run, "--seeds", 1, *LINE).code == 0
@@ -131,6 +145,17 @@ def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):
     assert ended.code == 1
     assert "another run" in ended.err
     assert (run / "results.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["control", "tune"])
+def test_a_folder_with_other_files_is_left_as_it_is(edp, tmp_path, command):
+    kept = tmp_path / "thesis.txt"
+    kept.write_text("mine")
+    ended = edp(command, tmp_path, "--seeds", 1, *LINE)
+    assert ended.code == 1
+    assert "is not empty and holds no run ('thesis.txt'); nothing was changed" in " ".join(ended.err.split())
+    assert [file.name for file in tmp_path.iterdir()] == [kept.name]
+    assert "is a file" in " ".join(edp(command, kept, "--seeds", 1, *LINE).err.split())
 
 
 @pytest.mark.parametrize(

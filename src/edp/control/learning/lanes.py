@@ -18,6 +18,7 @@ from edp.control.twin_environment import TIP, TwinEnvironment, TwinStart, check_
 from edp.errors import ConfigError
 from edp.networks.twin import Twin, TwinState
 from edp.sim.environment import ExcavatorEnv, VectorExcavatorEnv
+from edp.sim.machine.machine_files import load_machine
 
 Array = NDArray[np.float64]
 
@@ -198,4 +199,4 @@ def _twin(spec: LearningSpec) -> Twin:
     """
     if isinstance(spec.plant, Twin):
         return of_rate(spec.plant, "the twin", spec.rate_hz)
-    return twin_of(str(spec.plant), spec.rate_hz)
+    return twin_of(str(spec.plant), load_machine(spec.machine), spec.rate_hz)

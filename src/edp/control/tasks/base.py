@@ -80,6 +80,11 @@ class TaskSpec(ABC):
             margin=below(0.0, 0.5),
         )
         LAWS[self.law]
+        if self.margin < self.limits.stroke_margin:
+            raise ConfigError(
+                f"task: margin = {self.margin:g} lets references go where limits.stroke_margin = "
+                f"{self.limits.stroke_margin:g} does not; margin >= stroke_margin must hold"
+            )
 
     @abstractmethod
     def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:

@@ -11,15 +11,14 @@ import numpy as np
 
 from edp.config.control import ControlExperiment
 from edp.control.controllers import ControllerSpec
-from edp.control.loop import LoopResult, run_loop
+from edp.control.loop import LoopResult, run_loop, start_options
 from edp.control.models import ControlModels
 from edp.control.plant import interface_of
-from edp.control.plants import plant_of
+from edp.control.plants import plant_of, twin_of
 from edp.control.tasks import draw_task
-from edp.control.valve_map import RUN_S, ValveMap, measure_valve_map
+from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_map
 from edp.errors import ConfigError
 from edp.training.bundle import load_bundle
-from edp.training.twin_bundle import load_twin
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class ControlBench:
         valve_map: ValveMap | None = None
         if "valve_map" in self.experiment.controller.needs:
             valve_map = measure_valve_map(probe, self.plant, self.experiment.seed)
-        twin = None if sources.twin is None else load_twin(sources.twin).twin
+        twin = None if sources.twin is None else twin_of(sources.twin, self.plant.geometry.machine)
         predictor = None if sources.predictor is None else load_bundle(_bundle_of(sources.predictor))
         return ControlModels(valve_map, twin, predictor)
 
@@ -108,12 +107,24 @@ class ControlBench:
         return results
 
     def check(self) -> None:
-        """Build the controller of the experiment, for its refusal only.
+        """Build the controller of the experiment and hold its limits to references and plant, for a refusal only.
 
         Raises:
-            ConfigError: plant and controller do not fit, or a model is missing.
+            ConfigError: plant and controller do not fit, a model is missing, or limits contradict what is asked.
         """
         self.experiment.controller.build(self.plant, self.tasks[0].limits, self.models)
+        for task in self.tasks:
+            if self.models.valve_map is not None:
+                check_levers(self.models.valve_map, task.reference, task.limits)
+        first = self.tasks[0]
+        options = {**start_options(first, self.plant.geometry), **(self._options or {})}
+        row = np.asarray(self._env.reset(seed=first.seed, options=options)[0], float)
+        for channel, value in zip(self.plant.channels, row, strict=True):
+            if channel.name.startswith("CylPressures_") and value > first.limits.pressure_pa:
+                raise ConfigError(
+                    f"limits: pressure_pa = {first.limits.pressure_pa:g} Pa, but the machine rests with "
+                    f"{channel.name} at {value:.3g} Pa; allow more"
+                )
 
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""

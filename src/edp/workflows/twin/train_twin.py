@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,14 @@ from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import MOST_MEMBERS
+from edp.recording import Recording
 from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FittedTwin, FreeRunProgress
-from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
+from edp.training.twin_bundle import STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
@@ -103,7 +104,7 @@ def train_twin(
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         tell("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
-        provenance = _provenance(source, experiment, data, fitted) | result.facts
+        provenance = _provenance(source, experiment, data, fitted) | _machine(recordings) | result.facts
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
         write_scores(run.path, scores, runs, intervals)
@@ -145,6 +146,12 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
         "seconds": round(fitted.seconds, 2),
         "data": {"source": str(source.path), "reader": source.to_plain(), "digest": data.digest, "names": parts},
     }
+
+
+def _machine(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
+    said = {tuple(recording.meta[STROKES]) for recording in recordings if STROKES in recording.meta}
+    return {STROKES: list(said.pop())} if len(said) == 1 else {}
 
 
 __all__ = ["FOLDER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]
