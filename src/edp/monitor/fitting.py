@@ -54,7 +54,8 @@ class ChainSpec:
         folds: parts into which sessions are dealt; what judges a session was fitted without its part.
         drift_per_hour: of the level of a summary that is followed, in healthy standard deviations.
         most_drift: of them together.
-        doubtful: of a session's own mean, over that of other sessions, beyond which it is left out and named.
+        doubtful: largest deviation of a session's means, over the usual largest one, beyond which it is left out and
+            named.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -174,7 +175,8 @@ def fit_from_blocks(
         own = [Watch(w.detector, w.mean, w.matrix, s.scale) for w, s in zip(own, watches, strict=True)]
         for i in range(fold, len(kept), spec.folds):
             rows[i] = _conditioned(own_conditioning, drift, kept[i], settle)
-            white[i] = np.concatenate([watch(rows[i][settle:]) for watch in own], axis=1)
+            # The start of a session is operating time: its rows are missing, and count as healthy.
+            white[i] = np.concatenate([watch(rows[i]) for watch in own], axis=1)
     bank = _widths_of(watches)
     limit = calibrated(bank, [_padded(part, bank) for part in white], blocks_per_s, promised_hours)
     quiet = _quiet(bank, [_padded(part, bank) for part in white])
@@ -219,11 +221,12 @@ def _without_doubtful(
     spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int
 ) -> tuple[list[SessionBlocks], tuple[str, ...]]:
     """Sessions without those whose means lie far from all others, and the names of those."""
-    conditioning = _conditioning(spec, sessions, settle)
-    means = np.stack([np.nanmean(conditioning(s.summaries, s.points)[settle:], axis=0) for s in sessions])
-    means = np.nan_to_num(means)
+    # As they are: what is usual at an operating point would be learned from the doubtful sessions, too.
+    means = np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in sessions])
     middle = np.median(means, axis=0)
-    width = np.maximum(1.4826 * np.median(np.abs(means - middle), axis=0), 0.02)
+    width = 1.4826 * np.median(np.abs(means - middle), axis=0)
+    # A summary that hardly varies between sessions would make every one stand out.
+    width = np.maximum(width, 0.02 + 1e-3 * np.abs(middle))
     worst = (np.abs(means - middle) / width).max(axis=1)
     # Healthy sessions differ as well: what is doubtful stands far out among their own largest deviations.
     usual = float(np.median(worst))

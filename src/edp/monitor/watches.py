@@ -78,10 +78,15 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
     Raises:
         DataError: too few rows.
     """
-    blocks = max(1, round(spec.memory_s * blocks_per_s))
+    usual = int(np.median([len(session) - settle for session in sessions])) if sessions else 0
+    # A quarter of a session at most: of longer averages there would be too few.
+    blocks = max(1, min(round(spec.memory_s * blocks_per_s), usual // 4))
     rows = np.concatenate([_averaged(np.nan_to_num(session[settle:]), blocks) for session in sessions])
-    if len(rows) < 2 * blocks + 8:
-        raise DataError(f"{len(rows)} averages over {blocks} blocks are too few for a covariance; bring more hours")
+    if len(rows) < LEAST_ROWS:
+        raise DataError(
+            f"{len(rows)} averages over {blocks} blocks are too few for a covariance; {LEAST_ROWS} at least must hold: "
+            "bring more hours"
+        )
     mean = rows.mean(axis=0)
     centred = rows - mean
     covariance = centred.T @ centred / len(rows)
@@ -171,5 +176,7 @@ def scaled_alike(watches: Sequence[Watch], sessions: Sequence[Array], settle: in
     return tuple(result)
 
 
+LEAST_ROWS = 16
+"""Of averages that a covariance is taken of; the diagonal that is mixed in stands for what they do not tell."""
 EAGER = 0.8
 """Of the largest statistics of healthy sessions: where watches are made equal."""

@@ -42,7 +42,8 @@ class Balances(ResidualSource):
     """Levels less the integrals of their rates, where what is older than `memory_s` fades.
 
     With d[t] = x[t] - x[t-1] - gain v[t] dt the residual is e[t] = left e[t-1] + d[t], left = 1 - dt / memory_s: a
-    leaky sum has no drift, and a step of the level stays visible for `memory_s`.
+    leaky sum has no drift, and a step of the level stays visible for `memory_s`. At a tick at which level or rate is
+    missing, or the level was missing at the tick before, d is 0: what happened meanwhile is not known.
 
     Args:
         inputs: raw channels, SI units.
@@ -75,10 +76,11 @@ class Balances(ResidualSource):
 
     def _start(self, streams: int) -> Any:
         # None until the first tick, which has no change.
-        return None, np.zeros((streams, len(self.names)))
+        none = np.zeros((streams, len(self.names)))
+        return None, none, none.astype(bool)
 
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
-        before, residual = own
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
+        before, residual, known_before = own
         levels = rows[..., self.pairs[:, 0]].astype(np.float64)
         rates = rows[..., self.pairs[:, 1]].astype(np.float64)
         first = before is None
@@ -87,12 +89,15 @@ class Balances(ResidualSource):
         if first:
             steps[:, 0] = 0.0
         change = np.diff(levels, axis=1, prepend=before[:, None]) - steps
+        known = there[..., self.pairs[:, 0]]
+        earlier = np.concatenate([(known[:, 0] if first else known_before)[:, None], known[:, :-1]], axis=1)
+        change[~(known & earlier & there[..., self.pairs[:, 1]])] = 0.0
         out = np.empty(change.shape)
         left = 1.0 - 1.0 / (self.memories_s * self.rate_hz)
         for column, share in enumerate(left.tolist()):
             start = share * residual[:, column : column + 1]
             out[..., column], _ = lfilter([1.0], [1.0, -share], change[..., column], axis=1, zi=start)
-        return out.astype(np.float32), (levels[:, -1], out[:, -1])
+        return out.astype(np.float32), (levels[:, -1], out[:, -1], known[:, -1])
 
     def parts(self) -> SourceParts:
         """See `ResidualSource.parts`."""

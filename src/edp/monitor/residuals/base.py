@@ -140,7 +140,7 @@ class ResidualSource(ABC):
             return np.empty((*rows.shape[:2], len(self.names)), np.float32), state
         there = np.isfinite(rows)
         filled, last = self._filled(rows, there, state)
-        residuals, own = self._run(filled, state.own)
+        residuals, own = self._run(filled, there, state.own)
         # A fresh array: sources may give views of what they keep.
         residuals = np.array(residuals, dtype=np.float32)
         if not there.all():
@@ -172,8 +172,8 @@ class ResidualSource(ABC):
         """What the source itself carries, at the start."""
 
     @abstractmethod
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
-        """`run` on finite rows."""
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
+        """`run` on finite rows; `there` says which of their values were measured and did not have to be held."""
 
     @abstractmethod
     def parts(self) -> SourceParts:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from edp.monitor.residuals.base import (
     RESIDUALS,
@@ -73,7 +74,7 @@ class LookAhead(ResidualSource):
             states.append((state, waiting))
         return states
 
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
         parts, states = [], []
         for bundle, columns, (state, waiting) in zip(self.bundles.values(), self._columns, own, strict=True):
             fed, logged, measured = columns

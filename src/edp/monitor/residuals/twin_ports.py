@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.monitor.residuals.base import (
     RESIDUALS,
@@ -63,7 +64,7 @@ class TwinPorts(ResidualSource):
         # None until the first tick, which is what is expected at that tick.
         return None
 
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
         twin = self.bundle.twin
         commands, measured = rows[..., self._commands], rows[..., self._answers]
         if own is None:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from edp.data.features import FeatureSet
 from edp.data.prepared import Prepared
@@ -76,7 +77,7 @@ class VirtualSensors(ResidualSource):
             for bundle in self.bundles.values()
         ]
 
-    def _run(self, rows: Rows, own: Any) -> tuple[Rows, Any]:
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
         parts, states = [], []
         with torch.inference_mode():
             for bundle, (fed, judged), state in zip(self.bundles.values(), self._columns, own, strict=True):
