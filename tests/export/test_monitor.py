@@ -10,11 +10,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edp.config.monitor import load_monitor_experiment
+from edp.data.features import FeatureSet
+from edp.data.scaling import fit_scaler
+from edp.data.task import TargetMode, Task
 from edp.errors import BundleError, ConfigError, ExportError
 from edp.export.monitor import monitor_files, write_monitor
 from edp.export.monitor.golden import drawn_rows
 from edp.monitor.detectors import EDetectorSpec
 from edp.monitor.monitor_file import save_monitor
+from edp.networks.backbones import GruSpec
+from edp.networks.outputs import OUTPUTS
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.twin import TWINS
+from edp.signals import Kind
+from edp.testing.twins import RATE_HZ, sample_actuators, sample_twin
+from edp.training.bundle import Bundle
+from edp.training.twin_bundle import TwinBundle
+from edp.workflows.monitor import fit_to_recordings
 from edp.workflows.monitor.export_monitor import chain_part, export_monitor, monitor_parts
 
 OK, WARMING, HELD, RESTARTED, NOT_RESET = range(5)
@@ -264,3 +277,47 @@ def test_what_has_no_form_in_c_is_refused(rig_monitor, tmp_path):
     with pytest.raises(BundleError, match="not a monitor"):
         export_monitor(tmp_path, "c", tmp_path / "c", "watch")
     assert not (tmp_path / "c").exists()
+
+
+@pytest.fixture(scope="module")
+def ahead_monitor():
+    """A monitor with look-ahead networks, with and without intervals, and a twin with free ports; none is trained."""
+    sessions = [sample_actuators(900, seed) for seed in range(10)]
+    task = Task(
+        FeatureSet("all", sessions[0].channel_names), ("speed_1", "pressure_1"), (1, 3), TargetMode.DELTA, RATE_HZ
+    )
+    scaler = fit_scaler(task, [task.series(s) for s in sessions], [channel.kind for channel in sessions[0].channels])
+    bundles = []
+    for output in (OUTPUTS["point"](), OUTPUTS["quantiles"]()):
+        spec = ModelSpec(backbone=GruSpec(units=6), window=8, output=output)
+        predictor = build_model(task, spec, scaler, seed=2)
+        kinds = (Kind.VELOCITY, Kind.PRESSURE)
+        bundles.append(Bundle(predictor, sessions[0].channels, kinds, ("speed", "pressure")))
+    spec = TWINS["recurrent"](units=6, members=1)
+    twin = TwinBundle(spec, sample_twin(spec)[0])
+    changes = [
+        *("chain.block_s=0.4", "chain.settle_s=1.0", "chain.folds=2", "train_share=0.3"),
+        'chain.watches=[{detector={kind="cusum",slack=0.5},memory_s=0.4}]',
+        'residuals=[{kind="look_ahead"},{kind="twin_ports",free_s=0.3}]',
+    ]
+    experiment = load_monitor_experiment(None, changes, {"hours_per_false_alarm": 0.01, "minutes": 0.02})
+    return fit_to_recordings(sessions, experiment, [*bundles, twin]).monitor, sessions[0]
+
+
+def test_look_ahead_networks_and_twins_with_free_ports(c, ahead_monitor, tmp_path):
+    monitor, session = ahead_monitor
+    assert {name.split(":")[0] for name in monitor.residual_names} == {"ahead", "ahead1", "twin"}
+    parts = monitor_parts(monitor)
+    write_monitor(parts, "watch", tmp_path)
+    flags = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    c.run("gcc", *c.flags, *flags, *sources(tmp_path), "host_test.c", "-lm", "-o", "program", folder=tmp_path)
+    assert "all tests passed" in c.run(tmp_path / "program").decode()
+    rows = session.select(monitor.inputs).copy()
+    rows[300:310, 1] = np.nan
+    residuals, _, _ = streamed(c, tmp_path / "program", rows, monitor)
+    expected, _ = monitor.residuals(rows, monitor.initial_state())
+    np.testing.assert_array_equal(np.isnan(residuals), np.isnan(expected))
+    # Predictions of the first ticks are about ticks that come later.
+    assert np.isnan(expected[0]).any()
+    scale = np.nanstd(expected, axis=0)
+    assert (np.nan_to_num(np.abs(residuals - expected)) < 1e-3 * scale).all()

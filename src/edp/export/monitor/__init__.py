@@ -10,6 +10,7 @@ from edp.export.monitor.parts import (
     MonitorParts,
     NetworkPart,
     SourcePart,
+    TwinPart,
     WatchPart,
 )
 from edp.export.monitor.write import DETECTORS, monitor_files, write_monitor
@@ -23,6 +24,7 @@ __all__ = [
     "MonitorParts",
     "NetworkPart",
     "SourcePart",
+    "TwinPart",
     "WatchPart",
     "drawn_rows",
     "monitor_files",

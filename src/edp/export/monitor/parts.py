@@ -26,7 +26,8 @@ class NetworkPart:
         judged: input of the monitor that each residual judges.
         results: place of each prediction among those of the network, horizon by horizon.
         delays: ticks by which each prediction is older than what it is compared with; 0 for a virtual sensor.
-        widths: over which each residual is divided; 1 leaves it in SI units.
+        scaled: whether residuals are divided by half the width of the first interval.
+        least_width: of that half.
     """
 
     bundle: Bundle
@@ -35,7 +36,8 @@ class NetworkPart:
     judged: Places
     results: Places
     delays: Places
-    widths: NDArray[np.float32]
+    scaled: bool = False
+    least_width: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,28 @@ class BalancePart:
     left: Array
 
 
-SourcePart = NetworkPart | BalancePart
+@dataclass(frozen=True, eq=False)
+class TwinPart:
+    """Residuals of a twin that runs once a group of its answers, with the ports of the group free.
+
+    Attributes:
+        bundle: of its plant: commands, measured answers and flags in, answers one tick ahead out.
+        reads: inputs of the monitor that are its commands and measured answers.
+        middle: what stands in for each of them before it was ever there, shape (reads,).
+        groups: answers that are judged together, by their place.
+        prefix: ticks at which all is measured.
+        period: ticks from one measured tick of a group to the next.
+    """
+
+    bundle: Bundle
+    reads: Places
+    middle: NDArray[np.float32]
+    groups: tuple[Places, ...]
+    prefix: int
+    period: int
+
+
+SourcePart = NetworkPart | BalancePart | TwinPart
 
 
 @dataclass(frozen=True, eq=False)

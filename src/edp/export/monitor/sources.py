@@ -10,7 +10,7 @@ import numpy as np
 from edp.export.c.model import Model, make_model
 from edp.export.c.text import number
 from edp.export.monitor.numbers import MonitorTables
-from edp.export.monitor.parts import BalancePart, NetworkPart, SourcePart
+from edp.export.monitor.parts import BalancePart, NetworkPart, SourcePart, TwinPart
 
 HOLD = """\
     for (uint32_t i = 0; i < {count}u; i++) {{
@@ -32,16 +32,50 @@ static void {own}_residuals({name}_state *s) {{
 AHEAD = """
 /* Predictions wait in a ring until what they are about is measured. */
 static void {own}_residuals({name}_state *s) {{
-    {model}_output out;
-{hold}    const bool known = {model}_step(&s->{own}, s->{own}_in, &out) <= EDP_WARMING;
+    {model}_output *const out = &s->{own}_out;
+{hold}    const bool known = {model}_step(&s->{own}, s->{own}_in, out) <= EDP_WARMING;
     for (uint32_t i = 0; i < {residuals}u; i++) {{
         const uint32_t back = (s->{own}_at + {length}u - {own}_delays[i]) % {length}u;
-        s->{own}_past[s->{own}_at][i] = known ? (&out.prediction[0][0])[{own}_results[i]] : (float)edp_unknown();
-        const float expected = (s->{own}_seen >= {own}_delays[i]) ? s->{own}_past[back][i] : (float)edp_unknown();
-        s->residuals[{first}u + i] = (s->row[{own}_judged[i]] - expected) / {own}_widths[i];
+        const bool due = s->{own}_seen >= {own}_delays[i];
+        s->{own}_past[s->{own}_at][i] = known ? (&out->prediction[0][0])[{own}_results[i]] : (float)edp_unknown();
+{width}        s->residuals[{first}u + i] = due ? {value} : (float)edp_unknown();
     }}
     s->{own}_at = (s->{own}_at + 1u) % {length}u;
     s->{own}_seen += (s->{own}_seen < {length}u) ? 1u : 0u;
+}}
+"""
+WIDTH = """\
+        const float half = 0.5f * ((&out->upper[0][0][0])[{own}_results[i]] - (&out->lower[0][0][0])[{own}_results[i]]);
+        s->{own}_width[s->{own}_at][i] = (half > {least}) ? half : {least};
+"""
+TWIN = """
+/* A twin a group of its answers, whose ports are free but for a tick now and then. */
+static void {own}_residuals({name}_state *s) {{
+    {model}_output out;
+    float row[{inputs}];
+    uint32_t at = {first}u;
+    const bool apart = (s->{own}_ticks >= {prefix}u) && (((s->{own}_ticks - {prefix}u) % {period}u) != 0u);
+{hold}    for (uint32_t g = 0; g < {groups}u; g++) {{
+        edp_copy(s->{own}_in, {reads}u, row);
+        edp_fill(1.0f, {answers}u, &row[{reads}u]);
+        for (uint32_t i = {own}_group_from[g]; i < {own}_group_from[g + 1u]; i++) {{
+            const uint32_t answer = {own}_groups[i];
+            const float expected = (s->{own}_ticks > 0u) ? s->{own}_expected[i] : row[{commands}u + answer];
+            s->residuals[at] = row[{commands}u + answer] - expected;
+            at++;
+            if (apart) {{
+                row[{commands}u + answer] = 0.0f;
+                row[{reads}u + answer] = 0.0f;
+            }}
+        }}
+        const bool known = {model}_step(&s->{own}[g], row, &out) <= EDP_WARMING;
+        for (uint32_t i = {own}_group_from[g]; i < {own}_group_from[g + 1u]; i++) {{
+            s->{own}_expected[i] = known ? out.prediction[0][{own}_groups[i]] : (float)edp_unknown();
+        }}
+    }}
+    /* The count stays small for ever, and within a period tells the same. */
+    s->{own}_ticks++;
+    s->{own}_ticks -= (s->{own}_ticks >= ({prefix}u + {period}u)) ? {period}u : 0u;
 }}
 """
 BALANCE = """
@@ -106,18 +140,16 @@ class NetworkCode:
         self.model: Model | None = make_model(model, part.bundle)
         self.prefix = model
         self.residuals = len(part.judged)
-        self.ahead = bool(part.delays) and (max(part.delays) > 0 or bool((part.widths != 1.0).any()))
-
-    @property
-    def _length(self) -> int:
-        return max(self.part.delays) + 1
+        self.ahead = part.scaled or max(part.delays) > 0
 
     def fields(self) -> list[str]:
         """See `SourceCode`."""
         lines = [f"{self.prefix}_state {self.own};", f"float {self.own}_in[{len(self.part.reads)}];"]
+        lines += [f"{self.prefix}_output {self.own}_out; /* to be read: what the network said last */"]
         if self.ahead:
             lines += [f"uint32_t {self.own}_at;", f"uint32_t {self.own}_seen;"]
-            lines += [f"float {self.own}_past[{self._length}][{self.residuals}];"]
+            rings = ("past", "width") if self.part.scaled else ("past",)
+            lines += [f"float {self.own}_{ring}[{max(self.part.delays) + 1}][{self.residuals}];" for ring in rings]
         return lines
 
     def constants(self, tables: MonitorTables) -> None:
@@ -129,20 +161,23 @@ class NetworkCode:
         tables.floats(f"{self.own}_middle", part.middle)
         if self.ahead:
             tables.places(f"{self.own}_delays", part.delays)
-            tables.floats(f"{self.own}_widths", part.widths)
 
     def code(self, name: str, first: int) -> str:
         """See `SourceCode`."""
-        hold = HOLD.format(own=self.own, count=len(self.part.reads))
-        return (AHEAD if self.ahead else NETWORK).format(
-            own=self.own,
-            name=name,
-            model=self.prefix,
-            hold=hold,
-            residuals=self.residuals,
-            first=first,
-            length=self._length if self.ahead else 0,
-        )
+        own, part = self.own, self.part
+        value = f"(s->row[{own}_judged[i]] - s->{own}_past[back][i])"
+        blanks: dict[str, object] = {
+            "own": own,
+            "name": name,
+            "model": self.prefix,
+            "hold": HOLD.format(own=own, count=len(part.reads)),
+            "residuals": self.residuals,
+            "first": first,
+            "width": WIDTH.format(own=own, least=number(part.least_width)) if part.scaled else "",
+            "value": f"({value} / s->{own}_width[back][i])" if part.scaled else value,
+            "length": max(part.delays) + 1,
+        }
+        return (AHEAD if self.ahead else NETWORK).format(**blanks)
 
     def reset(self) -> list[str]:
         """See `SourceCode`."""
@@ -190,6 +225,65 @@ class BalanceCode:
         return [f"s->{self.own}_began = false;", f"edp_clear({self.residuals}u, s->{self.own}_sum);"]
 
 
+class TwinCode:
+    """A twin with free ports; see `TwinPart`.
+
+    Args:
+        part: what it is.
+        own: prefix of its names within the monitor.
+        model: C prefix of its plant.
+    """
+
+    def __init__(self, part: TwinPart, own: str, model: str) -> None:
+        self.part, self.own, self.prefix = part, own, model
+        self.model: Model | None = make_model(model, part.bundle)
+        self.residuals = sum(map(len, part.groups))
+
+    def fields(self) -> list[str]:
+        """See `SourceCode`."""
+        lines = [f"{self.prefix}_state {self.own}[{len(self.part.groups)}];", f"uint32_t {self.own}_ticks;"]
+        return [
+            *lines,
+            f"float {self.own}_in[{len(self.part.reads)}];",
+            f"float {self.own}_expected[{self.residuals}];",
+        ]
+
+    def constants(self, tables: MonitorTables) -> None:
+        """See `SourceCode`."""
+        groups = self.part.groups
+        tables.places(f"{self.own}_reads", self.part.reads)
+        tables.places(f"{self.own}_groups", [answer for group in groups for answer in group])
+        tables.places(f"{self.own}_group_from", np.cumsum([0, *map(len, groups)]).tolist())
+        tables.floats(f"{self.own}_middle", self.part.middle)
+
+    def code(self, name: str, first: int) -> str:
+        """See `SourceCode`."""
+        part, reads, answers = self.part, len(self.part.reads), len(self.part.bundle.task.targets)
+        return TWIN.format(
+            own=self.own,
+            name=name,
+            model=self.prefix,
+            hold=HOLD.format(own=self.own, count=reads),
+            first=first,
+            inputs=reads + answers,
+            reads=reads,
+            answers=answers,
+            commands=reads - answers,
+            groups=len(part.groups),
+            prefix=part.prefix,
+            period=part.period,
+        )
+
+    def reset(self) -> list[str]:
+        """See `SourceCode`."""
+        return [*self.forget(), f"edp_copy({self.own}_middle, {len(self.part.reads)}u, s->{self.own}_in);"]
+
+    def forget(self) -> list[str]:
+        """See `SourceCode`."""
+        groups = range(len(self.part.groups))
+        return [*(f"{self.prefix}_reset(&s->{self.own}[{g}]);" for g in groups), f"s->{self.own}_ticks = 0u;"]
+
+
 def source_code(part: SourcePart, place: int, name: str) -> SourceCode:
     """The source at a place of the monitor `name`.
 
@@ -198,6 +292,8 @@ def source_code(part: SourcePart, place: int, name: str) -> SourceCode:
     """
     if isinstance(part, NetworkPart):
         return NetworkCode(part, f"n{place}", f"{name}_n{place}")
+    if isinstance(part, TwinPart):
+        return TwinCode(part, f"t{place}", f"{name}_t{place}")
     return BalanceCode(part, f"b{place}")
 
 
@@ -205,6 +301,3 @@ def reads_tables(reads: Sequence[tuple[int, ...]], tables: MonitorTables) -> Non
     """Inputs of every residual, one behind the other, and where each begins."""
     tables.places("reads", [place for places in reads for place in places])
     tables.places("reads_from", np.cumsum([0, *(len(places) for places in reads)]).tolist())
-
-
-__all__ = ["BalanceCode", "NetworkCode", "SourceCode", "number", "reads_tables", "source_code"]

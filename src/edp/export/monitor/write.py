@@ -80,8 +80,8 @@ class MonitorFiles:
 
     @property
     def slices(self) -> int:
-        """Parts of the work on a block: operating point, each residual, each watch, the verdict."""
-        return 2 + len(self.parts.residuals) + sum(map(_watch_slices, self.parts.chain.watches))
+        """Parts of the work on a block: operating point, residuals and their summaries, watches, the verdict."""
+        return 2 + (SUMMARIES + 1) * len(self.parts.residuals) + sum(map(_watch_slices, self.parts.chain.watches))
 
     def _numbers(self) -> Code:
         head = f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */\n"
@@ -122,7 +122,7 @@ class MonitorFiles:
         tables.text(
             f"static const uint32_t memory_from[{len(rows)}] = {{{', '.join(f'{m}u' for m in memories[:-1])}}};"
         )
-        first = 1 + len(self.parts.residuals)
+        first = 1 + (SUMMARIES + 1) * len(self.parts.residuals)
         starts = first + np.cumsum([0, *map(_watch_slices, self.parts.chain.watches)])
         slice_text = ", ".join(f"{start}u" for start in starts.tolist())
         tables.text(f"static const uint32_t slices_from[{len(starts)}] = {{{slice_text}}};")

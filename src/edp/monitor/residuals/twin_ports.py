@@ -61,14 +61,17 @@ class TwinPorts(ResidualSource):
         self.units = tuple(units[name] for name in judged)
 
     def _start(self, streams: int) -> Any:
-        # None until the first tick, which tells the state that the machines begin in.
+        # None until the first tick, which is what is expected at that tick.
         return None
 
     def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
         twin = self.bundle.twin
         commands, measured = rows[..., self._commands], rows[..., self._answers]
         if own is None:
-            start = [twin.initial_state(commands[:, 0], measured[:, 0]) for _ in self.groups]
+            # At rest at the means of its training data, as exported plants begin; the measured prefix does the rest.
+            scales, lanes = twin.scales, len(rows)
+            means = [np.repeat(mean[None], lanes, axis=0) for mean in (scales.command_offset, scales.answer_offset)]
+            start = [twin.initial_state(means[0], means[1]) for _ in self.groups]
             own = (0, start, [measured[:, 0] for _ in self.groups])
         ticks, states, expected = own
         at = np.arange(ticks, ticks + rows.shape[1])

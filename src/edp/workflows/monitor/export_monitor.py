@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, ExportError, closest
-from edp.export.golden import SHARE
+from edp.export.golden import at_thresholds, grown_tolerance, stream, tolerance
 from edp.export.monitor import (
     DETECTORS,
     BalancePart,
@@ -19,6 +19,7 @@ from edp.export.monitor import (
     MonitorParts,
     NetworkPart,
     SourcePart,
+    TwinPart,
     WatchPart,
     drawn_rows,
     write_monitor,
@@ -31,10 +32,14 @@ from edp.monitor.monitor import IMPOSSIBLE, Monitor
 from edp.monitor.monitor_file import HEADER, load_monitor
 from edp.monitor.residuals.balances import Balances
 from edp.monitor.residuals.base import ResidualSource
+from edp.monitor.residuals.look_ahead import SMALLEST_WIDTH, LookAhead
+from edp.monitor.residuals.twin_ports import TwinPorts
 from edp.monitor.residuals.virtual_sensors import VirtualSensors
 from edp.monitor.watches import Watch
 from edp.networks.integer import IntegerPredictor
+from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.training.bundle import Bundle
+from edp.training.twin_bundle import plant_bundle
 
 FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries")}
 """Forms of a monitor with their options; they are forms of networks, too."""
@@ -87,7 +92,7 @@ def monitor_parts(monitor: Monitor) -> MonitorParts:
     Raises:
         ExportError: a source or a detector without a form in C.
     """
-    place = {name: i for i, name in enumerate(monitor.inputs)}
+    place = _places(monitor)
     sources = tuple(part for source in monitor.sources for part in source_parts(source, place))
     chain = chain_part(monitor.chain)
     parts = MonitorParts(
@@ -129,6 +134,10 @@ def source_parts(source: ResidualSource, place: Mapping[str, int]) -> list[Sourc
     """
     if isinstance(source, VirtualSensors):
         return [_virtual(source, bundle, place) for bundle in source.bundles.values()]
+    if isinstance(source, LookAhead):
+        return [_look_ahead(source, bundle, place) for bundle in source.bundles.values()]
+    if isinstance(source, TwinPorts):
+        return [_twin(source, place)]
     if isinstance(source, Balances):
         return [_balances(source, place)]
     raise ExportError(
@@ -147,7 +156,37 @@ def _virtual(source: VirtualSensors, bundle: Bundle, place: Mapping[str, int]) -
         judged=tuple(place[name] for name in targets),
         results=tuple(range(len(targets))),
         delays=(0,) * len(targets),
-        widths=np.ones(len(targets), np.float32),
+    )
+
+
+def _look_ahead(source: LookAhead, bundle: Bundle, place: Mapping[str, int]) -> NetworkPart:
+    own = {name: i for i, name in enumerate(source.inputs)}
+    reads, task = bundle.task.inputs, bundle.task
+    logged = [i for i, target in enumerate(task.targets) if target in own]
+    return NetworkPart(
+        bundle=bundle,
+        reads=tuple(place[name] for name in reads),
+        middle=source.middle[[own[name] for name in reads]],
+        judged=tuple(place[task.targets[i]] for _ in task.horizons for i in logged),
+        results=tuple(h * len(task.targets) + i for h in range(len(task.horizons)) for i in logged),
+        delays=tuple(k for k in task.horizons for _ in logged),
+        scaled=bool(bundle.predictor.output.coverages),
+        least_width=SMALLEST_WIDTH,
+    )
+
+
+def _twin(source: TwinPorts, place: Mapping[str, int]) -> TwinPart:
+    channels = source.bundle.twin.channels
+    own = {name: i for i, name in enumerate(source.inputs)}
+    reads = [channel.name for channel in (*channels.commands, *channels.answers)]
+    answers = {channel.name: i for i, channel in enumerate(channels.answers)}
+    return TwinPart(
+        bundle=plant_bundle(source.bundle),
+        reads=tuple(place[name] for name in reads),
+        middle=source.middle[[own[name] for name in reads]],
+        groups=tuple(tuple(answers[name] for name in group) for group in source.groups),
+        prefix=source.bundle.twin.prefix_ticks,
+        period=source.period,
     )
 
 
@@ -237,29 +276,68 @@ def golden_residuals(monitor: Monitor) -> GoldenResiduals:
     holes[: GOLDEN_TICKS // 2] = False
     inputs[holes] = np.nan
     residuals, _ = monitor.residuals(inputs, monitor.initial_state())
-    tolerance = np.zeros(residuals.shape[1])
-    first = 0
-    for source in monitor.sources:
-        own = slice(first, first + len(source.names))
-        tolerance[own] = _allowed(source, residuals[:, own], inputs, monitor.inputs)
-        first += len(source.names)
-    return GoldenResiduals(inputs, residuals, tolerance.astype(np.float32))
+    allowed_by, first = np.zeros(residuals.shape[1]), 0
+    filled = _filled(inputs, summaries.centre)
+    for part in (part for source in monitor.sources for part in source_parts(source, _places(monitor))):
+        allowed = _allowed(part, filled)
+        allowed_by[first : first + len(allowed)] = allowed
+        first += len(allowed)
+    return GoldenResiduals(inputs, residuals, allowed_by.astype(np.float32))
 
 
-def _allowed(source: ResidualSource, residuals: Rows, inputs: Rows, names: Sequence[str]) -> NDArray[np.float64]:
-    """How far residuals in C may be off: as predictions of networks are; nothing for integers and balances."""
-    if not isinstance(source, VirtualSensors):
-        return np.zeros(len(source.names))
-    parts = []
-    place = {name: i for i, name in enumerate(names)}
-    for bundle in source.bundles.values():
-        if isinstance(bundle.predictor, IntegerPredictor):
-            parts.append(np.zeros(len(bundle.task.targets)))
+def _places(monitor: Monitor) -> dict[str, int]:
+    return {name: i for i, name in enumerate(monitor.inputs)}
+
+
+def _filled(rows: Rows, start: NDArray[np.float64]) -> Rows:
+    """Rows in which the last value stands in for a missing one."""
+    filled, last = rows.copy(), start.astype(np.float32)
+    for row in filled:
+        row[:] = last = np.where(np.isfinite(row), row, last)
+    return filled
+
+
+def _allowed(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
+    """How far residuals in C may be off: as far as the network's numbers may be; nothing for sums and integers."""
+    if isinstance(part, BalancePart):
+        return np.zeros(len(part.levels))
+    if isinstance(part, TwinPart):
+        return _allowed_of_twin(part, rows)
+    network, fed, judged = part.bundle.predictor, rows[:, part.reads], rows[:, part.judged]
+    outputs = stream(network, fed)
+    # A predictor whose trees may take another leaf there is off by a step.
+    off = (tolerance(network, fed, outputs) + at_thresholds(network, fed).max(axis=0)).astype(np.float64)
+    results, count = np.asarray(part.results), len(part.bundle.task.targets) * len(part.bundle.task.horizons)
+    whole = not isinstance(network, IntegerPredictor)
+    apart = off[results] + whole * ROUNDING * np.abs(judged).max(axis=0)
+    if not part.scaled:
+        return np.asarray(apart)
+    # Bounds stand behind the predictions, lower ones first; the first interval is the scale.
+    upper = results + count * (1 + len(part.bundle.predictor.output.coverages))
+    lower = results + count
+    half = np.maximum(0.5 * (outputs[:, upper] - outputs[:, lower]), part.least_width).astype(np.float64)
+    largest = np.abs(judged - outputs[:, results]).max(axis=0) + 2.0 * np.ptp(judged, axis=0)
+    width = half.min(axis=0)
+    return np.asarray((apart + largest / width * 0.5 * (off[upper] + off[lower])) / width)
+
+
+def _allowed_of_twin(part: TwinPart, rows: Rows) -> NDArray[np.float64]:
+    """What errors of single precision grow to while ports are free, group by group."""
+    plant, fed = part.bundle.predictor, rows[:, part.reads]
+    if not isinstance(plant, TwinPlant):
+        raise ExportError("residuals with free ports need a twin; fit the monitor again")
+    commands, answers = plant.sizes[:2]
+    ticks, allowed = np.arange(len(rows)), []
+    apart = (ticks >= part.prefix) & ((ticks - part.prefix) % part.period != 0)
+    for group in part.groups:
+        flags = np.ones((len(rows), answers), np.float32)
+        flags[np.ix_(apart, group)] = 0.0
+        measured = fed[:, commands:] * flags
+        inputs = np.concatenate([fed[:, :commands], measured, flags], axis=1)
+        outputs = stream(plant, inputs)
+        if isinstance(plant, IntegerTwinPlant):
+            allowed.append(np.zeros(len(group)))
             continue
-        sigma = bundle.predictor.code.width.detach().cpu().double().numpy().ravel()
-        measured = np.nanmax(np.abs(inputs[:, [place[name] for name in bundle.task.targets]]), axis=0)
-        # The prediction is the measured value less the residual: its size is at most that of both.
-        largest = measured + np.nanmax(np.abs(residuals[:, : len(sigma)]), axis=0)
-        residuals = residuals[:, len(sigma) :]
-        parts.append(2.0 * SHARE * (sigma + largest) + ROUNDING * measured)
-    return np.concatenate(parts)
+        off = grown_tolerance(plant, inputs, outputs).max(axis=0).astype(np.float64)
+        allowed.append(off[list(group)] + ROUNDING * np.abs(fed[:, commands:]).max(axis=0)[list(group)])
+    return np.concatenate(allowed)

@@ -1,0 +1,215 @@
+"""What does a tick of an exported monitor cost beside its predictor, and are its cycles those of `edp footprint`?
+
+Chains of several sizes with drawn numbers run on an emulated Cortex-M4F, which has no double precision in hardware: the
+instructions of every tick of a block are counted, and those of some ticks traced and given their cycles as in
+`controller_cycles.py`. With ``--fit`` the cycles of a residual, an input, a product and a root are fitted to what was
+counted (`edp.evaluation.monitor_footprint`).
+
+Then a network of the preset `quick` with weights as drawn, alone and within a monitor of its look-ahead errors: what
+the monitor adds, on average and in the longest tick.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import finish, parser, table, verdict
+from controller_cycles import QEMU, of_preset, traced_image
+from edp.evaluation.monitor_footprint import chain_cycles, chain_work
+from edp.export.c.target import CTarget
+from edp.export.monitor import (
+    BalancePart,
+    ChainPart,
+    GoldenChain,
+    GoldenResiduals,
+    MonitorParts,
+    NetworkPart,
+    WatchPart,
+    monitor_files,
+)
+from edp.signals import Channel, Kind
+from embedded_step import BOARD, M4, instructions, run
+
+BLOCK, SETTLE = 100, 1
+SIZES = ((6, 30, 25, 20), (12, 30, 25, 40), (24, 30, 25, 60), (24, 12, 8, 120), (40, 40, 12, 60))
+"""Residuals, inputs, numbers of the operating point, directions of each of two watches."""
+PROGRAM = """
+#include "watch.h"
+#include <stdio.h>
+#define SYST_CSR (*(volatile uint32_t *)0xE000E010u)
+#define SYST_RVR (*(volatile uint32_t *)0xE000E014u)
+#define SYST_CVR (*(volatile uint32_t *)0xE000E018u)
+static watch_state state;
+static float in[WATCH_INPUTS], residuals[WATCH_RESIDUALS];
+static uint32_t lcg = 1u;
+static float drawn(void) {
+    lcg = (1664525u * lcg) + 1013904223u;
+    return ((float)(lcg >> 8) * 1.1920929e-7f) - 1.0f;
+}
+int main(void) {
+    watch_reset(&state);
+    SYST_RVR = 0xFFFFFFu;
+    for (unsigned tick = 0; tick < TICKS; tick++) {
+        watch_output out;
+        (void)out;
+        for (unsigned i = 0; i < WATCH_INPUTS; i++) { in[i] = drawn(); }
+        for (unsigned i = 0; i < WATCH_RESIDUALS; i++) { residuals[i] = drawn(); }
+        SYST_CVR = 0u;
+        SYST_CSR = 5u;
+        const uint32_t start = SYST_CVR;
+#ifdef WHOLE
+        (void)watch_step(&state, in, &out);
+#else
+        watch_chain(&state, in, residuals);
+#endif
+        const uint32_t passed = (start - SYST_CVR) & 0xFFFFFFu;
+#ifdef COUNTED
+        (void)printf("%lu ", (unsigned long)(passed * (1000000000u / CLOCK_HZ)));
+#else
+        (void)passed;
+#endif
+    }
+    return 0;
+}
+"""
+
+
+def main() -> None:
+    given = parser(__doc__ or "")
+    given.add_argument("--fit", action="store_true", help="print cycles fitted to what was counted")
+    arguments = given.parse_args()
+    quick, seed = arguments.quick, arguments.seed
+    with tempfile.TemporaryDirectory() as temporary:
+        root = Path(temporary)
+        rows = [measured(size, root / str(i), seed) for i, size in enumerate(SIZES[:2] if quick else SIZES)]
+        beside = beside_predictor(root / "beside", seed)
+    each = float(np.mean([row["cycles_each"] for row in rows]))
+    for row in rows:
+        row["ratio"] = row["estimate"] / (row["mean"] * each)
+    heads = ["residuals", "inputs", "point", "directions", "instructions a tick", "longest tick", "estimate / counted"]
+    table(heads, [[*row["size"], row["mean"], row["most"], row["ratio"]] for row in rows])
+    if arguments.fit:
+        print(fitted(rows, each))
+    print(f"{each:.3f} cycles an instruction; predictor {beside['alone']:,} instructions a tick, in a monitor of its "
+          f"look-ahead errors {beside['mean']:,.0f}, longest {beside['most']:,}")  # fmt: skip
+    worst = max(abs(row["ratio"] - 1.0) for row in rows)
+    verdicts = [
+        verdict("estimated cycles of a chain against counted ones, largest error", worst, 0.15, "<= 1", "share", quick),
+        verdict("a monitor of look-ahead errors over 1.25 times the predictor alone, mean", beside["mean"],
+                1.25 * beside["alone"], "<= 1", "instructions", quick),
+        verdict("the same, longest tick", beside["most"], 1.25 * beside["alone"], "<= 1", "instructions", quick),
+    ]  # fmt: skip
+    finish("monitor_cycles", verdicts, seed, {"chains": rows, "cycles_an_instruction": each, "beside": beside})
+
+
+def measured(size: tuple[int, int, int, int], folder: Path, seed: int) -> dict[str, Any]:
+    """Instructions of the ticks of a block, and cycles of one of them."""
+    parts = drawn_parts(size, seed)
+    counts = counted(parts, folder)
+    few, many = (traced_ticks(folder, ticks) for ticks in (2, 4))
+    each = (many[1] - few[1]) / (many[0] - few[0])
+    return {
+        "size": size, "mean": float(counts.mean()), "most": int(counts.max()), "cycles_each": each,
+        "work": chain_work(parts), "estimate": chain_cycles(parts).mean,
+    }  # fmt: skip
+
+
+def counted(parts: MonitorParts, folder: Path, *flags: str) -> np.ndarray:
+    """Instructions of each tick of a block that is judged."""
+    ticks = (SETTLE + 3) * BLOCK
+    build(parts, folder, "-DCOUNTED", f"-DTICKS={ticks}u", *flags)
+    told = run([*QEMU, "-icount", "shift=0", "-kernel", "image.elf"], folder).split()
+    return np.array(told, float)[-BLOCK:]
+
+
+def build(parts: MonitorParts, folder: Path, *flags: str) -> None:
+    folder.mkdir(exist_ok=True)
+    files = monitor_files(parts, "watch")
+    for name, text in files.texts().items():
+        (folder / name).write_text(text)
+    (folder / "ticks.c").write_text(PROGRAM)
+    given = ["-std=gnu11", "-O2", "-ffp-contract=off", "-fno-tree-loop-vectorize", *M4, "-I.", "-DCLOCK_HZ=25000000u"]
+    rest = ["ticks.c", *files.compiled, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
+    run(["arm-none-eabi-gcc", *given, *flags, "-T", str(BOARD / "mps2.ld"), *rest], folder)
+
+
+def traced_ticks(folder: Path, ticks: int) -> tuple[int, int]:
+    given = ["-std=gnu11", "-O2", "-ffp-contract=off", *M4, "-I.", "-DCLOCK_HZ=25000000u", f"-DTICKS={ticks}u"]
+    sources = sorted(path.name for path in folder.glob("*.c"))
+    rest = [*sources, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
+    command = ["arm-none-eabi-gcc", *given, "-T", str(BOARD / "mps2.ld"), *rest]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    return traced_image(folder, QEMU)
+
+
+def beside_predictor(folder: Path, seed: int) -> dict[str, Any]:
+    """Instructions of a predictor alone, and of a monitor of its errors, a whole step each."""
+    bundle = of_preset("quick", seed)
+    with tempfile.TemporaryDirectory() as temporary:
+        CTarget().write(bundle, "predictor", Path(temporary))
+        alone = instructions(Path(temporary))
+    inputs, targets = len(bundle.inputs), len(bundle.task.targets)
+    names = [channel.name for channel in bundle.inputs]
+    judged = tuple(names.index(target) for target in bundle.task.targets)
+    network = NetworkPart(
+        bundle, tuple(range(inputs)), np.zeros(inputs, np.float32), judged, tuple(range(targets)),
+        tuple(k for k in bundle.task.horizons for _ in bundle.task.targets),
+    )  # fmt: skip
+    parts = drawn_parts((targets, inputs, inputs, 5 * targets), seed, network, bundle.inputs)
+    counts = counted(parts, folder, "-DWHOLE")
+    return {"alone": alone, "mean": float(counts.mean()), "most": int(counts.max()), "work": chain_work(parts)}
+
+
+def drawn_parts(
+    size: tuple[int, int, int, int], seed: int, network: NetworkPart | None = None, channels: tuple[Channel, ...] = ()
+) -> MonitorParts:
+    """A monitor with drawn numbers."""
+    residuals, inputs, points, directions = size
+    rng, summaries = np.random.default_rng(seed), 5 * residuals
+    channels = channels or tuple(Channel(f"c{i}", Kind.GENERIC) for i in range(inputs))
+
+    def single(*shape: int) -> np.ndarray:
+        return rng.normal(size=shape).astype(np.float32).astype(float)
+
+    ones = np.ones(inputs)
+    widths = np.concatenate([np.ones((summaries, 1)), 0.01 * np.abs(single(summaries, points))], axis=1)
+    watches = tuple(
+        WatchPart(kind, 0.5, single(summaries), single(summaries, directions), 1.0) for kind in ("cusum", "ewma")
+    )
+    chain = ChainPart(
+        block=BLOCK, centre=0.1 * ones, spread=ones, impossible=1e5, scale=np.ones(residuals),
+        change=np.ones(residuals),
+        channel=tuple(i % inputs for i in range(residuals)), level=tuple(range(points // 2)),
+        moving=tuple(i % inputs for i in range(points - points // 2)), point_offset=single(points),
+        point_width=np.ones(points), point_limit=3.0, usual=single(summaries, points + 1),
+        wide=widths.astype(np.float32).astype(float), least=np.full(summaries, 0.25), clip=6.0, drift_step=0.001,
+        drift_most=0.5, watches=watches, limit=1e9, quiet=0.0, settle=SETTLE,
+    )  # fmt: skip
+    source = network or BalancePart(
+        tuple(range(inputs)), np.zeros(inputs, np.float32), tuple(i % inputs for i in range(residuals)),
+        tuple((i + 1) % inputs for i in range(residuals)), np.ones(residuals), np.full(residuals, 0.99),
+    )  # fmt: skip
+    nothing = GoldenChain(np.zeros((1, 2)), (-1,), (0,), np.zeros(summaries))
+    rows = GoldenResiduals(np.zeros((1, inputs), np.float32), np.zeros((1, residuals), np.float32),
+                           np.zeros(residuals, np.float32))  # fmt: skip
+    names = tuple(f"r{i}" for i in range(residuals))
+    reads = [tuple(range(inputs))] * residuals
+    return MonitorParts("drawn", "0" * 32, "drawn", channels, 100.0, names, reads, (source,), chain, nothing, rows)
+
+
+def fitted(rows: list[dict[str, Any]], each: float) -> dict[str, float]:
+    """Cycles of the parts of the work, by least squares of relative errors."""
+    names = list(rows[0]["work"])
+    work = np.array([[row["work"][name] for name in names] for row in rows])
+    cycles = np.array([row["mean"] * each for row in rows])
+    found, *_ = np.linalg.lstsq(work / cycles[:, None], np.ones(len(cycles)), rcond=None)
+    return dict(zip(names, found.round(1).tolist(), strict=True))
+
+
+if __name__ == "__main__":
+    main()

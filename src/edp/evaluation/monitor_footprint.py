@@ -1,0 +1,166 @@
+"""What an exported monitor costs: its networks as of predictors, and the chain in double precision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate
+from edp.evaluation.footprint import Footprint, footprint
+from edp.export.monitor import MonitorParts, NetworkPart, TwinPart, monitor_files
+from edp.networks.integer import IntegerPredictor
+from edp.networks.twin import TwinPlant
+
+CORE_COSTS = {"residual": 900.0, "input": 400.0, "product": 130.0, "summary": 2_000.0, "tick": 300.0}
+"""Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library: of a
+residual and of an input at a tick, of a product with its sum, of a summary of a residual at the end of a block, and of
+a tick besides. Fitted to counted code of chains of several sizes (``benchmarks/monitor_cycles.py --fit``)."""
+CENTRE, CUSUM, EWMA, GLR, VERDICT = 0.5, 2.0, 2.5, 2.0, 0.6
+"""Products that take as long as a summary centred for a watch, a direction in a detector, a summary in a verdict."""
+CHAIN_PROGRAM_BYTES = 9_000
+"""Code of the chain, its runtime and the double precision of the compiler's library on a Cortex-M4F."""
+
+
+@dataclass(frozen=True)
+class ChainCycles:
+    """Cycles of a tick of a chain on a Cortex-M4F with zero-wait memory: on average, and in the longest tick."""
+
+    mean: float
+    most: float
+
+
+def chain_work(parts: MonitorParts) -> dict[str, float]:
+    """What the chain does at a tick, on average, by the names of `CORE_COSTS`."""
+    chain, summaries, points = parts.chain, parts.summaries, parts.points
+    watches = sum(_watch_products(watch.detector, watch.matrix.shape, watch.option) for watch in chain.watches)
+    products = 2.0 * summaries * points + watches + VERDICT * summaries
+    return {
+        "residual": float(len(chain.scale)),
+        "input": float(len(chain.centre) + len(chain.level) + len(chain.moving)),
+        "product": products / chain.block,
+        "summary": summaries / chain.block,
+        "tick": 1.0,
+    }
+
+
+def _watch_products(detector: str, shape: Sequence[int], option: float) -> float:
+    summaries, directions = shape
+    each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR * option}[detector]
+    return summaries * directions + CENTRE * summaries + each * directions
+
+
+def chain_cycles(parts: MonitorParts) -> ChainCycles:
+    """Cycles of the chain of a monitor."""
+    work, files = chain_work(parts), monitor_files(parts, "monitor")
+    mean = sum(CORE_COSTS[name] * amount for name, amount in work.items())
+    every = sum(CORE_COSTS[name] * work[name] for name in ("residual", "input", "tick"))
+    chain = parts.chain
+    parts_of_block = [max(2 * parts.points * CORE_COSTS["product"], 5 * CORE_COSTS["summary"])]
+    parts_of_block += [VERDICT * parts.summaries * CORE_COSTS["product"]]
+    for watch in chain.watches:
+        summaries, directions = watch.matrix.shape
+        each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR}[watch.detector] * directions
+        parts_of_block.append(CORE_COSTS["product"] * max(summaries, each))
+    return ChainCycles(mean, every + -(-files.slices // chain.block) * max(parts_of_block))
+
+
+@dataclass(frozen=True)
+class MonitorFootprint:
+    """What a monitor takes on a controller.
+
+    Attributes:
+        networks: footprint of each of its networks with the number format that it is exported in, and how often it runs
+            a tick.
+        chain: cycles behind the residuals.
+        cycles: low, typical and high estimate of a tick by core; the high one decides and is that of the longest tick.
+        constants: bytes in read-only memory.
+        ram_bytes: state, working memory and stack.
+        program_bytes: code, an estimate.
+        state_bytes: of the chain alone.
+    """
+
+    networks: tuple[tuple[Footprint, str, int], ...]
+    chain: ChainCycles
+    cycles: dict[str, tuple[int, int, int]]
+    constants: int
+    ram_bytes: int
+    program_bytes: int
+    state_bytes: int
+
+    def to_json(self, budget: Budget) -> dict[str, Any]:
+        """Plain values with the verdict against `budget`."""
+        return {
+            "networks": [
+                {"parameters": f.parameters, "macs_tick": runs * f.macs_tick, "number_format": form, "runs": runs}
+                for f, form, runs in self.networks
+            ],
+            "chain": asdict(self.chain),
+            "cycles": {core: list(values) for core, values in self.cycles.items()},
+            "constants": self.constants,
+            "ram_bytes": self.ram_bytes,
+            "program_bytes": self.program_bytes,
+            "budget": asdict(budget),
+            "verdict": self.verdict(budget),
+        }
+
+    def verdict(self, budget: Budget) -> list[dict[str, Any]]:
+        """A row for each limit, as `Footprint.verdict` has them."""
+        low, typical, high = self.cycles[budget.core]
+        text = f"high estimate of the longest tick; low {low:,}, typical {typical:,}"
+        memory, flash = self.constants + self.ram_bytes, self.constants + self.program_bytes
+        rows = [
+            ("cycles per tick", high, budget.cycles, "cycles", text),
+            ("parameters", self.constants, budget.parameter_bytes, "bytes", "all constants of the C code"),
+            ("RAM", memory, budget.ram_bytes, "bytes", "constants too, as in the thesis"),
+            ("flash", flash, budget.flash_bytes, "bytes", "estimate, with the program"),
+        ]
+        return [
+            {"what": what, "value": value, "limit": limit, "unit": unit, "fits": value <= limit, "note": note}
+            for what, value, limit, unit, note in rows
+        ]
+
+
+def monitor_footprint(parts: MonitorParts) -> MonitorFootprint:
+    """Count what a monitor takes as its exported C code.
+
+    Raises:
+        ExportError: a part has no form in C.
+    """
+    files = monitor_files(parts, "monitor")
+    networks = tuple(_network(part) for part in parts.sources if isinstance(part, NetworkPart | TwinPart))
+    estimates: list[tuple[Estimate, int]] = [(f.estimate(form), runs) for f, form, runs in networks]
+    chain, state = chain_cycles(parts), state_bytes(parts)
+    cycles = {}
+    for name, core in CORES.items():
+        sums = [sum(runs * entry.cycles[name][side] for entry, runs in estimates) for side in range(3)]
+        low, typical = round(chain.mean * core.low), round(chain.mean * core.typical * BOARD_TYPICAL)
+        cycles[name] = (sums[0] + low, sums[1] + typical, sums[2] + round(chain.most * BOARD_SLOW))
+    return MonitorFootprint(
+        networks=networks,
+        chain=chain,
+        cycles=cycles,
+        constants=files.tables.bytes + sum(entry.parameter_bytes for entry, _ in estimates),
+        ram_bytes=STACK_BYTES + state + sum(runs * (entry.ram_bytes - STACK_BYTES) for entry, runs in estimates),
+        program_bytes=CHAIN_PROGRAM_BYTES + sum(entry.program_bytes for entry, _ in estimates),
+        state_bytes=state,
+    )
+
+
+def _network(part: NetworkPart | TwinPart) -> tuple[Footprint, str, int]:
+    network, runs = part.bundle.predictor, len(part.groups) if isinstance(part, TwinPart) else 1
+    whole = isinstance(network, IntegerPredictor)
+    counted = (
+        network.in_float() if isinstance(network, IntegerPredictor) and not isinstance(network, TwinPlant) else network
+    )
+    return footprint(counted), "w8a16" if whole else "float32", runs
+
+
+def state_bytes(parts: MonitorParts) -> int:
+    """Of the chain: sums of two blocks, summaries, drift, evidence, detectors, in double precision."""
+    chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
+    sums = 8 * residuals + len(chain.level) + len(chain.moving)
+    detectors = sum(w.matrix.shape[1] * (int(w.option) if w.detector == "glr" else 1) for w in chain.watches)
+    widest = max(w.matrix.shape[1] for w in chain.watches)
+    doubles = 2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 4 * len(chain.watches)
+    return int(8 * doubles + 4 * summaries + 5 * inputs + 4 * residuals + 64)
