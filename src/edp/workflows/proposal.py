@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from edp.config.experiment import TaskSettings, build
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.proposal.columns import LogColumn
 from edp.logs.proposal.groups import LogGroup, group_logs
@@ -194,9 +193,11 @@ def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
     if not measured:
         measured = proposal.of_role("command", "reference")
         if not measured:
+            texts = len(proposal.look.texts)
+            unread = f", and {texts} that hold text or share a name" if texts else ""
             raise DataError(
-                f"'{proposal.look.path}': no column moves (constants, counters and labels only); there is nothing to "
-                "predict: record while the machine works"
+                f"'{proposal.look.path}': no column moves (constants, counters and labels only{unread}); there is "
+                "nothing to predict: record while the machine works, and give each column a name of its own"
             )
         notes.append("no column looks measured: check task.targets")
     # A change of another column is a velocity, whatever its unit.
@@ -308,9 +309,10 @@ def _check(files: dict[str, str]) -> None:
     Raises:
         ConfigError: it is not; nothing was written.
     """
-    if MAP in files:
-        map_of_table(parse_toml(files[MAP], MAP), MAP)
-    build(TaskSettings, parse_toml(files[SETTINGS], SETTINGS)["task"], SETTINGS)
+    tables = {name: parse_toml(text, name) for name, text in files.items()}
+    # Settings themselves are not built here: their classes import PyTorch, which takes seconds.
+    if MAP in tables:
+        map_of_table(tables[MAP], MAP)
 
 
 def _side_by_side(proposal: MapProposal) -> dict[str, dict[str, ColumnGuess]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from edp.signals import VOCABULARY, SignalMap
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
 _MOST_NAMES = 2000
 """Columns that are compared with the vocabulary: each costs half a millisecond."""
+_MISSPELT = 0.85
+"""Likeness (`difflib`) of a name to one of the vocabulary from which it is a slip: a letter in eight."""
 _LONGEST_MISS = 64
 """Characters of a name that is compared: the time grows with the product of both lengths."""
 
@@ -108,10 +111,16 @@ def _opened(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[
             raise
         plain = plain_map(look_at_log(path))
     else:
-        # Text that looks like names nearly of the vocabulary is answered with them, as before.
-        plain = signal_map if _near_misses(raw) else plain_map(look_at_log(path))
+        # Misspelt names of the vocabulary are answered with the right ones.
+        misspelt = any(_is_misspelt(name) for name in islice(raw.signals, _MOST_NAMES))
+        plain = signal_map if misspelt else plain_map(look_at_log(path))
     raw = open_log(path, plain)
     return raw, plain, *resolve(raw, plain)
+
+
+def _is_misspelt(name: str) -> bool:
+    """Whether a name is nearly one of the vocabulary: any short word is somewhat like one of so many."""
+    return len(name) <= _LONGEST_MISS and bool(get_close_matches(name, VOCABULARY, n=1, cutoff=_MISSPELT))
 
 
 def _changed(
