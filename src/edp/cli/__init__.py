@@ -21,6 +21,7 @@ from edp.cli import (
     finetune,
     footprint,
     identify,
+    init,
     inspect,
     monitor,
     parity,
@@ -49,6 +50,7 @@ app = typer.Typer(
 )
 app.command("demo")(demo.demo)
 app.command("simulate")(simulate.simulate)
+app.command("init")(init.init)
 app.command("inspect")(inspect.inspect)
 app.command("screen")(screen.screen)
 app.command("animate")(animate.animate)

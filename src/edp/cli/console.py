@@ -64,6 +64,8 @@ err = Terminal(stderr=True)
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON document to standard output and nothing else.")]
 INTERRUPTED = 130
+_GAP = 2
+"""Blanks between two columns of a table."""
 PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
@@ -84,13 +86,44 @@ def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None
 
 
 def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table; the first column is text, the others are aligned right."""
-    printed_table = _table(title)
-    for i, heading in enumerate(headings):
-        printed_table.add_column(_shown(heading), justify="left" if i == 0 else "right")
-    for row in rows:
-        printed_table.add_row(*(_shown(f"{cell:,}" if isinstance(cell, int) else str(cell)) for cell in row))
-    out.print(printed_table)
+    """Print a table; the first column is text, the others are aligned right.
+
+    Columns that do not fit beside each other stand below each other, each block with the first column.
+    """
+    texts = [[_cell(cell) for cell in row] for row in rows]
+    for i, block in enumerate(_blocks(headings, texts, out.width)):
+        printed_table = _table(title if not i else "")
+        for heading in (headings[column] for column in block):
+            first = not printed_table.columns
+            # Names are folded, never cut: six rows of a table once all read CylPress...
+            printed_table.add_column(
+                _shown(heading), justify="left" if first else "right", overflow="fold", no_wrap=not first
+            )
+        for row in texts:
+            printed_table.add_row(*(row[column] for column in block if column < len(row)))
+        out.print(printed_table)
+
+
+def _cell(value: Any) -> Text:
+    return _shown(f"{value:,}" if isinstance(value, int) else str(value))
+
+
+def _blocks(headings: Sequence[str], rows: Sequence[Sequence[Text]], width: int) -> list[list[int]]:
+    """Columns by blocks that fit into a width, each with the first one."""
+    widths = [
+        max([_shown(heading).cell_len, *(row[i].cell_len for row in rows if i < len(row))])
+        for i, heading in enumerate(headings)
+    ]
+    # A long name takes at most half of a line, and is folded.
+    first = min(widths[0], max(width // 2, 1)) if widths else 0
+    blocks: list[list[int]] = []
+    for column in range(1, len(widths)):
+        used_width = first + sum(widths[other] + _GAP for other in blocks[-1][1:]) if blocks else 0
+        if not blocks or used_width + widths[column] + _GAP > width:
+            blocks.append([0, column])
+        else:
+            blocks[-1].append(column)
+    return blocks or [list(range(len(widths)))]
 
 
 def listing(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
-from edp.cli.quality import LogDisplay, show_between, show_report, verdict_text
+from edp.cli.quality import LogDisplay, show_between, show_lines, show_report, verdict_text
 from edp.cli.train import MapOption
-from edp.errors import EdpError
+from edp.errors import DataError, EdpError
 
 if TYPE_CHECKING:
     from edp.data.coverage import Coverage
@@ -23,7 +23,10 @@ FAULTY = 3
 def inspect(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     signal_map: MapOption = None,
-    channels: Annotated[bool, typer.Option(help="Show a row for each channel.")] = True,
+    details: Annotated[
+        bool | None,
+        typer.Option(help="Show each channel and finding of each log, and all coverage; default: of a single log."),
+    ] = None,
     covered: Annotated[
         bool, typer.Option("--coverage/--no-coverage", help="Show the coverage of the operating range.")
     ] = True,
@@ -52,7 +55,11 @@ def inspect(
     asked = page is not None or bool(split or inputs)
     coverage_facts, why = None, "" if covered or asked else "not asked for"
     # Recordings with errors have no coverage: training would refuse them.
-    if not errors and (covered or asked):
+    if quality.proposed and (covered or asked):
+        why = "no signal map says which channels command and which move; edp init proposes one (--map)"
+        if asked:
+            raise DataError(f"'{data}': {why}")
+    elif not errors and (covered or asked):
         coverage_facts, why = _coverage(source, split, tuple(filter(None, inputs.split(","))), asked)
     if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
@@ -60,17 +67,23 @@ def inspect(
         build_coverage_page(coverage_facts, page, data.resolve().stem, quality)
 
     def show() -> None:
-        for report in quality.reports:
-            show_report(report, channels)
+        whole = len(quality.reports) == 1 if details is None else details
+        if whole:
+            for report in quality.reports:
+                show_report(report)
+        else:
+            show_lines(quality)
         show_between(quality)
         if coverage_facts is not None:
-            show_coverage(coverage_facts)
+            show_coverage(coverage_facts, whole)
         elif why and covered:
             out.print(f"coverage: {why}")
         if coverage_facts is not None and page is not None:
             out.print(f"page: {page.resolve()}")
         out.print(verdict_text(quality))
-        if not errors:
+        if quality.proposed:
+            out.print(f"next: edp init {data}, which writes a signal map and settings; then edp train with both")
+        elif not errors:
             mapped = "" if signal_map is None else f" --map {signal_map}"
             out.print(f"next: edp train {data}{mapped} --out runs/first")
 
@@ -98,8 +111,8 @@ def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bo
         return None, str(error)
 
 
-def show_coverage(coverage: Coverage) -> None:
-    """Print what a data set covers."""
+def show_coverage(coverage: Coverage, whole: bool = True) -> None:
+    """Print what a data set covers; where not the `whole`, only the figures that are wanted of it."""
     from edp.data.coverage_targets import wanted
 
     rows: list[tuple[Any, ...]] = []
@@ -134,6 +147,17 @@ def show_coverage(coverage: Coverage) -> None:
     if judged:
         table("wanted of data to learn a machine from", ["", "here", "wanted", "verdict"], judged)
         out.print()
+    if whole:
+        _show_all_coverage(coverage)
+    for warning in coverage.contradictions:
+        out.print(f"  warning: {warning}")
+    for note in coverage.absent:
+        out.print(f"  note: {note}")
+    out.print()
+
+
+def _show_all_coverage(coverage: Coverage) -> None:
+    """Print commands, events and joint histograms."""
     moves = [(a.axis, *(_count(v) for v in (a.reversals, a.crossings)), _share(a.active)) for a in coverage.activity]
     table("commands", ["axis", "reversals", "dead-band crossings", "time active"], moves)
     out.print()
@@ -148,11 +172,6 @@ def show_coverage(coverage: Coverage) -> None:
         for j in coverage.joints
     ]
     table("joint histograms", ["", "with", "bins filled", "correlation", "mutual information, nat"], pairs)
-    for warning in coverage.contradictions:
-        out.print(f"  warning: {warning}")
-    for note in coverage.absent:
-        out.print(f"  note: {note}")
-    out.print()
 
 
 def _verdict(met: bool) -> str:

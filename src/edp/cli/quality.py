@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,11 @@ if TYPE_CHECKING:
 
     from edp.logs import DataQuality, Finding, QualityReport
 
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_MOST_KINDS = 12
+"""Kinds of findings of one severity that are shown without --details."""
+_MOST_NAMED = 4
+"""Logs that are named beside one."""
 VERDICT_TEXTS = {
     "good": "good: use them as they are",
     "check": "check: read the warnings before training",
@@ -33,8 +39,8 @@ class LogDisplay:
         self.steps.say(f"read: {path.name}, {number} of {count}")
 
 
-def show_report(report: QualityReport, channels: bool) -> None:
-    """Print one recording's facts and findings."""
+def show_report(report: QualityReport) -> None:
+    """Print one recording's facts, a row for each channel, and all findings."""
     out.print(report.name, style="bold", end="")
     out.print(
         f": {report.duration_s:.1f} s, {report.rate_hz:g} Hz, {report.samples:,} samples, verdict: {report.verdict}"
@@ -42,7 +48,7 @@ def show_report(report: QualityReport, channels: bool) -> None:
     for clock in report.clocks:
         gaps = f"{clock.gaps} gap(s), longest {clock.longest_gap_s:g} s" if clock.gaps else "no gaps"
         out.print(f"  time of '{clock.name}': {clock.rate_hz:g} Hz, jitter {clock.jitter:.2g} of a step, {gaps}")
-    if channels and report.channels:
+    if report.channels:
         rows = [(c.name, c.unit, *map(_short, (c.min, c.max, c.mean, c.std)), c.missing) for c in report.channels]
         table("", ["channel", "unit", "min", "max", "mean", "std", "missing"], rows)
         out.print()
@@ -56,6 +62,36 @@ def show_report(report: QualityReport, channels: bool) -> None:
         )  # fmt: skip
     for finding in report.findings:
         show_finding(finding)
+    out.print()
+
+
+def show_lines(quality: DataQuality) -> None:
+    """Print a line a log, then each kind of finding once with the logs that have it."""
+    rows = []
+    for report in quality.reports:
+        counts = [sum(f.severity == severity for f in report.findings) for severity in ("error", "warning", "note")]
+        figures = [f"{report.duration_s:,.1f}", f"{report.rate_hz:g}", len(report.channels), *counts, report.verdict]
+        rows.append([report.name, *figures])
+    table("", ["log", "s", "Hz", "channels", "errors", "warnings", "notes", "verdict"], rows)
+    out.print()
+    kinds: dict[tuple[str, str | None, str], list[tuple[str, Finding]]] = {}
+    for report in quality.reports:
+        for finding in report.findings:
+            # The same finding has other numbers in each log.
+            what = _NUMBER.sub("#", finding.what.replace(report.source, ""))
+            kinds.setdefault((finding.severity, finding.channel, what), []).append((report.name, finding))
+    for severity in ("error", "warning", "note"):
+        chosen = [each for (of, _, _), each in kinds.items() if of == severity]
+        if severity == "note" and chosen:
+            out.print(f"  {len(chosen)} kind(s) of notes; --details shows them")
+            break
+        for each in sorted(chosen, key=len, reverse=True)[:_MOST_KINDS]:
+            show_finding(each[0][1])
+            if len(quality.reports) > 1:
+                names = ", ".join(name for name, _ in each[:_MOST_NAMED]) + (", ..." if len(each) > _MOST_NAMED else "")
+                out.print(f"    in {len(each)} of {len(quality.reports)} logs: {names}")
+        if len(chosen) > _MOST_KINDS:
+            out.print(f"  and {len(chosen) - _MOST_KINDS} more kinds of {severity}s; --details shows them")
     out.print()
 
 

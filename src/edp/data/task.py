@@ -173,7 +173,7 @@ class Task:
                 raise DataError(
                     f"recording '{recording.name}' ({recording.source}): channel '{names[which]}' has "
                     f"{int(bad[:, which].sum())} missing or infinite value(s), the first at row {start + row}; "
-                    'repair the log or allow a repair (nan = "hold")'
+                    "repair the log or allow a repair (--repair nan=hold)"
                 )
         machine = str(recording.meta.get(MACHINE, "")).lower()
         return Series(name or recording.name, inputs, np.ascontiguousarray(targets), machine=machine)

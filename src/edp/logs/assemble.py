@@ -298,7 +298,7 @@ def _timelines(
             signal_names = ", ".join(list(raw.signals)[:12])
             raise DataError(
                 f"'{raw.path}' has no time column that fits '{signal.name}' (columns: {signal_names}); "
-                "set 'time' in the signal map to its name, or set 'sample_time_s'"
+                "set 'time' in the signal map (--map) to its name, or set 'sample_time_s'"
             )
         where = f"'{raw.path}', time of '{signal.name}'"
         clock, order, repaired = repair_stamps(signal.time_s, repair, where)

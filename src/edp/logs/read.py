@@ -222,7 +222,7 @@ def _check_same(recordings: Sequence[Recording], files: Sequence[Path]) -> None:
         if abs(recording.rate_hz - first.rate_hz) > RATE_TOLERANCE * first.rate_hz:
             raise DataError(
                 f"mixed rates: {files[0].name} {first.rate_hz:.6g} Hz, {file.name} {recording.rate_hz:.6g} Hz; "
-                "set rate_hz in the signal map"
+                "set rate_hz in the signal map (--map)"
             )
         if recording.channel_names != first.channel_names:
             lacks = sorted(set(first.channel_names) - set(recording.channel_names))
@@ -231,7 +231,7 @@ def _check_same(recordings: Sequence[Recording], files: Sequence[Path]) -> None:
             parts += [f"has in addition {', '.join(extra)}"] if extra else []
             raise DataError(
                 f"mixed channels: {file.name} {' and '.join(parts) or 'has another order'} compared with "
-                f"{files[0].name}; list the wanted channels in the signal map"
+                f"{files[0].name}; list the wanted channels in the signal map (--map)"
             )
 
 

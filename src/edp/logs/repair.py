@@ -62,7 +62,8 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
         if repair.falling == "refuse":
             raise DataError(
                 f"{where}: time goes back in {len(clock.falling)} row(s), first in row {clock.falling[0]} "
-                f'(t = {stamps[clock.falling[0]]:g} s); repair the file or set repair falling = "sort"'
+                f'(t = {stamps[clock.falling[0]]:g} s); repair the file or set repair falling = "sort" '
+                "(--repair falling=sort)"
             )
         repairs.append({"repair": "falling = sort", "count": len(clock.falling), "row": int(clock.falling[0])})
         # Stable: rows of equal stamps keep their order, so that `last` means the last in the file.
@@ -73,7 +74,8 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
         if repair.duplicates == "refuse":
             raise DataError(
                 f"{where}: {len(clock.duplicates)} duplicate time stamp(s), first in row {clock.duplicates[0]} "
-                f'(t = {stamps[clock.duplicates[0]]:g} s); repair the file or set repair duplicates = "last"'
+                f'(t = {stamps[clock.duplicates[0]]:g} s); repair the file or set repair duplicates = "last" '
+                "(--repair duplicates=last)"
             )
         repairs.append({"repair": "duplicates = last", "count": len(clock.duplicates), "row": int(clock.duplicates[0])})
         last = np.append(np.diff(stamps) > 0, True)
@@ -95,7 +97,8 @@ def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tu
     if repair.gaps == "refuse":
         raise DataError(
             f"{where}: {len(starts)} gap(s) in time, first at row {starts[0]} (t = {starts[0] / rate_hz:g} s), longest "
-            f'{longest:g} s; set repair gaps = "hold", "cut" (keep the longest stretch) or "keep" (NaN)'
+            f'{longest:g} s; set repair gaps = "hold" (--repair gaps=hold), "cut" (keep the longest stretch) '
+            'or "keep" (NaN)'
         )
     fact = {"repair": f"gaps = {repair.gaps}", "count": len(starts), "row": int(starts[0]), "longest_s": longest}
     if repair.gaps != "cut":
@@ -139,7 +142,7 @@ def repair_values(
         if repair.nan == "refuse":
             raise DataError(
                 f"{where}: channel '{name}' has {len(rows)} missing or infinite value(s), first in row {first} "
-                f'(t = {first / rate_hz:g} s); repair the file or set repair nan = "hold"'
+                f'(t = {first / rate_hz:g} s); repair the file or set repair nan = "hold" (--repair nan=hold)'
             )
         # Nothing is taken from later samples, which a machine would not have had.
         if bad[0]:

@@ -101,7 +101,10 @@ def _nothing_known(raw: RawLog) -> DataError:
     near = [f"'{name}'{hint}" for name in names if (hint := closest(name, VOCABULARY)).startswith("; did")]
     shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
     text = near[0] if near else "none is in the built-in vocabulary (Table A.1)"
-    return DataError(f"'{raw.path}' has the columns {shown}: {text}; rename columns or give a signal map")
+    return DataError(
+        f"'{raw.path}' has the columns {shown}: {text}; rename columns or give a signal map (--map; edp init "
+        "proposes one)"
+    )
 
 
 def _one(raw: RawLog, entry: ChannelMap) -> ChannelSource:

@@ -19,7 +19,7 @@ COMMANDS = [command.name for command in app.registered_commands]
 EXPECTED = [
     *("demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "distil", "compress", "footprint"),
     *("quantise", "export", "parity", "pretrain", "finetune", "adapt", "replay", "report", "twin", "rollout"),
-    *("identify", "control", "tune"),
+    *("identify", "control", "tune", "init"),
 ]
 
 
@@ -82,7 +82,7 @@ def test_whole_path_from_the_simulator_to_the_page(edp, tmp_path, small):
 
 
 def test_output_for_people_names_the_next_command(edp, logs, trained, tmp_path, small):
-    assert f"edp train {logs}" in edp("inspect", logs, "--no-channels").out
+    assert f"edp train {logs}" in edp("inspect", logs, "--no-details").out
     assert "edp evaluate" in edp("train", logs, "--out", tmp_path / "run", *small).out
     judged = edp("evaluate", trained, "--baselines", "persistence").out
     assert "100 ms ahead (k = 10)" in judged
@@ -220,7 +220,7 @@ def test_soil_family_and_format_of_the_command_line_go_before_the_scenario_file(
 
 def test_inspect_shows_and_draws_what_the_data_cover(edp, logs, tmp_path):
     page = tmp_path / "coverage.html"
-    shown = edp("inspect", logs, "--no-channels", "--split", "time", "--page", page)
+    shown = edp("inspect", logs, "--details", "--split", "time", "--page", page)
     assert shown.code == 0
     assert "smallest singular value" in shown.out
     assert "test to train, median" in shown.out

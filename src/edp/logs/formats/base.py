@@ -253,7 +253,7 @@ def find_time(names: Sequence[str], signal_map: SignalMap, path: Path) -> str | 
         if signal_map.time not in names:
             raise DataError(
                 f"'{path}' has no time column '{signal_map.time}'{closest(signal_map.time, names)}; "
-                "set 'time' in the signal map to an existing column, or set 'sample_time_s'"
+                "set 'time' in the signal map (--map) to an existing column, or set 'sample_time_s'"
             )
         return signal_map.time
     for time_name in _TIME_NAMES:

@@ -41,6 +41,8 @@ _MOST_CELLS_LOOKED = 200_000
 _DELIMITERS = (",", ";", "\t", "|")
 """In the order in which a tie is decided."""
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")
+NAME_BY_PLACE = re.compile(r"column_\d+")
+"""Name of a column of a file that names none."""
 _STATED = re.compile(r'sep=([^\w\s"]|\t)', re.IGNORECASE)
 _ROWS_LOOKED = 200
 """Rows in which the layout is looked for."""
@@ -110,26 +112,29 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
     if not rows:
         raise DataError(f"'{path}' holds no rows; expected a header row and numbers")
     check_names(path, () if len(rows[0]) <= MOST_COLUMNS else map(str, range(len(rows[0]))))
-    place = find_table(rows, _number_of_any_kind(delimiter), _is_unit_row) or TablePlace(0, 0)
-    named = place.header < place.first
-    rows[place.header] = [*rows[place.header], *[""] * place.padding]
-    head = rows[place.header]
-    body = rows[place.first :] if named else rows[place.header + signal_map.header :]
+    table_place = find_table(rows, _number_of_any_kind(delimiter), _is_unit_row) or TablePlace(0, 0)
+    named = table_place.header < table_place.first
+    rows[table_place.header] = [*rows[table_place.header], *[""] * table_place.padding]
+    head = rows[table_place.header]
+    body = rows[table_place.first :] if named else rows[table_place.header + signal_map.header :]
     decimal = signal_map.decimal
     if decimal == "." and _has_decimal_commas(body, delimiter):
         decimal = ","
     if not signal_map.header:
-        body = rows[place.first :]
+        body = rows[table_place.first :]
         names, units = _stated_columns(path, body, signal_map)
-        used = place.first
+        used = table_place.first
     elif _holds_numbers_only(head, decimal):
-        names, units, used = *_names_beside(path, rows[place.header :], remark, delimiter, signal_map), place.header
+        names, units, used = (
+            *_names_beside(path, rows[table_place.header :], remark, delimiter, signal_map),
+            table_place.header,
+        )
         body = rows[used:]
     else:
-        names, units, more = _header(rows[place.header :])
-        used = place.first if named else place.header + more
+        names, units, more = _header(rows[table_place.header :])
+        used = table_place.first if named else table_place.header + more
         if named:
-            units = _units_between(rows[place.header + 1 : place.first], units)
+            units = _units_between(rows[table_place.header + 1 : table_place.first], units)
         body = rows[used:]
     skip += ends[used - 1] if used else 0
     numeric = tuple(all(is_number(row[i], decimal) for row in body if i < len(row)) for i in range(len(names)))
@@ -153,7 +158,7 @@ def _holds_numbers_only(head: list[str], decimal: str) -> bool:
 def _names_beside(
     path: Path, rows: list[list[str]], remark: str, delimiter: str, signal_map: SignalMap
 ) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
-    """Names of columns that no row holds: from the comment above the numbers, else by place where all are taken.
+    """Names of columns that no row holds: from the comment above the numbers, else by number where all are taken.
 
     Raises:
         DataError: neither.
@@ -170,8 +175,8 @@ def _names_beside(
         return tuple(f"column_{i + 1}" for i in range(width)), (None,) * width
     shown = ", ".join(cell[:20] for cell in rows[0][:4])
     raise DataError(
-        f"'{path}': the first row holds numbers, not names ({shown}); set header = false in the signal map and list "
-        "its columns, or let `edp init` write one"
+        f"'{path}': the first row holds numbers, not names ({shown}); set header = false in the signal map (--map) "
+        "and list its columns, or let `edp init` write one"
     )
 
 

@@ -160,7 +160,7 @@ def _check_missing(at: Looked) -> list[Finding]:
         return []
     infinite = int(np.isinf(at.values).sum())
     what = f"missing values (NaN), {infinite} of them infinite" if infinite else "missing values (NaN)"
-    advice = 'repair the file, or read with repair nan = "hold" (gaps: "hold" or "cut")'
+    advice = "repair the file, or read with --repair nan=hold (gaps: gaps=hold or gaps=cut)"
     return [Finding("error", at.channel.name, what, len(bad), place_of(int(bad[0]), at.rate_hz), advice)]
 
 

@@ -40,6 +40,11 @@ class DataQuality:
         return sum(len(report.errors) for report in self.reports)
 
     @property
+    def proposed(self) -> bool:
+        """Whether a log was read by a proposed map, for want of another one."""
+        return any(report.proposed for report in self.reports)
+
+    @property
     def verdict(self) -> str:
         """Of the worst finding: ``unusable`` as it is, ``check`` before use, or ``good``."""
         every = [finding for report in self.reports for finding in report.findings]

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from edp.errors import DataError, closest
+from edp.errors import DataError, EdpError, closest
 from edp.logs.assemble import assemble
 from edp.logs.detect import open_log
 from edp.logs.formats.base import RawLog
 from edp.logs.formats.names import name_of_file
+from edp.logs.proposal.columns import look_at_log
+from edp.logs.proposal.propose import plain_map
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.quality import ClockFacts, QualityReport, inspect
 from edp.logs.quality.repeats import Sketch, sketch
@@ -25,6 +29,8 @@ from edp.signals import VOCABULARY, SignalMap
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
 _MOST_NAMES = 2000
 """Columns that are compared with the vocabulary: each costs half a millisecond."""
+_MISSPELT = 0.85
+"""Likeness (`difflib`) of a name to one of the vocabulary from which it is a slip: a letter in eight."""
 _LONGEST_MISS = 64
 """Characters of a name that is compared: the time grows with the product of both lengths."""
 
@@ -59,10 +65,15 @@ def look_into(
     Raises:
         DataError: as `inspect_log`.
     """
-    signal_map = signal_map or SignalMap()
-    raw = open_log(path, signal_map)
-    sources, problems = resolve(raw, signal_map)
+    original_map = signal_map or SignalMap()
+    raw, signal_map, sources, problems = _opened(Path(path), original_map)
+    proposed = signal_map != original_map
     findings = [Finding("error", None, str(problem)) for problem in problems]
+    if proposed:
+        what = (
+            "no map was given and no column has a name of the vocabulary: columns are taken for what edp init proposes"
+        )
+        findings.append(Finding("note", None, what, 1, "", "edp init writes a map to check"))
     if not signal_map.channels and not signal_map.others:
         findings += _near_misses(raw)
     findings += _unit_clashes(raw, signal_map)
@@ -75,12 +86,41 @@ def look_into(
     except DataError as error:
         findings.append(Finding("error", None, str(error)))
         empty = Recording(name or name_of_file(raw.path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
-        return inspect(empty, tuple(findings)), None
+        return replace(inspect(empty, tuple(findings)), proposed=proposed), None
     findings += _changed(raw, recording, signal_map, rows)
     for signal, clock in clocks:
         findings += _time_findings(signal, clock)
     facts = tuple(_clock_facts(signal, clock) for signal, clock in clocks)
-    return inspect(recording, tuple(findings), facts), sketch(recording)
+    return replace(inspect(recording, tuple(findings), facts), proposed=proposed), sketch(recording)
+
+
+def _opened(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[ChannelSource], list[EdpError]]:
+    """The log with its channels: by the map, or where none was given and no column is known, by a proposed one.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    try:
+        raw = open_log(path, signal_map)
+        sources, problems = resolve(raw, signal_map)
+        if sources or signal_map != SignalMap():
+            return raw, signal_map, sources, problems
+    except DataError:
+        # A file without names of columns is one that nobody described; all others stay unreadable.
+        if signal_map != SignalMap():
+            raise
+        plain = plain_map(look_at_log(path))
+    else:
+        # Misspelt names of the vocabulary are answered with the right ones.
+        misspelt = any(_is_misspelt(name) for name in islice(raw.signals, _MOST_NAMES))
+        plain = signal_map if misspelt else plain_map(look_at_log(path))
+    raw = open_log(path, plain)
+    return raw, plain, *resolve(raw, plain)
+
+
+def _is_misspelt(name: str) -> bool:
+    """Whether a name is nearly one of the vocabulary: any short word is somewhat like one of so many."""
+    return len(name) <= _LONGEST_MISS and bool(get_close_matches(name, VOCABULARY, n=1, cutoff=_MISSPELT))
 
 
 def _changed(
@@ -157,18 +197,31 @@ def _time_findings(name: str, clock: Clock) -> list[Finding]:
         row = int(clock.falling[0])
         what = f"time goes back ('{name}')"
         where = f"row {row} (t = {at[row]:g} s)"
-        findings.append(Finding("error", None, what, len(clock.falling), where, 'repair falling = "sort"'))
+        findings.append(
+            Finding("error", None, what, len(clock.falling), where, 'repair falling = "sort" (--repair falling=sort)')
+        )
     if len(clock.duplicates):
         row = int(clock.duplicates[0])
         what = f"duplicate time stamps ('{name}')"
         where = f"row {row} (t = {at[row]:g} s)"
-        findings.append(Finding("error", None, what, len(clock.duplicates), where, 'repair duplicates = "last"'))
+        findings.append(
+            Finding(
+                "error",
+                None,
+                what,
+                len(clock.duplicates),
+                where,
+                'repair duplicates = "last" (--repair duplicates=last)',
+            )
+        )
     if len(clock.gaps):
         row = int(clock.gaps[0])
         longest = float((at[clock.gaps + 1] - at[clock.gaps]).max())
         what = f"gaps in time ('{name}'), longest {longest:g} s"
         where = f"after row {row} (t = {at[row]:g} s)"
-        findings.append(Finding("error", None, what, len(clock.gaps), where, 'repair gaps = "hold" or "cut"'))
+        findings.append(
+            Finding("error", None, what, len(clock.gaps), where, 'repair gaps = "hold" or "cut" (--repair gaps=hold)')
+        )
     if not clock.uniform:
         what = f"time steps are not uniform ('{name}'): rms {clock.jitter:.3g} of a step, median {clock.step_s:g} s"
         advice = f"rows are resampled causally to {clock.rate_hz:g} Hz; set rate_hz for another rate"

@@ -84,7 +84,11 @@ class ClockFacts:
 
 @dataclass(frozen=True)
 class QualityReport:
-    """All findings of one log, worst first, with the facts of its time and channels."""
+    """All findings of one log, worst first, with the facts of its time and channels.
+
+    Where it is `proposed`, no map was given and no column is of the vocabulary: channels are what `edp init` would take
+    the columns for.
+    """
 
     name: str
     source: str
@@ -95,6 +99,7 @@ class QualityReport:
     clocks: tuple[ClockFacts, ...]
     channels: tuple[ChannelFacts, ...]
     findings: tuple[Finding, ...]
+    proposed: bool = False
 
     @property
     def errors(self) -> tuple[Finding, ...]:

@@ -1,0 +1,115 @@
+"""``edp init``: a signal map and settings proposed for logs that nobody described."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress
+from edp.cli.quality import LogDisplay
+from edp.errors import ConfigError
+
+if TYPE_CHECKING:
+    from edp.logs.proposal.propose import ColumnGuess
+    from edp.workflows.proposal import LogsProposal
+
+_SHOWN_ROWS = 60
+"""Columns in the table; all of them are in the map and in --json."""
+_SHOWN_NAME = 20
+"""Characters of a name in the table, which fits into 80 columns."""
+
+
+def init(
+    logs: Annotated[Path, typer.Argument(help="A log, or a folder of logs, of any columns.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder to write map.toml and settings.toml into.")] = Path(),
+    yes: Annotated[bool, typer.Option("--yes", help="Write the files without asking.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Propose which column is what, and what to predict; write a signal map and settings.
+
+    Says how sure it is of each column and what to check. A channel that it is unsure of is taken as numbers without a
+    unit. Only bounded parts of the logs are read.
+
+    Example: `edp init logs/ --yes`
+    """
+    from edp.workflows.proposal import propose, write_proposal
+
+    if not yes and not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigError("edp init asks before it writes, and there is no terminal to ask on; give --yes")
+    with progress(as_json) as shown:
+        proposal = propose(logs, LogDisplay(shown, Steps(as_json)).on_log)
+    if not as_json:
+        show_proposal(proposal)
+    if not yes and not typer.confirm(f"Write {' and '.join(proposal.files)} into '{folder}'?", err=True):
+        err.print("nothing was written")
+        raise typer.Exit(1)
+    paths = write_proposal(proposal, folder, overwrite)
+    commands = proposal.commands(folder)
+
+    def show() -> None:
+        for path in paths:
+            out.print(f"wrote {path}")
+        out.print("next: " + commands[0])
+        for command in commands[1:]:
+            out.print("      " + command)
+
+    emit(as_json, _facts(proposal, paths, commands), show)
+
+
+def show_proposal(proposal: LogsProposal) -> None:
+    """Print what each column is taken for, within 80 columns, and what else a person should know."""
+    look, clock = proposal.proposal.look, proposal.proposal.clock
+    rate = "unknown rate" if clock.rate_hz is None else f"{clock.rate_hz:.5g} Hz"
+    count = len(proposal.group.paths)
+    out.print(f"{count} log(s) with these columns; {look.path.name}: {look.rows:,} rows, {rate}")
+    columns = proposal.proposal.columns
+    rows = [_row(guess) for guess in columns[:_SHOWN_ROWS]]
+    listing("", ["column", "role", "kind", "unit", "sure", "check"], rows)
+    if len(columns) > _SHOWN_ROWS:
+        out.print(f"and {len(columns) - _SHOWN_ROWS:,} more columns, which --json lists")
+    for note in proposal.notes:
+        out.print(f"  note: {note}")
+    if proposal.repairs:
+        out.print(f"  note: training needs repairs: {', '.join(proposal.repairs)}")
+    out.print(f"to predict: {', '.join(proposal.targets)}")
+    unsure = sum(guess.sureness == "unsure" for guess in columns if guess.channel)
+    if unsure:
+        out.print(f"unsure of {unsure} channel(s): taken as numbers without a unit (generic) until the map says more")
+
+
+def _row(guess: ColumnGuess) -> tuple[str, ...]:
+    name = guess.column if len(guess.column) <= _SHOWN_NAME else guess.column[: _SHOWN_NAME - 3] + "..."
+    kind = (str(guess.kind.kind).replace("_", " "), guess.kind.unit) if guess.channel else ("-", "-")
+    return name, guess.role, *kind, guess.sureness, guess.check or guess.why
+
+
+def _facts(proposal: LogsProposal, paths: list[Path], commands: list[str]) -> dict[str, Any]:
+    clock = proposal.proposal.clock
+    return {
+        "files": [str(path) for path in paths],
+        "logs": [str(path) for path in proposal.group.paths],
+        "rate_hz": clock.rate_hz,
+        "time": clock.column,
+        "columns": [
+            {
+                "column": guess.column,
+                "channel": guess.channel or None,
+                "role": guess.role,
+                "kind": str(guess.kind.kind),
+                "unit": guess.kind.unit,
+                "sure": guess.sureness,
+                "confidence": guess.confidence,
+                "why": "; ".join(filter(None, (guess.why, guess.kind.why))),
+                "check": guess.check,
+            }
+            for guess in proposal.proposal.columns
+        ],
+        "targets": list(proposal.targets),
+        "repairs": list(proposal.repairs),
+        "notes": list(proposal.notes),
+        "next": commands,
+    }

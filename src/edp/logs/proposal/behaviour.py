@@ -1,0 +1,223 @@
+"""What numbers of columns say: time, counters, constants, steps, and which columns follow from others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edp.logs.formats.base import Column
+from edp.logs.proposal.columns import LogColumn
+
+RELATED = 24
+"""Columns that are compared in pairs: the work grows with the square."""
+_ALIKE = 0.97
+"""Correlation from which one column is a change, a copy or a reference of another; chance and common motion reach
+0.9 on logs of a machine that repeats one cycle."""
+_LAGS = 25
+"""Samples by which a reference may lead what follows it."""
+_HOLDS = 0.9
+"""Share of equal neighbours from which a column moves in steps."""
+_FEW = 12
+"""Distinct values of a label at most."""
+_SLOW = 2e-3
+"""Changes a row of a label at most: operators switch seldom."""
+_SPANS = (1, 4, 16)
+"""Rows over which a change is compared with a velocity: noise hides it over one, motion over many."""
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """What the numbers of one column say.
+
+    Attributes:
+        filled: share of rows that hold a number.
+        low: smallest value.
+        high: largest value.
+        constant: one value throughout.
+        whole: whole numbers only.
+        levels: distinct values.
+        holds: share of rows that repeat the row before.
+        rises: no row is below the one before.
+        climbs: every row is above the one before.
+        step: median of the steps that are not zero, 0 where there are none.
+        even: nearly all steps have one size.
+        restarts: rows at which an even rise begins anew.
+    """
+
+    filled: float
+    low: float
+    high: float
+    constant: bool
+    whole: bool
+    levels: int
+    holds: float
+    rises: bool
+    climbs: bool
+    step: float
+    even: bool
+    restarts: int
+
+    @property
+    def counts(self) -> bool:
+        """Rows are numbered, or parts of the log are: whole numbers that rise by one."""
+        return self.whole and self.rises and not self.constant and abs(self.step - 1.0) < 1e-9
+
+    @property
+    def switches(self) -> bool:
+        """A few whole values, changed seldom."""
+        return self.whole and self.levels <= _FEW and self.changes <= _SLOW and not self.constant
+
+    @property
+    def changes(self) -> float:
+        """Share of rows that differ from the row before."""
+        return 1.0 - self.holds
+
+    @property
+    def steps(self) -> bool:
+        """Moves in steps and holds its value between them."""
+        return self.holds >= _HOLDS and not self.constant
+
+
+def behaviour_of(column: LogColumn) -> Behaviour:
+    """Look at one column."""
+    values = column.values
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return Behaviour(0.0, np.nan, np.nan, True, False, 0, 1.0, False, False, 0.0, False, 0)
+    steps = np.concatenate([np.diff(piece) for piece in column.pieces])
+    steps = steps[np.isfinite(steps)]
+    moving = steps[steps != 0]
+    step = float(np.median(moving)) if len(moving) else 0.0
+    first = column.pieces[0]
+    rounded = (first[-1] - first[0]) / (len(first) - 1) if len(first) > 1 else np.nan
+    # The mean step knows more than a printed one, unless rows are lost.
+    if step > 0 and abs(rounded - step) < 0.1 * step:
+        step = float(rounded)
+    near = np.abs(moving - step) <= 0.1 * abs(step)
+    falls = int(np.count_nonzero(steps < 0))
+    constant = bool(finite.min() == finite.max())
+    return Behaviour(
+        filled=len(finite) / len(values),
+        low=float(finite.min()),
+        high=float(finite.max()),
+        constant=constant,
+        whole=bool(np.all(finite == np.rint(finite))),
+        levels=len(np.unique(finite)),
+        holds=float(np.mean(steps == 0)) if len(steps) else 1.0,
+        rises=falls == 0,
+        climbs=bool(len(steps)) and bool(np.all(steps > 0)),
+        step=step,
+        even=bool(len(moving)) and float(near.mean()) > 0.9,
+        restarts=falls if step > 0 and falls and float(near.mean()) > 0.9 else 0,
+    )
+
+
+@dataclass(frozen=True)
+class Relation:
+    """How a column follows from another one.
+
+    Attributes:
+        how: ``change`` (its change in time), ``copy`` or ``reference`` (what the other one follows).
+        other: name of the other column.
+        factor: for a change the column over the change of the other a row.
+        strength: correlation.
+    """
+
+    how: str
+    other: str
+    factor: float
+    strength: float
+
+
+def relations_of(columns: list[LogColumn]) -> dict[str, Relation]:
+    """The strongest relation of each column that has one, by name; among the first `RELATED` columns."""
+    chosen = columns[:RELATED]
+    found_relations: dict[str, Relation] = {}
+    for column in chosen:
+        candidates = [relation for other in chosen if other is not column and (relation := _relation(column, other))]
+        # Copies first: a copy of a velocity is a change of the position, too.
+        order = sorted(candidates, key=lambda relation: (relation.how != "copy", -relation.strength))
+        if order:
+            found_relations[column.name] = order[0]
+    return found_relations
+
+
+def _relation(column: LogColumn, other: LogColumn) -> Relation | None:
+    own, theirs = column.pieces[0], other.pieces[0]
+    good = np.isfinite(own) & np.isfinite(theirs)
+    if good.sum() < 50 or len(own) != len(theirs):
+        return None
+    own, theirs = own[good], theirs[good]
+    if _scatter(own) == 0 or _scatter(theirs) == 0:
+        return None
+    level = _correlation(own, theirs)
+    if abs(level) > 1 - 1e-9:
+        return Relation("copy", other.name, float(np.std(own) / np.std(theirs)), abs(level))
+    change = _change(own, theirs)
+    if change is not None and change[1] > max(_ALIKE, abs(level)):
+        return Relation("change", other.name, *change)
+    return Relation("reference", other.name, 1.0, level) if _leads(own, theirs, level) else None
+
+
+def _scatter(values: Column) -> float:
+    return float(np.std(values)) if len(values) else 0.0
+
+
+def _correlation(a: Column, b: Column) -> float:
+    if len(a) < 3 or _scatter(a) == 0 or _scatter(b) == 0:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _change(own: Column, theirs: Column) -> tuple[float, float] | None:
+    """Factor and correlation of a column with the change of another, over the span that shows it best."""
+    best: tuple[float, float] | None = None
+    sums = np.concatenate(([0.0], np.cumsum(own)))
+    for span in _SPANS:
+        if len(own) < 20 * span:
+            continue
+        moved = theirs[span:] - theirs[:-span]
+        # The mean over the span, its ends shared: whether a logger differentiates forwards or backwards is open.
+        mean = 0.5 * ((sums[span:-1] - sums[: -span - 1]) + (sums[span + 1 :] - sums[1:-span])) / span
+        strength = abs(_correlation(mean, moved))
+        if best is None or strength > best[1]:
+            slope = float(mean @ moved / (moved @ moved)) * span if np.any(moved) else 0.0
+            best = (slope, strength)
+    return best
+
+
+def _leads(own: Column, theirs: Column, level: float) -> bool:
+    """Whether a column is what another one is to follow: the same level, in steps or earlier.
+
+    Sensors side by side have one level, too; neither leads.
+    """
+    spread = _scatter(theirs)
+    if level < _ALIKE or not 0.9 < _scatter(own) / spread < 1.1 or abs(float(np.mean(own - theirs))) > 0.15 * spread:
+        return False
+    still = float(np.mean(np.diff(own) == 0)), float(np.mean(np.diff(theirs) == 0))
+    if still[0] >= _HOLDS or still[1] >= _HOLDS:
+        return still[0] > still[1]
+    span = 8
+    if len(own) < 10 * (span + _LAGS):
+        return False
+    a, b = own[span:] - own[:-span], theirs[span:] - theirs[:-span]
+    middle = slice(_LAGS, len(a) - _LAGS)
+    scores = [_correlation(a[middle], np.roll(b, -lag)[middle]) for lag in range(-_LAGS, _LAGS + 1)]
+    best = int(np.argmax(scores)) - _LAGS
+    return best > 0 and scores[best + _LAGS] - scores[_LAGS] > 1e-5
+
+
+def is_steered_by(command: LogColumn, reference: LogColumn, measured: LogColumn) -> bool:
+    """Whether a column is what a controller makes of a reference and what follows it: gain, damping and offset."""
+    own, target, actual = (column.pieces[0] for column in (command, reference, measured))
+    if not len(own) == len(target) == len(actual) or len(own) < 100:
+        return False
+    rate = np.gradient(actual)
+    good = np.isfinite(own) & np.isfinite(target) & np.isfinite(rate)
+    if good.sum() < 100 or _scatter(own[good]) == 0:
+        return False
+    parts = np.column_stack([(target - actual)[good], rate[good], np.ones(int(good.sum()))])
+    fitted, *_ = np.linalg.lstsq(parts, own[good], rcond=None)
+    rest = own[good] - parts @ fitted
+    return bool(np.var(rest) < 0.1 * np.var(own[good]))

@@ -1,0 +1,123 @@
+"""Which column tells the time of rows, in which unit, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from edp.logs.formats.base import time_factor
+from edp.logs.proposal.behaviour import Behaviour
+from edp.logs.proposal.columns import LogColumn, LogLook
+from edp.logs.proposal.names import is_sample_time_name, is_time_name
+from edp.signals import TIME_UNITS, SignalMap
+
+_SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 5e8}
+"""Least value of a stamp that counts from 1970 in a unit: 2,000 or so."""
+_FASTEST_HZ = 200.0
+"""Rates above are brought down to `_USUAL_HZ`: a machine moves slower, and a tick more costs on a controller."""
+_USUAL_HZ = 100.0
+
+
+@dataclass(frozen=True)
+class ClockGuess:
+    """The time of rows.
+
+    Attributes:
+        column: the time column; None where rows are even, or signals have times of their own.
+        unit: of it.
+        sample_time_s: step of rows without a time column.
+        rate_hz: samples a second, None where nothing tells.
+        wanted_hz: rate to bring a fast log to; None keeps its own.
+        beside: columns that also tell time, and are no channels.
+        confidence: from 0 to 1.
+        check: what a person should look at.
+    """
+
+    column: str | None
+    unit: str
+    sample_time_s: float | None
+    rate_hz: float | None
+    wanted_hz: float | None = None
+    beside: tuple[str, ...] = ()
+    confidence: float = 0.9
+    check: str = ""
+
+
+def clock_of(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
+    """The time of the rows of a log."""
+    if look.rate_hz is not None:
+        return _brought_down(ClockGuess(None, "s", None, look.rate_hz, confidence=1.0))
+    if look.time is None and look.step_s is not None:
+        return _brought_down(ClockGuess(None, "s", None, 1.0 / look.step_s, confidence=0.95))
+    by_name = {column.name: column for column in look.columns}
+    if look.time is not None and look.step_s and look.time not in by_name:
+        return _brought_down(ClockGuess(look.time, "s", None, 1.0 / look.step_s, confidence=0.9))
+    column = _time_column(look, behaviours)
+    if column is not None:
+        return _of_column(column, behaviours[column.name], by_reader=look.time == column.name)
+    return _without_column(look, behaviours)
+
+
+def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
+    """The column of stamps: that of the reader, one named so, or the first of an even rise at the front."""
+    rising = [c for c in look.columns if behaviours[c.name].rises and not behaviours[c.name].constant]
+    named = [c for c in rising if c.name == look.time] + [
+        c for c in rising if is_time_name(c.name) and 1.0 - behaviours[c.name].holds > 0.5
+    ]
+    if named:
+        return named[0]
+    front = look.columns[0] if look.columns else None
+    if front is not None and front in rising and behaviours[front.name].climbs and behaviours[front.name].even:
+        return front
+    return None
+
+
+def _of_column(column: LogColumn, behaviour: Behaviour, by_reader: bool) -> ClockGuess:
+    unit, confidence, check = _unit(column, behaviour)
+    rate = 1.0 / (behaviour.step * TIME_UNITS[unit])
+    if not by_reader and not is_time_name(column.name):
+        confidence, check = min(confidence, 0.7), check or "is it time?"
+    return _brought_down(ClockGuess(column.name, unit, None, rate, None, (), confidence, check))
+
+
+def _unit(column: LogColumn, behaviour: Behaviour) -> tuple[str, float, str]:
+    """Unit of stamps, how sure, and what to check."""
+    stated = time_factor(column.name, column.unit, SignalMap())
+    ending = column.name.lower().rpartition("_")[2]
+    if column.unit or ending in TIME_UNITS:
+        unit = next(unit for unit, factor in TIME_UNITS.items() if factor == stated)
+        return unit, 0.95, ""
+    for unit, least in _SINCE_1970.items():
+        if behaviour.low > least:
+            return unit, 0.85, ""
+    if not behaviour.whole:
+        return "s", 0.85, ""
+    if behaviour.step < 5:
+        return "s", 0.65, "seconds?"
+    unit = "ms" if behaviour.step <= 1000 else "us" if behaviour.step <= 1e6 else "ns"
+    return unit, 0.65, f"{unit}?"
+
+
+def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
+    """Rows without a time column: a stated step, a clock that begins anew, or nothing at all."""
+    for column in look.columns:
+        behaviour = behaviours[column.name]
+        if behaviour.constant and behaviour.high > 0 and is_sample_time_name(column.name):
+            step = behaviour.high
+            return ClockGuess(None, "s", step, 1.0 / step, None, (column.name,), 0.8, f"a row each {step:g} s?")
+    for column in look.columns:
+        behaviour = behaviours[column.name]
+        if behaviour.restarts and behaviour.even and is_time_name(column.name):
+            step = behaviour.step
+            check = "it begins anew within the log: are rows without gaps?"
+            return ClockGuess(None, "s", step, 1.0 / step, None, (column.name,), 0.65, check)
+    return ClockGuess(None, "s", 1.0, 1.0, None, (), 0.3, "no time found: a row counts as 1 s; set sample_time_s")
+
+
+def _brought_down(clock: ClockGuess) -> ClockGuess:
+    if clock.rate_hz is None or clock.rate_hz <= _FASTEST_HZ:
+        return clock
+    check = f"{clock.rate_hz:.4g} Hz are brought to {_USUAL_HZ:g} Hz: set rate_hz"
+    return ClockGuess(
+        clock.column, clock.unit, None, clock.rate_hz, _USUAL_HZ, clock.beside, clock.confidence, clock.check or check
+    )

@@ -1,0 +1,250 @@
+"""The columns of a log as they are, a bounded part of each: what a proposal is made from."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+from edp.logs.detect import format_for, open_log
+from edp.logs.formats.base import Column, RawLog, RawSignal
+from edp.logs.formats.csv import NAME_BY_PLACE
+from edp.signals import Kind, SignalMap
+
+TEXT_BYTES = 16_000_000
+"""Of a text file that is looked at, 15 min of 20 channels at 100 Hz; text has no index, so this is its beginning."""
+MOST_COLUMNS = 400
+"""Columns that are looked at; the others are left out and counted."""
+_ROWS = 30_000
+"""Rows of the first piece, which tells time and relations; five minutes at 100 Hz."""
+_LATER_ROWS = 10_000
+"""Rows of a piece from the middle and of one from the end: a machine may rest when a log begins."""
+_VALUES = 12_000_000
+"""Numbers kept of all columns together, 96 MB."""
+_PROBE_ROWS = 1000
+"""Rows by which a column of text is told from one of numbers."""
+_MOST_TEXTS = 20
+"""Columns of text that are tried as time."""
+_TIME_WORDS = ("time", "zeit", "stamp", "date", "datum", "uhr")
+
+
+@dataclass(frozen=True, eq=False)
+class LogColumn:
+    """One column of a log.
+
+    Attributes:
+        name: the file's own.
+        pieces: values of consecutive rows, float64, NaN where missing; the first piece is the beginning.
+        samples: rows that the file has.
+        unit: as the file states it.
+        kind: as the file states it (EDP's own).
+        own_time: it has time stamps of its own, as signals of MDF and bags do.
+    """
+
+    name: str
+    pieces: tuple[Column, ...]
+    samples: int
+    unit: str | None = None
+    kind: Kind | None = None
+    own_time: bool = False
+
+    @property
+    def values(self) -> Column:
+        """All values that are kept, shape ``(rows,)``."""
+        return np.concatenate(self.pieces)
+
+
+@dataclass(frozen=True, eq=False)
+class LogLook:
+    """What was looked at of a log.
+
+    Attributes:
+        path: the log.
+        columns: those of numbers, in the file's order; of one length.
+        texts: names of columns that hold text.
+        rows: of the file, or of its part.
+        rate_hz: as the file states it.
+        time: the column that the reader takes for time by its name or its dates.
+        step_s: median step of the times that the reader made of it, None where there are none.
+        headerless: the file names no columns.
+        shared: every name occurs once.
+        left_out: columns that were not looked at, by the reason.
+        part: what share of the file was looked at, in words; empty for all of it.
+    """
+
+    path: Path
+    columns: tuple[LogColumn, ...]
+    texts: tuple[str, ...]
+    rows: int
+    rate_hz: float | None = None
+    time: str | None = None
+    step_s: float | None = None
+    headerless: bool = False
+    left_out: dict[str, int] = field(default_factory=dict)
+    part: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns of numbers."""
+        return tuple(column.name for column in self.columns)
+
+
+def look_at_log(path: Path) -> LogLook:
+    """Read a bounded part of every column.
+
+    Raises:
+        DataError: the file cannot be read, or holds no column of numbers.
+    """
+    with _bounded(path) as (part, note):
+        try:
+            return _look(path, part, note)
+        except DataError as error:
+            # The user knows the log, not the copy of its beginning.
+            raise type(error)(str(error).replace(str(part), str(path))) from error
+
+
+@contextmanager
+def _bounded(path: Path) -> Iterator[tuple[Path, str]]:
+    """The log itself, or a file with the first lines of a long text."""
+    size = path.stat().st_size if path.is_file() else 0
+    if size <= TEXT_BYTES or format_for(path).name != "csv":
+        yield path, ""
+        return
+    with path.open("rb") as stream:
+        head = stream.read(TEXT_BYTES)
+    end = head.rfind(b"\n") + 1
+    if not end:
+        raise DataError(f"'{path}': no row ends within the first {TEXT_BYTES:,} bytes; it is no table")
+    with tempfile.TemporaryDirectory(prefix="edp_") as folder:
+        part = Path(folder) / f"beginning{path.suffix.lower()}"
+        part.write_bytes(head[:end])
+        yield part, f"the first {end / 1e6:.0f} of {size / 1e6:,.0f} MB"
+
+
+def _look(path: Path, part: Path, note: str) -> LogLook:
+    # With a stated step no column is taken for time: all of them are looked at.
+    raw = open_log(part, SignalMap(others=True, sample_time_s=1.0))
+    length = _usual_length(raw)
+    signals = [signal for signal in raw.signals.values() if signal.samples == length]
+    left_out = {f"have another length than {length:,} rows": len(raw.signals) - len(signals)}
+    left_out["come after the first columns"] = max(len(signals) - MOST_COLUMNS, 0)
+    signals = signals[:MOST_COLUMNS]
+    numbers = [signal for signal in signals if _is_numeric(signal)]
+    texts = tuple(signal.name for signal in signals if signal not in numbers)
+    if not numbers:
+        raise DataError(f"'{path}' holds no column of numbers; nothing can be mapped")
+    first = min(_ROWS, max(_VALUES // len(numbers) // 2, 100))
+    ranges = _ranges(length, first, min(_LATER_ROWS, first // 3))
+    pieces = _pieces(numbers, ranges)
+    time, step_s, owners = _time_of(part, raw, texts)
+    columns = tuple(
+        LogColumn(signal.name, tuple(values), length, signal.unit, signal.kind, signal.name in owners)
+        for signal, values in zip(numbers, pieces)
+    )
+    return LogLook(
+        path,
+        columns,
+        texts,
+        length,
+        raw.rate_hz,
+        time,
+        step_s,
+        all(NAME_BY_PLACE.fullmatch(name) for name in raw.signals) and format_for(path).name == "csv",
+        {reason: count for reason, count in left_out.items() if count},
+        note,
+    )
+
+
+def _usual_length(raw: RawLog) -> int:
+    """The number of rows that most columns have, the longer one where two are as frequent."""
+    lengths = [signal.samples for signal in raw.signals.values()]
+    if not lengths or max(lengths) < 2:
+        raise DataError(f"'{raw.path}' holds no column with two rows or more; nothing can be mapped")
+    return max(set(lengths), key=lambda length: (length > 1, lengths.count(length), length))
+
+
+def _is_numeric(signal: RawSignal) -> bool:
+    """Whether its first rows are numbers."""
+    try:
+        _read([signal], 0, min(signal.samples, _PROBE_ROWS))
+    except DataError:
+        return False
+    return True
+
+
+def _ranges(length: int, first: int, later: int) -> list[tuple[int, int]]:
+    """Rows of the beginning, the middle and the end; all of a short log."""
+    if length <= first:
+        return [(0, length)]
+    middle, last = max(first, (length - later) // 2), max(first, length - later)
+    ranges = [(0, first), (middle, min(middle + later, last)), (last, length)]
+    return [(start, stop) for start, stop in ranges if stop - start > 1]
+
+
+def _read(signals: Sequence[RawSignal], start: int, stop: int) -> list[Column]:
+    """Rows of columns, those of one table in one go; each float64."""
+    columns_by_id: dict[int, Column] = {}
+    tables: dict[int, list[RawSignal]] = {}
+    for signal in signals:
+        if signal.table is None:
+            columns_by_id[id(signal)] = np.asarray(signal.load(), dtype=np.float64)[start:stop]
+        else:
+            tables.setdefault(id(signal.table), []).append(signal)
+    for group in tables.values():
+        table = group[0].table
+        if table is not None:
+            parts = list(table.pieces([signal.key for signal in group], start, stop))
+            for i, signal in enumerate(group):
+                columns = [np.asarray(part[i], dtype=np.float64) for part in parts]
+                columns_by_id[id(signal)] = np.concatenate(columns) if columns else np.empty(0)
+    return [np.where(np.isfinite(columns_by_id[id(signal)]), columns_by_id[id(signal)], np.nan) for signal in signals]
+
+
+def _pieces(signals: Sequence[RawSignal], ranges: Sequence[tuple[int, int]]) -> list[list[NDArray[np.float64]]]:
+    """Of each column its pieces; text further down makes a piece missing, not the log."""
+    columns: list[list[NDArray[np.float64]]] = [[] for _ in signals]
+    for start, stop in ranges:
+        try:
+            values = _read(signals, start, stop)
+        except DataError:
+            values = [_read_or_missing(signal, start, stop) for signal in signals]
+        for column, piece in zip(columns, values):
+            column.append(piece)
+    return columns
+
+
+def _read_or_missing(signal: RawSignal, start: int, stop: int) -> Column:
+    try:
+        return _read([signal], start, stop)[0]
+    except DataError:
+        return np.full(stop - start, np.nan)
+
+
+def _time_of(part: Path, raw: RawLog, texts: Sequence[str]) -> tuple[str | None, float | None, set[str]]:
+    """The column that the reader takes for time, the step in seconds, and the columns with stamps of their own."""
+    by_word = [name for name in texts if any(word in name.lower() for word in _TIME_WORDS)]
+    others = [name for name in texts if name not in by_word]
+    for name in (None, *islice([*by_word, *others], _MOST_TEXTS)):
+        try:
+            timed = open_log(part, SignalMap(others=True, time=name))
+            signal = next((s for s in timed.signals.values() if s.time_s is not None), None)
+            stamps = None if signal is None else signal.time_s
+        except DataError:
+            continue
+        if stamps is None or len(stamps) < 2 or not np.isfinite(stamps[:_ROWS]).any():
+            continue
+        steps = np.diff(stamps[:_ROWS])
+        absent = [column for column in raw.signals if column not in timed.signals]
+        rising = steps[steps > 0]
+        step = float(np.median(rising)) if len(rising) else None
+        if absent:
+            return name or absent[0], step, set()
+        return None, step, {s.name for s in timed.signals.values() if s.time_s is not None}
+    return None, None, set()

@@ -1,0 +1,100 @@
+"""Logs of a folder that belong together: those with the same columns, give or take a few."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edp.errors import DataError
+from edp.logs.proposal.columns import LogLook, look_at_log
+
+MOST_LOGS = 12
+"""Logs that are looked at of a group of files: the first ones, the last ones and some between."""
+_ALIKE = 0.7
+"""Share of columns that two logs must have in common to belong together."""
+
+
+@dataclass(frozen=True)
+class LogGroup:
+    """Logs with the same columns, give or take a few.
+
+    Attributes:
+        looks: those that were looked at, the longest first.
+        paths: all of them.
+    """
+
+    looks: tuple[LogLook, ...]
+    paths: tuple[Path, ...]
+
+    @property
+    def rows(self) -> int:
+        """Rows of those that were looked at."""
+        return sum(look.rows for look in self.looks)
+
+    @property
+    def common(self) -> frozenset[str]:
+        """Columns that all of them have."""
+        return frozenset.intersection(*(frozenset(look.names) for look in self.looks))
+
+
+def group_logs(
+    paths: Sequence[Path], on_log: Callable[[Path, int, int], None] | None = None
+) -> tuple[list[LogGroup], dict[Path, str]]:
+    """Look at logs and sort them by their columns, the most rows first.
+
+    Args:
+        paths: of the logs.
+        on_log: called with the path of each log before it is looked at, its number from 1, and how many there are.
+
+    Returns:
+        the groups, and what is wrong with the logs that cannot be read.
+
+    Raises:
+        DataError: none can be read.
+    """
+    chosen = _some(paths)
+    groups: list[list[LogLook]] = []
+    broken: dict[Path, str] = {}
+    for i, path in enumerate(chosen):
+        if on_log is not None:
+            on_log(path, i + 1, len(chosen))
+        try:
+            look = look_at_log(path)
+        except DataError as error:
+            broken[path] = str(error)
+            continue
+        fitting = next((group for group in groups if _alike(group[0], look)), None)
+        if fitting is None:
+            groups.append([look])
+        else:
+            fitting.append(look)
+    if not groups:
+        first = next(iter(broken.values()))
+        raise DataError(first if len(broken) == 1 else f"none of {len(broken)} logs can be read; the first: {first}")
+    seen = {look.path for group in groups for look in group} | set(broken)
+    # Logs that were not looked at are taken for what the only group is; among several nobody knows.
+    unseen = [path for path in paths if path not in seen] if len(groups) == 1 else []
+    groups_of_logs = [
+        LogGroup(
+            tuple(sorted(group, key=lambda look: -look.rows)),
+            tuple(path for path in paths if path in {look.path for look in group} or path in unseen),
+        )
+        for group in groups
+    ]
+    return sorted(groups_of_logs, key=lambda group: -group.rows), broken
+
+
+def _some(paths: Sequence[Path]) -> list[Path]:
+    """Paths spread evenly over all of them."""
+    places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), MOST_LOGS)).round().astype(int))
+    return [paths[index] for index in places]
+
+
+def _alike(one: LogLook, other: LogLook) -> bool:
+    if one.headerless or other.headerless:
+        return one.headerless and other.headerless and one.names == other.names
+    mine, theirs = set(one.names), set(other.names)
+    return len(mine & theirs) >= _ALIKE * len(mine | theirs)

@@ -1,0 +1,136 @@
+"""What names of columns say: kinds, units and roles, in English and German, and in tags of instruments."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from edp.logs.units import normalise_unit
+from edp.signals import UNITS, Kind
+
+_LONGEST = 200
+"""Characters of a name that are looked at."""
+_PARTS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
+
+KIND_WORDS: Mapping[str, Kind] = {
+    word: kind
+    for kind, words in {
+        Kind.PILOT_PRESSURE: "pilot vorsteuerdruck",
+        Kind.PRESSURE: "pressure press druck",
+        Kind.ANGULAR_VELOCITY: "rpm drehzahl omega gyro angvel revs",
+        Kind.ACCELERATION: "acceleration accel acc beschleunigung",
+        Kind.VELOCITY: "velocity vel speed geschwindigkeit geschw",
+        Kind.ANGLE: "angle winkel pitch roll yaw heading",
+        Kind.POSITION: "position pos stroke hub weg displacement disp verschiebung hoehe abstand",
+        Kind.FORCE: "force kraft",
+        Kind.FLOW: "flow durchfluss volumenstrom",
+        Kind.MASS: "mass masse gewicht weight payload",
+        Kind.TEMPERATURE: "temperature temperatur temp",
+        Kind.VOLTAGE: "voltage spannung volt",
+        Kind.CURRENT: "strom amp ampere",
+        Kind.RATIO: "percent prozent ratio duty pwm opening oeffnung",
+    }.items()
+    for word in words.split()
+}
+"""Words that name a kind; the first of a name counts, in this order. ``current`` is not among them: it may mean now."""
+_LONG = 4
+"""Letters from which a word also counts within a compound, as in ``Kolbendruck``."""
+_UNIT_ENDINGS: Mapping[str, str] = {
+    ending: unit
+    for unit, endings in {
+        **{
+            unit: unit for unit in ("bar", "kPa", "MPa", "psi", "mm", "cm", "rpm", "kN", "deg", "rad", "mV", "mA", "kg")
+        },
+        "%": "percent prozent pct",
+        "m/s": "mps",
+        "mm/s": "mmps",
+        "L/min": "lpm lmin",
+        "V": "volt volts",
+        "A": "ampere",
+        "K": "kelvin",
+        "degC": "degC celsius",
+    }.items()
+    for ending in endings.lower().split()
+}
+ROLE_WORDS: Mapping[str, str] = {
+    word: role
+    for role, words in {
+        "reference": "soll sollwert ref reference setpoint desired des target vorgabe fuehrungsgroesse r",
+        "command": "command cmd ctrl control u valve ventil joystick lever hebel pilot pwm input stellgroesse pedal",
+        "measured": "ist istwert act actual meas measured mess messwert fb feedback y output",
+        "label": "flag status state mode id label condition fault error leak stable zustand fehler",
+    }.items()
+    for word in words.split()
+}
+_COUNTERS = frozenset(
+    ("cycle", "zyklus", "index", "idx", "sample", "row", "zeile", "nr", "no", "number", "count", "counter")
+)
+_TIMES = frozenset(
+    ("time", "zeit", "t", "timestamp", "zeitstempel", "uhrzeit", "tout", "sec", "seconds", "second", "sekunde")
+)
+_SAMPLE_TIMES = frozenset(("ts", "dt", "sampletime", "sample_time", "samplingtime", "tastzeit", "abtastzeit", "t_s"))
+_TAG = re.compile(r"([PTF])([SIT])(\d{1,3})")
+_TAGS: Mapping[str, Kind] = {"P": Kind.PRESSURE, "T": Kind.TEMPERATURE, "F": Kind.FLOW}
+"""First letters of instrument tags (ISA-5.1), with sensor, indicator or transmitter behind: PS1, TT12."""
+
+
+def words_of(name: str) -> tuple[str, ...]:
+    """The words of a name, in lower letters, umlauts written out: ``CylVel_1`` is cyl, vel, 1."""
+    return tuple(part.lower() for part in _PARTS.findall(name[:_LONGEST].translate(_UMLAUTS)))
+
+
+def kind_by_word(name: str) -> Kind | None:
+    """The kind that a word of a name means; None where no word does, or a rate of another kind is named."""
+    words = words_of(name)
+    for word, kind in KIND_WORDS.items():
+        if word in words or (len(word) > _LONG and any(word in other for other in words)):
+            return kind
+    return None
+
+
+def kind_by_tag(name: str) -> Kind | None:
+    """The kind of an instrument's tag; it means little by itself."""
+    tag = _TAG.fullmatch(name)
+    return None if tag is None else _TAGS[tag[1]]
+
+
+def tag_family(name: str) -> str:
+    """What tags of one kind share: their letters; empty for other names."""
+    tag = _TAG.fullmatch(name)
+    return "" if tag is None else tag[1] + tag[2]
+
+
+def unit_by_ending(name: str) -> str | None:
+    """The unit that ends a name of several words: ``valve_percent``, ``pA_bar``."""
+    words = [word for word in words_of(name) if not word.isdigit()]
+    return _UNIT_ENDINGS.get(words[-1]) if len(words) > 1 else None
+
+
+def known_unit(stated: str | None) -> str | None:
+    """A stated unit under its name here; None where it is not known."""
+    unit = normalise_unit(stated)
+    return unit if unit in UNITS else None
+
+
+def role_by_word(name: str) -> str:
+    """``reference``, ``command``, ``measured`` or ``label`` where a word says it; else empty."""
+    words = words_of(name)
+    roles = {ROLE_WORDS[word] for word in words if word in ROLE_WORDS}
+    # A reference of a valve is a reference, its measured opening is measured.
+    return next((role for role in ("reference", "measured", "label", "command") if role in roles), "")
+
+
+def is_counter_name(name: str) -> bool:
+    """Whether a word of a name counts something."""
+    return any(word in _COUNTERS for word in words_of(name))
+
+
+def is_time_name(name: str) -> bool:
+    """Whether a name is that of time."""
+    return any(word in _TIMES for word in words_of(name)[:1])
+
+
+def is_sample_time_name(name: str) -> bool:
+    """Whether a name is that of the time between two rows."""
+    return "".join(name.split()).lower() in _SAMPLE_TIMES

@@ -1,0 +1,253 @@
+"""A signal map for logs that nobody described, column by column with how sure it is."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_steered_by, relations_of
+from edp.logs.proposal.clocks import ClockGuess, clock_of
+from edp.logs.proposal.columns import LogColumn, LogLook
+from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change
+from edp.logs.proposal.names import is_counter_name, role_by_word, tag_family, words_of
+from edp.signals import TABLE_A1, VOCABULARY, ChannelMap, Kind, SignalMap
+
+SURE = 0.85
+"""Confidence from which nothing needs to be checked."""
+MAPPED_ROLES = ("reference", "command", "measured", "label")
+"""Roles of columns that become channels; time, counters, constants and text do not."""
+_COMMANDS = (Kind.PILOT_PRESSURE, Kind.CURRENT, Kind.VOLTAGE, Kind.RATIO)
+_MOTIONS = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.POSITION, Kind.ANGLE, Kind.ACCELERATION, Kind.FORCE)
+_PLAIN_NAME = re.compile(r"\w[\w .\-/()%]{0,63}")
+_MOST_CHANNELS = 200
+_SWITCHED_HZ = {"command": 0.01, "": 0.05, "label": 1.0}
+"""Changes a second below which a column of a few whole values is a label, by what its name says: a working machine
+opens valves more often than every 100 s."""
+
+
+@dataclass(frozen=True)
+class ColumnGuess:
+    """What a column is taken for.
+
+    Attributes:
+        column: its name in the file.
+        channel: name of the channel; empty where it becomes none.
+        role: ``time``, ``counter``, ``constant``, ``text``, or one of `MAPPED_ROLES`.
+        kind: kind and unit.
+        confidence: of role and kind together, from 0 to 1.
+        why: what the role was taken from.
+        check: what a person should look at.
+        relation: how it follows from another column.
+    """
+
+    column: str
+    channel: str
+    role: str
+    kind: KindGuess
+    confidence: float
+    why: str
+    check: str = ""
+    relation: Relation | None = None
+
+    @property
+    def sureness(self) -> str:
+        """In a word; ``unsure`` is what lies below `BOUND`."""
+        return "sure" if self.confidence >= SURE else "likely" if self.confidence >= BOUND else "unsure"
+
+
+@dataclass(frozen=True)
+class MapProposal:
+    """A signal map and what it was made from."""
+
+    look: LogLook
+    clock: ClockGuess
+    columns: tuple[ColumnGuess, ...]
+    signal_map: SignalMap
+
+    def of_role(self, *roles: str) -> tuple[ColumnGuess, ...]:
+        """The channels that have one of some roles, in order."""
+        return tuple(guess for guess in self.columns if guess.channel and guess.role in roles)
+
+
+def propose_map(look: LogLook, common: Collection[str] | None = None) -> MapProposal:
+    """Propose what every column of a log is.
+
+    Args:
+        look: the columns.
+        common: columns that all logs of a group have; None for all of this log. Others become no channels.
+    """
+    behaviours = {column.name: behaviour_of(column) for column in look.columns}
+    clock = clock_of(look, behaviours)
+    families = Counter(tag_family(column.name) for column in look.columns)
+    moving = [c for c in look.columns if _is_free(c, behaviours[c.name], clock)]
+    relations = relations_of(moving)
+    kinds = {c.name: kind_of(c, behaviours[c.name], families[tag_family(c.name)]) for c in look.columns}
+    for name, relation in relations.items():
+        change = kind_of_change(relation, kinds[relation.other], clock.rate_hz)
+        if change is not None and kinds[name].confidence < BOUND:
+            kinds[name] = change
+    steered = _steered(moving, relations)
+    # What follows a reference is measured, also where a coarse sensor makes it move in steps.
+    following = {
+        r.other: Relation("follows", name, 1.0, r.strength) for name, r in relations.items() if r.how == "reference"
+    }
+    relations = following | relations
+    guesses = [
+        _column_guess(column, behaviours[column.name], kinds[column.name], clock, relations.get(column.name), steered)
+        for column in look.columns
+    ]
+    if common is not None:
+        guesses = [g if g.column in common else replace(g, channel="", check="not in all logs") for g in guesses]
+    guesses = _named(guesses)
+    texts = [
+        ColumnGuess(name, "", "time" if name == clock.column else "text", _NO_KIND, 0.9, "holds text")
+        for name in look.texts
+    ]
+    columns = (*guesses, *texts)
+    return MapProposal(look, clock, columns, _signal_map(look, clock, columns))
+
+
+_NO_KIND = KindGuess(Kind.GENERIC, "1", 1.0, "")
+
+
+def _is_free(column: LogColumn, behaviour: Behaviour, clock: ClockGuess) -> bool:
+    """Whether a column may be related to others: no time, no constant, no counter, no label."""
+    idle = behaviour.constant or behaviour.counts or behaviour.switches or (behaviour.restarts and behaviour.whole)
+    return column.name != clock.column and column.name not in clock.beside and not idle
+
+
+def _steered(columns: Sequence[LogColumn], relations: dict[str, Relation]) -> dict[str, str]:
+    """Columns that are what a controller makes of a reference and of what follows it, each with the reference."""
+    by_name = {column.name: column for column in columns}
+    pairs = [(name, relation.other) for name, relation in relations.items() if relation.how == "reference"]
+    return {
+        column.name: target
+        for target, actual in pairs
+        for column in columns
+        if column.name not in (target, actual) and is_steered_by(column, by_name[target], by_name[actual])
+    }
+
+
+def _column_guess(
+    column: LogColumn,
+    behaviour: Behaviour,
+    kind: KindGuess,
+    clock: ClockGuess,
+    relation: Relation | None,
+    steered: dict[str, str],
+) -> ColumnGuess:
+    name = column.name
+    if name == clock.column or name in clock.beside:
+        return ColumnGuess(name, "", "time", _NO_KIND, clock.confidence, "time of the rows", clock.check)
+    aside = _aside(name, behaviour, kind, clock.rate_hz)
+    if aside is not None:
+        return aside
+    role, sure, why = _role(column, behaviour, kind, relation, steered)
+    check = kind.check
+    if sure < BOUND and not check:
+        check = f"is it a {role}?"
+    return ColumnGuess(name, name, role, kind, min(sure, kind.confidence), why, check, relation)
+
+
+def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | None) -> ColumnGuess | None:
+    """A column that holds no motion: a constant, a counter, a label; None for all others."""
+    if behaviour.constant:
+        value = "empty" if not behaviour.filled else f"always {behaviour.high:g}"
+        return ColumnGuess(name, "", "constant", _NO_KIND, 0.95, value, "" if is_known(name) else "not taken")
+    if behaviour.counts and behaviour.levels > 2:
+        sure = 0.9 if is_counter_name(name) else 0.65
+        return ColumnGuess(name, "", "counter", _NO_KIND, sure, "rises by one", "" if sure >= SURE else "a counter?")
+    if behaviour.restarts and behaviour.even and behaviour.whole:
+        return ColumnGuess(name, "", "counter", _NO_KIND, 0.7, "counts and begins anew", "a counter?")
+    word = role_by_word(name)
+    if behaviour.switches and behaviour.changes * (rate_hz or 1.0) < _SWITCHED_HZ.get(word, 0.0):
+        sure = min(0.85 if word == "label" else 0.7, max(kind.confidence, BOUND))
+        check = kind.check if kind.kind is not Kind.GENERIC and kind.check else "known on the machine? then a feature"
+        return ColumnGuess(name, name, "label", kind, sure, f"{behaviour.levels} values, seldom changed", check)
+    return None
+
+
+def is_known(name: str) -> bool:
+    """Whether a name is of the vocabulary, whose constants may be wanted (conflux lines that a machine lacks)."""
+    return name in VOCABULARY
+
+
+def _role(
+    column: LogColumn, behaviour: Behaviour, kind: KindGuess, relation: Relation | None, steered: dict[str, str]
+) -> tuple[str, float, str]:
+    """Role of a column that moves, how sure, and why."""
+    name, word = column.name, role_by_word(column.name)
+    if name in TABLE_A1:
+        return ("command" if kind.kind in _COMMANDS else "measured"), 0.95, "a name of Table A.1"
+    if relation is not None and relation.how == "reference":
+        return "reference", 0.85 if word == "reference" else 0.75, f"{relation.other[:24]} follows it"
+    if relation is not None and relation.how == "follows":
+        return "measured", 0.85 if word == "measured" else 0.75, f"follows {relation.other[:24]}"
+    if name in steered:
+        return "command", 0.8, f"a controller's answer to {steered[name][:24]}"
+    if word in ("reference", "command", "measured"):
+        # A single letter is a habit, not a word.
+        by_letter = all(len(part) == 1 or part.isdigit() for part in words_of(name)[:1])
+        return word, 0.7 if by_letter else 0.85, "its name"
+    if kind.kind in _COMMANDS and kind.confidence >= BOUND:
+        return "command", 0.65, f"a {kind.kind.replace('_', ' ')}"
+    if behaviour.steps:
+        return "command", 0.65, "moves in steps"
+    if relation is not None and relation.how == "change":
+        return "measured", 0.7, f"the change of {relation.other[:24]}"
+    if kind.kind in _MOTIONS and kind.confidence >= BOUND:
+        return "measured", 0.85, f"a {kind.kind.replace('_', ' ')}"
+    return "measured", 0.65, "moves by itself"
+
+
+def _named(guesses: Sequence[ColumnGuess]) -> list[ColumnGuess]:
+    """Channels under names that every export takes and a person can type; too many ones are left out."""
+    named, used, count = [], set[str](), 0
+    for i, guess in enumerate(guesses):
+        channel = guess.channel
+        count += bool(channel)
+        if channel and (count > _MOST_CHANNELS or not channel.isprintable()):
+            guess = replace(guess, channel="", check=f"left out: beyond {_MOST_CHANNELS} channels, or an odd name")
+        elif channel:
+            channel = channel if _PLAIN_NAME.fullmatch(channel) and channel not in used else f"channel_{i + 1}"
+            used.add(channel)
+            guess = replace(guess, channel=channel)
+        named.append(guess)
+    return named
+
+
+def _signal_map(look: LogLook, clock: ClockGuess, columns: Sequence[ColumnGuess]) -> SignalMap:
+    channels = tuple(
+        ChannelMap(
+            guess.channel,
+            guess.column,
+            guess.kind.unit,
+            guess.kind.kind,
+        )
+        for guess in columns
+        if guess.channel
+    )
+    return SignalMap(
+        channels,
+        time=clock.column,
+        time_unit=clock.unit,
+        sample_time_s=clock.sample_time_s,
+        rate_hz=clock.wanted_hz,
+        header=not look.headerless,
+        columns=look.names if look.headerless else (),
+    )
+
+
+def plain_map(look: LogLook) -> SignalMap:
+    """A map of all columns of numbers, so that they can be inspected: kinds as proposed, the others as numbers."""
+    proposal = propose_map(look)
+    unmapped = [g for g in proposal.columns if not g.channel and g.role in ("constant", "counter")]
+    mapped = proposal.signal_map.channels
+    used = {entry.name for entry in mapped}
+    more = [
+        ChannelMap(g.column, g.column, "1", Kind.GENERIC) for g in unmapped if g.column not in used | set(VOCABULARY)
+    ]
+    # A fast log is inspected as it is.
+    return replace(proposal.signal_map, channels=(*mapped, *more)[:_MOST_CHANNELS], rate_hz=None)

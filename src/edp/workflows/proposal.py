@@ -1,0 +1,368 @@
+"""From a folder of unknown logs to a signal map and settings with which the other commands run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from edp.errors import ConfigError, DataError, StorageError
+from edp.logs.proposal.columns import LogColumn
+from edp.logs.proposal.groups import LogGroup, group_logs
+from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
+from edp.logs.read import find_recordings, unique_names
+from edp.logs.source import map_of_table
+from edp.logs.timebase import judge
+from edp.settings.tree import parse_toml
+from edp.signals import TIME_UNITS, VOCABULARY, Kind, SignalMap
+from edp.storage import make_folder, write_bytes
+
+MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
+MOST_TARGETS = 4
+"""Outputs at most: each is a model of its own in the time that a first run takes."""
+MOST_FEATURES = 48
+_AHEAD_S = 0.1
+"""How far ahead a machine's motion is of use to a controller; two steps of a slow hydraulic valve."""
+_SLOW_TICKS = 5
+"""Ticks ahead where a tick takes longer than half of that."""
+_LEAST_RECORDINGS = 5
+"""Recordings from which whole ones test; of fewer a single one would decide the score."""
+_TARGETS = (
+    (Kind.VELOCITY,),
+    (Kind.ANGULAR_VELOCITY,),
+    (Kind.POSITION,),
+    (Kind.ANGLE,),
+    (Kind.FORCE,),
+    (Kind.PRESSURE,),
+    (Kind.FLOW,),
+    (Kind.TEMPERATURE,),
+)
+"""What is predicted: the first of these kinds that is measured, or else all that is measured."""
+_PAIR = re.compile(r"(.+?)[_ .]?(est|val|train|test|id|training|validation|identification)", re.IGNORECASE)
+_TRAINS = ("est", "train", "id", "training", "identification")
+
+
+@dataclass(frozen=True)
+class LogsProposal:
+    """What `propose` found.
+
+    Attributes:
+        source: what was asked about.
+        group: the logs that belong together.
+        others: further logs, with other columns.
+        broken: logs that cannot be read, each with the reason.
+        columns: the columns with what they are taken for.
+        files: the texts to write, by name.
+        targets: channels to predict.
+        repairs: what training would refuse unless it is repaired, as ``--repair`` takes it.
+        notes: what else a person should know.
+    """
+
+    source: Path
+    group: LogGroup
+    others: tuple[LogGroup, ...]
+    broken: dict[Path, str]
+    proposal: MapProposal
+    files: dict[str, str]
+    targets: tuple[str, ...]
+    repairs: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def commands(self, folder: Path) -> list[str]:
+        """The commands that come next, in order."""
+        data, mapped = _quoted(self.source), f" --map {_quoted(folder / MAP)}"
+        if DATA in self.files:
+            data, mapped = _quoted(folder / DATA), ""
+        repair = "".join(f" --repair {one}" for one in self.repairs)
+        run = _quoted(folder / "runs" / "first")
+        return [
+            f"edp inspect {data}{mapped}",
+            f"edp train {data}{mapped} --config {_quoted(folder / SETTINGS)} --out {run}{repair}",
+            f"edp evaluate {run}",
+            f"edp report {run}",
+        ]
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = None) -> LogsProposal:
+    """Look at logs and propose a map and settings; nothing is written.
+
+    Args:
+        path: a log, or a folder of logs.
+        on_log: called with the path of each log before it is looked at, its number from 1, and how many there are.
+
+    Raises:
+        DataError: no log there can be read, or nothing in it can be predicted.
+    """
+    source = Path(path)
+    if source.suffix.lower() == ".toml":
+        raise ConfigError(f"'{source}' is a data-set file; give the log or the folder of logs that it is to describe")
+    paths = find_recordings(source)
+    groups, broken = group_logs(paths, on_log)
+    group, others = groups[0], tuple(groups[1:])
+    proposal = propose_map(group.looks[0], group.common)
+    pairs = _side_by_side(proposal)
+    if pairs:
+        return _of_pairs(source, group, others, broken, proposal, pairs)
+    notes = _notes(group, others, broken, proposal)
+    targets, more = _targets(proposal)
+    notes += more
+    channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
+    if len(channels) > MOST_FEATURES:
+        notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")
+        channels = list(dict.fromkeys([*channels[:MOST_FEATURES], *targets]))
+    split = {"kind": "recordings"} if len(group.paths) >= _LEAST_RECORDINGS else {"kind": "time"}
+    files = {
+        MAP: _text(_map_table(proposal.signal_map), _remarks(source, proposal)),
+        SETTINGS: _settings(proposal, channels, targets, split),
+    }
+    if others or broken:
+        files[DATA] = _data_set([{"path": _listed(one), "name": name} for one, name in _named(group.paths)], MAP)
+    _check(files)
+    repairs = repairs_of(proposal)
+    return LogsProposal(source, group, others, broken, proposal, files, targets, repairs, tuple(notes))
+
+
+def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool = False) -> list[Path]:
+    """Write the files of a proposal, each whole.
+
+    Raises:
+        StorageError: one is there already and may not be replaced, or cannot be written.
+    """
+    out = Path(folder)
+    paths = [out / name for name in proposal.files]
+    there = [path for path in paths if path.exists() or path.is_symlink()]
+    if there and not overwrite:
+        shown = ", ".join(f"'{path}'" for path in there)
+        raise StorageError(
+            f"{shown} exists already; nothing was written. Give another folder with --out, or --overwrite"
+        )
+    make_folder(out)
+    for path, text in zip(paths, proposal.files.values()):
+        write_bytes(path, text.encode())
+    return paths
+
+
+def repairs_of(proposal: MapProposal) -> tuple[str, ...]:
+    """Repairs without which training refuses what was looked at of a log."""
+    columns = {column.name: column for column in proposal.look.columns}
+    mapped = [columns[guess.column] for guess in proposal.columns if guess.channel]
+    repairs = ["nan=hold"] if any(not np.isfinite(column.values).all() for column in mapped) else []
+    time = columns.get(proposal.clock.column or "")
+    return (*repairs, *([] if time is None else _repairs_of_time(time, TIME_UNITS[proposal.clock.unit])))
+
+
+def _repairs_of_time(time: LogColumn, factor: float) -> list[str]:
+    """Repairs of stamps, by the rule with which a log is read."""
+    repairs = set()
+    for piece in time.pieces:
+        try:
+            clock = judge(piece * factor, time.name)
+        except DataError:  # which inspection and training name in their words
+            continue
+        if not clock.uniform:
+            repairs |= {"falling=sort"} if len(clock.falling) else set()
+            repairs |= {"duplicates=last"} if len(clock.duplicates) else set()
+            repairs |= {"gaps=hold"} if len(clock.gaps) else set()
+    return sorted(repairs)
+
+
+def horizons_for(rate_hz: float | None) -> tuple[int, int]:
+    """Look-ahead in samples: one, and a tenth of a second or five."""
+    ahead = round(_AHEAD_S * (rate_hz or 0.0))
+    return 1, ahead if ahead > 1 else _SLOW_TICKS
+
+
+def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
+    """What to predict, and what to say of it.
+
+    Raises:
+        DataError: nothing moves.
+    """
+    measured = proposal.of_role("measured")
+    notes = []
+    if not measured:
+        measured = proposal.of_role("command", "reference")
+        if not measured:
+            texts = len(proposal.look.texts)
+            unread = f", and {texts} that hold text or share a name" if texts else ""
+            raise DataError(
+                f"'{proposal.look.path}': no column moves (constants, counters and labels only{unread}); there is "
+                "nothing to predict: record while the machine works, and give each column a name of its own"
+            )
+        notes.append("no column looks measured: check task.targets")
+    # A change of another column is a velocity, whatever its unit.
+    changes = [guess for guess in measured if guess.relation is not None and guess.relation.how == "change"]
+    by_kind = [[g for g in measured if g.kind.kind in kinds] for kinds in _TARGETS]
+    chosen = next((guesses for guesses in [by_kind[0], by_kind[1], changes, *by_kind[2:]] if guesses), list(measured))
+    if len(chosen) > MOST_TARGETS:
+        notes.append(f"{len(chosen)} columns could be predicted; the first {MOST_TARGETS} are (task.targets)")
+    return tuple(guess.channel for guess in chosen[:MOST_TARGETS]), notes
+
+
+def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str], proposal: MapProposal) -> list[str]:
+    look, clock = proposal.look, proposal.clock
+    notes = [] if not look.part else [f"{look.path.name}: looked at {look.part}"]
+    notes += [f"{count} column(s) {reason}: left out" for reason, count in look.left_out.items()]
+    if clock.check:
+        notes.append(f"time: {clock.check}")
+    if len(group.looks) < len(group.paths):
+        notes.append(f"{len(group.looks)} of {len(group.paths)} logs were looked at; the others are taken for alike")
+    for other in others:
+        names = ", ".join(path.name[:40] for path in other.paths[:3])
+        notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")
+    notes += [f"not readable: {reason[:300]}" for reason in list(broken.values())[:3]]
+    if len(broken) > 3:
+        notes.append(f"{len(broken) - 3} more logs are not readable")
+    return notes
+
+
+def _map_table(signal_map: SignalMap) -> dict[str, Any]:
+    """A signal map as a file has it, without what is as usual."""
+    table: dict[str, Any] = {}
+    for key in ("time", "sample_time_s", "rate_hz"):
+        value = getattr(signal_map, key)
+        if value is not None:
+            table[key] = value
+    if signal_map.time is not None and signal_map.time_unit != "s":
+        table["time_unit"] = signal_map.time_unit
+    if not signal_map.header:
+        table |= {"header": False, "columns": list(signal_map.columns)}
+    table["channels"] = {
+        entry.name: {"column": entry.column}
+        | ({} if _usual_kind(entry.name) == entry.kind else {"kind": str(entry.kind)})
+        | {"unit": entry.unit or "1"}
+        for entry in signal_map.channels
+    }
+    return table
+
+
+def _usual_kind(name: str) -> Kind | None:
+    channel = VOCABULARY.get(name)
+    return None if channel is None else channel.kind
+
+
+def _remarks(source: Path, proposal: MapProposal) -> list[str]:
+    """Comments on top of a map: where it comes from and what is to be checked."""
+    lines = [f"Proposed by edp init for {source.name}. To be checked:"]
+    checked = [guess for guess in proposal.columns if guess.check and guess.channel]
+    lines += [f"  {guess.channel}: {guess.role}, {guess.sureness}; {guess.check}" for guess in checked]
+    if proposal.clock.check:
+        lines.append(f"  time: {proposal.clock.check}")
+    absent = [guess for guess in proposal.columns if not guess.channel and guess.role != "time"]
+    lines += [f"Not taken: {guess.column[:60]} ({guess.role}: {guess.why})" for guess in absent[:MOST_FEATURES]]
+    return lines
+
+
+def _text(table: dict[str, Any], remarks: Iterable[str] = ()) -> str:
+    """TOML with comments above; a comment ends at no character of a name."""
+    visible = ["".join(letter if letter.isprintable() else "?" for letter in line) for line in remarks]
+    return "".join(f"# {line}\n" for line in visible) + tomli_w.dumps(table)
+
+
+def _settings(proposal: MapProposal, channels: Sequence[str], targets: Sequence[str], split: dict[str, Any]) -> str:
+    clock = proposal.clock
+    rate = clock.wanted_hz or clock.rate_hz
+    table = {
+        "task": {
+            "targets": list(targets),
+            "horizons": list(horizons_for(rate)),
+            "mode": "delta",
+            "features": {"name": "proposed", "channels": list(channels)},
+        },
+        "split": split,
+    }
+    return _text(
+        table, ["Proposed by edp init: what is predicted, how far ahead (in samples), from what, tested on what."]
+    )
+
+
+def _listed(path: Path) -> str:
+    """A path for a data-set file, which puts environment variables in."""
+    return str(path.resolve())
+
+
+def _named(paths: Sequence[Path]) -> list[tuple[Path, str]]:
+    usable = [path for path in paths if "$" not in str(path.resolve()) and str(path).isprintable()]
+    return list(zip(usable, unique_names([path.stem for path in usable], usable)))
+
+
+def _data_set(recordings: list[dict[str, Any]], map_file: str | None = None) -> str:
+    if not recordings:
+        raise DataError("no path of these logs can be listed in a file ($ or unprintable characters); rename them")
+    table: dict[str, Any] = ({"map": map_file} if map_file else {}) | {"recordings": recordings}
+    return _text(table, ["Proposed by edp init: the logs with one set of columns."])
+
+
+def _check(files: dict[str, str]) -> None:
+    """See that what will be written is read as it was meant.
+
+    Raises:
+        ConfigError: it is not; nothing was written.
+    """
+    tables = {name: parse_toml(text, name) for name, text in files.items()}
+    # Settings themselves are not built here: their classes import PyTorch, which takes seconds.
+    if MAP in tables:
+        map_of_table(tables[MAP], MAP)
+
+
+def _side_by_side(proposal: MapProposal) -> dict[str, dict[str, ColumnGuess]]:
+    """Columns of two experiments beside each other, ``uEst`` and ``uVal``: by ending and stem; empty elsewhere."""
+    sets: dict[str, dict[str, ColumnGuess]] = {}
+    for guess in proposal.columns:
+        if not guess.channel:
+            continue
+        match = _PAIR.fullmatch(guess.column)
+        if match is None:
+            return {}
+        sets.setdefault(match[2].lower(), {})[match[1]] = guess
+    stems = [sorted(entries) for entries in sets.values()]
+    trains = [ending for ending in sets if ending in _TRAINS]
+    return sets if len(sets) == 2 and len(trains) == 1 and stems[0] == stems[1] else {}
+
+
+def _of_pairs(
+    source: Path,
+    group: LogGroup,
+    others: tuple[LogGroup, ...],
+    broken: dict[Path, str],
+    proposal: MapProposal,
+    pairs: dict[str, dict[str, ColumnGuess]],
+) -> LogsProposal:
+    """Two experiments in the columns of one log: a recording each."""
+    train = next(ending for ending in pairs if ending in _TRAINS)
+    test = next(ending for ending in pairs if ending != train)
+    recordings = []
+    for path, name in _named(group.paths):
+        for ending in (train, test):
+            renamed = [(stem, guess) for stem, guess in pairs[ending].items()]
+            entries = tuple(
+                replace(entry, name=stem)
+                for stem, guess in renamed
+                for entry in proposal.signal_map.channels
+                if entry.column == guess.column
+            )
+            table = _map_table(replace(proposal.signal_map, channels=entries))
+            recordings.append({"path": _listed(path), "name": f"{name}_{ending}", "map": table})
+    renamed_columns = tuple(replace(guess, channel=stem) for stem, guess in pairs[train].items())
+    renamed_proposal = replace(proposal, columns=renamed_columns)
+    targets, notes = _targets(renamed_proposal)
+    channels = [guess.channel for guess in renamed_proposal.of_role("reference", "command", "measured")]
+    tests = [str(one["name"]) for one in recordings if str(one["name"]).endswith(f"_{test}")]
+    files = {
+        DATA: _data_set(recordings),
+        SETTINGS: _settings(proposal, channels, targets, {"kind": "recordings", "test": tests}),
+    }
+    _check(files)
+    notes += _notes(group, others, broken, proposal)
+    notes.append(f"two experiments stand side by side: columns of '{train}' train, those of '{test}' test")
+    return LogsProposal(source, group, others, broken, proposal, files, targets, repairs_of(proposal), tuple(notes))
