@@ -71,9 +71,13 @@ def main() -> None:
     arguments_of.add_argument("--soil", action="store_true", help="also a C14 in soil, which takes as long again")
     arguments_of.add_argument("--specialist", action="store_true", help="train a second one, which takes as long")
     arguments_of.add_argument("--only", nargs="+", choices=(*FITTED, RESIDUAL), default=(*FITTED, RESIDUAL))
+    arguments_of.add_argument("--minutes", type=float, default=180.0, help="of recordings of 3 min each")
+    arguments_of.add_argument("--ticks", type=int, default=GreyFitSpec().ticks, help="of a round of a grey box's fit")
+    arguments_of.add_argument("--starts", type=int, default=GreyFitSpec().starts, help="of a grey box's fit")
     arguments = arguments_of.parse_args()
     quick, only = arguments.quick, arguments.only
-    minutes, recordings, starts = (10.0, 8, 3) if quick else (180.0, 60, 16)
+    minutes, recordings, starts = (10.0, 8, 3) if quick else (arguments.minutes, round(arguments.minutes / 3), 16)
+    fit = QUICK_FIT if quick else GreyFitSpec(ticks=arguments.ticks, starts=arguments.starts)
     with tempfile.TemporaryDirectory() as temporary:
         source = arguments.data or Path(temporary) / "data"
         simulate_data_set(source, SimulationOrder(minutes=minutes, recordings=recordings, seed=arguments.seed + 1))
@@ -84,7 +88,8 @@ def main() -> None:
     if quick:
         training = replace(training, lengths_s=(0.1, 0.5, 2.0), updates=(60, 40, 16), validate_every=40)
     models: dict[str, tuple[Twin, float]] = {}
-    closed = (*experiment.judge.floors, "n4sid")
+    whole = set(only) == {*FITTED, RESIDUAL}
+    closed = (*experiment.judge.floors, "n4sid") if whole else ("static",)
     for name in closed:
         # The validation part chose among weights of the others; what needs no choice has it to learn from.
         everything = [*data.train, *data.validation]
@@ -93,11 +98,11 @@ def main() -> None:
     if "recurrent" in only:
         models["recurrent"] = trained(experiment, training, parts)
     if "greybox" in only:
-        models["greybox"] = fitted_grey_box(parts, arguments.seed, quick)
+        models["greybox"] = fitted_grey_box(parts, arguments.seed, fit)
     if LINKED in only:
-        models[LINKED] = fitted_linkage(parts, arguments.seed, quick)
+        models[LINKED] = fitted_linkage(parts, arguments.seed, fit)
     if RESIDUAL in only:
-        models[BARE], models[TOPPED] = fitted_residual(parts, arguments.seed, quick, LEFT_OUT)
+        models[BARE], models[TOPPED] = fitted_residual(parts, arguments.seed, quick, LEFT_OUT, fit)
     if arguments.specialist:
         free_only = replace(training, measured_share=0.0, mixed_share=0.0)
         models[FREE_ONLY] = trained(experiment, free_only, (channels, scales, data))
@@ -147,7 +152,6 @@ def main() -> None:
         verdicts.append(verdict(name, best_in_soil, rival_in_soil, "<= 0.25", "mm", quick))
     if arguments.specialist:
         verdicts += specialist_verdicts(scores, quick)
-    whole = set(only) == {*FITTED, RESIDUAL}
     finish("twin" if whole else "twin_part", verdicts, arguments.seed, scores)
 
 
@@ -176,7 +180,7 @@ def trained(experiment: TwinExperiment, training: FreeRunSpec, parts: Any) -> tu
     return twin, fitted.seconds
 
 
-def fitted_linkage(parts: Any, seed: int, quick: bool) -> tuple[GreyTwin, float]:
+def fitted_linkage(parts: Any, seed: int, fit: GreyFitSpec) -> tuple[GreyTwin, float]:
     """The same, told pins and lengths of M22, with bodies that are not its own."""
     text = (resources.files("edp.sim") / "machines" / "m22.toml").read_text(encoding="utf-8")
     machine = tomllib.loads(text)
@@ -185,14 +189,13 @@ def fitted_linkage(parts: Any, seed: int, quick: bool) -> tuple[GreyTwin, float]
     with tempfile.TemporaryDirectory() as temporary:
         guess = Path(temporary) / "guess.toml"
         guess.write_text(tomli_w.dumps(machine), encoding="utf-8")
-        return fitted_grey_box(parts, seed, quick, str(guess))
+        return fitted_grey_box(parts, seed, fit, str(guess))
 
 
-def fitted_grey_box(parts: Any, seed: int, quick: bool, linkage: str = "") -> tuple[GreyTwin, float]:
+def fitted_grey_box(parts: Any, seed: int, settings: GreyFitSpec, linkage: str = "") -> tuple[GreyTwin, float]:
     """A grey box and the processor seconds of its fit; of the machine a linkage is told, and its channels."""
     channels, scales, data = parts
-    spec = QUICK_FIT if quick else GreyFitSpec()
-    twin = GreyBox(fit=spec, linkage=linkage).start(channels, scales, data.train, seed)
+    twin = GreyBox(fit=settings, linkage=linkage).start(channels, scales, data.train, seed)
     fit = fit_grey_box(
         twin,
         data.train,
@@ -204,12 +207,11 @@ def fitted_grey_box(parts: Any, seed: int, quick: bool, linkage: str = "") -> tu
 
 
 def fitted_residual(
-    parts: Any, seed: int, quick: bool, without: tuple[str, ...]
+    parts: Any, seed: int, quick: bool, without: tuple[str, ...], settings: GreyFitSpec
 ) -> tuple[tuple[Twin, float], tuple[Twin, float]]:
     """A grey box without some parts, and a network on top of it; each with its processor seconds."""
     channels, scales, data = parts
-    spec = QUICK_FIT if quick else GreyFitSpec()
-    form = Residual(fit=spec, without=without)
+    form = Residual(fit=settings, without=without)
     form = replace(form, units=16, updates=(8, 4, 2), validate_every=7) if quick else form
     start = form.start(channels, scales, data.train, seed)
     grey = fit_grey_box(start, data.train, data.validation, seed)
@@ -249,7 +251,9 @@ def soil(seed: int, quick: bool) -> dict[str, dict[str, Any]]:
     floor: Twin = TWINS["static"]().start(channels, parts[1], data.train, seed)
     models: dict[str, tuple[Twin, float]] = {"static": (floor, 0.0)}
     models["recurrent"] = trained(experiment, training, parts)
-    models["greybox"], models["residual"] = fitted_residual(parts, seed, quick, ())
+    models["greybox"], models["residual"] = fitted_residual(
+        parts, seed, quick, (), QUICK_FIT if quick else GreyFitSpec()
+    )
     scores = {}
     for name, (twin, seconds) in models.items():
         scores[name] = free_run_scores(free_runs(twin, data.test, 60.0, 4), experiment.judge)

@@ -118,12 +118,12 @@ class GreyBox:
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> GreyTwin:
         """With plausible numbers; where all is measured, its load balances the forces that were measured."""
         elements = self.elements(channels)
-        known = KnownLinkage.read(self.linkage, elements, channels, scales) if self.linkage else None
-        table = self._table(elements, channels, scales, known)
+        front = KnownLinkage.read(self.linkage, elements, channels, scales) if self.linkage else None
+        table = self._table(elements, channels, scales, front)
         commands = np.concatenate([series.inputs for series in train])
         full = [_full(commands[:, _sides(valve, channels)]) for valve in elements.valves]
         arrays = {"numbers": table.nominal.astype(np.float32), "full": np.array(full, np.float32)}
-        arrays |= {} if known is None else known.arrays()
+        arrays |= {} if front is None else front.arrays()
         twin = self.build(channels, scales, arrays | self._network(channels, seed))
         # Both sides of a motor are the same, so that there is nothing to learn of the second one.
         declared = [isinstance(one, MotorElement) or one.areas is not None for one in elements.actuators]
@@ -135,8 +135,8 @@ class GreyBox:
         elements = self.elements(channels)
         travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.actuators)
         own = KnownLinkage.SHAPES if self.linkage else {}
-        known = KnownLinkage(*(np.ones(shape) for shape in own.values())) if own else None
-        table = number_table(elements, travels, [1.0] * len(elements.pumps), self.degrees, self.without, known)
+        front = KnownLinkage(*(np.ones(shape) for shape in own.values())) if own else None
+        table = number_table(elements, travels, [1.0] * len(elements.pumps), self.degrees, self.without, front)
         return {"numbers": (len(table.numbers),), "full": (len(elements.valves),), **own}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
@@ -162,7 +162,7 @@ class GreyBox:
         return self.inertia_degree, self.potential_degree
 
     def _table(
-        self, elements: Elements, channels: TwinChannels, scales: TwinScales, known: KnownLinkage | None
+        self, elements: Elements, channels: TwinChannels, scales: TwinScales, front: KnownLinkage | None
     ) -> NumberTable:
         names = [channel.name for channel in channels.answers]
         count = len(channels.velocities)
@@ -177,7 +177,7 @@ class GreyBox:
             fastest, (first, second) = float(scales.high[i]) / FASTEST, actuator.chambers
             travels.append(Travel(float(low), float(high), fastest, (highest(first), highest(second))))
         pumps = [highest(pump.pressure) * HIGHEST for pump in elements.pumps]
-        return number_table(elements, travels, pumps, self.degrees, self.without, known)
+        return number_table(elements, travels, pumps, self.degrees, self.without, front)
 
 
 def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
@@ -338,8 +338,8 @@ class GreyTwin(Twin):
         return add_layer(build, self, fed)
 
     def arrays(self) -> dict[str, Array]:
-        known = {} if self.table.known is None else self.table.known.arrays()
-        return self.scales.arrays() | {"numbers": self.numbers.astype(np.float32), "full": self.full} | known
+        front = {} if self.table.front is None else self.table.front.arrays()
+        return self.scales.arrays() | {"numbers": self.numbers.astype(np.float32), "full": self.full} | front
 
 
 STATES = ("pressures_and_velocities", "strokes", "bristles", "displacements", "valves", "history")

@@ -168,7 +168,7 @@ def check_same_linkage(twin: GreyTwin, base: Machine, machine: str) -> None:
     Raises:
         ConfigError: pins or lengths that differ.
     """
-    if twin.table.known is None:
+    if twin.table.front is None:
         return
     own = KnownLinkage.read(machine, twin.spec.elements(twin.channels), twin.channels, twin.scales)
     if not np.allclose(own.values, twin.table.linkage, rtol=1e-4):

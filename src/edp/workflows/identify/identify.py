@@ -305,7 +305,7 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     poses = Poses.of(machine, strokes)
     nine, body = body_rows(tie, load, spread[count:, count:], twin.wiring.z_of, poses)
     numbers = number_rows(tie.base, machine, left[:count], excited)
-    if tie.parts.table.known is not None:
+    if tie.parts.table.front is not None:
         return replace(machine, bodies=linked_bodies(load, tie.base)), numbers + body, []
     try:
         return replace(machine, bodies=realised(nine, tie.base)), numbers + body, []

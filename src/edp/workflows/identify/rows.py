@@ -97,7 +97,7 @@ def body_rows(
     base, table = tie.base, tie.parts.table
 
     def solved(values: Doubles) -> Doubles:
-        if table.known is not None:
+        if table.front is not None:
             return base_parameters(linked_bodies(values, base))
         return solved_base(*grey_load(table, values, z_of, poses), poses, base)
 

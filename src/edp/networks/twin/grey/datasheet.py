@@ -66,7 +66,7 @@ def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list
     """
     covariance: Doubles = np.asarray(np.linalg.inv(information + np.eye(len(values))), np.float64)
     rows, first = [], table.inertia_at
-    if table.known is not None:
+    if table.front is not None:
         return _body_inertias(table, values, covariance)
     for a, first_number in enumerate(table.actuator_at):
         own = first + table.inertia_terms * np.arange(a + 1)

@@ -151,8 +151,8 @@ def _check_stroke(
 ) -> None:
     """Refuse recordings whose strokes the machine does not have."""
     column = [c.name for c in channels.velocities].index(elements.actuators[which].velocity)
-    place = len(channels.velocities) + column
-    low, high = float(scales.low[place]), float(scales.high[place])
+    answer = len(channels.velocities) + column
+    low, high = float(scales.low[answer]), float(scales.high[answer])
     if low < -BEYOND * stroke or high > (1.0 + BEYOND) * stroke:
         raise ConfigError(
             f"grey box: '{channels.strokes[column].name}' lies from {low:.4g} to {high:.4g} m in the recordings; the "

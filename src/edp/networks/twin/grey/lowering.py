@@ -50,7 +50,7 @@ def add_layer(build: Builder, twin: GreyTwin, fed: str) -> str:
         offset=scales.answer_offset / twin.units,
         answer_width=scales.answer_width / twin.units,
         # C has no empty arrays.
-        linkage=table.linkage if table.known is not None else np.zeros(1),
+        linkage=table.linkage if table.front is not None else np.zeros(1),
         sides=_places(wiring.sides),
         valve_at=_places(table.valve_at),
         valve_actuator=_places(wiring.actuator),

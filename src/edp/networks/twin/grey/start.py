@@ -73,7 +73,7 @@ def load_start(
         matrix[i] /= size
         goal[i] /= size
     flat = matrix.reshape(-1, matrix.shape[2]), goal.reshape(-1)
-    if table.known is not None:
+    if table.front is not None:
         values, others = balanced_bodies(table, *flat)
         return _with_friction(table, others, declared, values)
     solution = _ridge(*flat)
@@ -82,7 +82,7 @@ def load_start(
 
 def _load_columns(table: NumberTable, rows: Array, z_of: tuple[Array, Array]) -> Array:
     """Forces on the actuators by what is linear in the load ``(actuator, row, column)``."""
-    if table.known is not None:
+    if table.front is not None:
         return balance_columns(table, rows)
     n, exponents, pull = rows.shape[1], table.exponents, rows[:, :, 1]
     z, inertia = (rows[:, :, 2] - z_of[0]) * z_of[1], _entries(n)

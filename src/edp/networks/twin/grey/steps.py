@@ -279,8 +279,8 @@ def _freeze(
     full = columns_by != at.NONE
     force = (loads[0], loads[3], loads[4], loads[5])
     if len(linkage) > 0:
-        known = (*force, loads[8], loads[9], loads[10], loads[11])
-        freeze_linkage(q, places[0], frozen_s, before_v, linkage, known, full)
+        bodies = (*force, loads[8], loads[9], loads[10], loads[11])
+        freeze_linkage(q, places[0], frozen_s, before_v, linkage, bodies, full)
         return
     every = (terms[0], terms[1], loads[7])
     basis(z, exponents, scale, loads[6], every)
