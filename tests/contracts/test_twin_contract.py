@@ -10,6 +10,7 @@ from edp.networks.twin import TWINS
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.static_map import StaticMap, StaticTwin
 from edp.testing import ContractError, check_spec, check_twin
+from edp.testing.twins import sample_front
 
 
 @pytest.mark.parametrize("name", list(TWINS))
@@ -20,6 +21,11 @@ def test_a_formulation_keeps_the_contract(name):
 @pytest.mark.parametrize("members", [1, 3])
 def test_a_recurrent_twin_on_a_static_map_keeps_the_contract(members):
     check_twin("recurrent", Recurrent(units=6, members=members, valve_map=True))
+
+
+@pytest.mark.parametrize("name", ["greybox", "residual"])
+def test_a_grey_box_with_a_known_linkage_keeps_the_contract(name):
+    check_twin(name, TWINS[name](linkage="m22"), (sample_front(),))
 
 
 @pytest.mark.parametrize("name", list(TWINS))

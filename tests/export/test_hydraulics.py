@@ -17,16 +17,16 @@ from edp.export.c.sizes import constant_bytes
 from edp.export.golden import grown_tolerance, random_inputs, stream
 from edp.ir.hydraulics import NONE, HydraulicTick
 from edp.networks.twin import TwinPlant, fit_scales
-from edp.networks.twin.grey import layout, motion, network, stage, steps, valve
+from edp.networks.twin.grey import layout, linkage, motion, network, stage, steps, valve
 from edp.networks.twin.grey.elements import CylinderElement, MotorElement, PumpElement, ValveElement
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.residual import Residual
 from edp.signals import Channel, Kind
-from edp.testing.twins import sample_twin
+from edp.testing.twins import sample_front, sample_twin
 from edp.training.twin_bundle import TwinBundle, plant_bundle
 
-C = (resources.files("edp.export.c") / "runtime/edp_hydraulics.c").read_text()
-HEADER = (resources.files("edp.export.c") / "runtime/edp_hydraulics.h").read_text()
+RUNTIME = resources.files("edp.export.c") / "runtime"
+C, HEADER, LINKAGE = ((RUNTIME / f"edp_{name}").read_text() for name in ("hydraulics.c", "hydraulics.h", "linkage.c"))
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SPEC = GreyBox(
     cylinders=(
@@ -95,9 +95,15 @@ def turning_bench():
     return plant_bundle(TwinBundle(spec, twin.with_numbers(numbers)))
 
 
-def enumerated(*first):
+def front_bench():
+    """A front whose load is bodies of a known linkage."""
+    spec = GreyBox(linkage="m22")
+    return plant_bundle(TwinBundle(spec, sample_twin(spec, sample_front())[0]))
+
+
+def enumerated(first, code=C):
     """Names and numbers of the C enumeration that begins so."""
-    body = next(text for text in re.findall(r"enum \{(.*?)\}", C, re.S) if text.split(",")[0].split()[0] == first[0])
+    body = next(text for text in re.findall(r"enum \{(.*?)\}", code, re.S) if text.split(",")[0].split()[0] == first)
     rows, at = {}, 0
     for entry in re.sub(r"\s+", " ", body).split(","):
         name, _, value = entry.strip().partition(" = ")
@@ -112,6 +118,31 @@ def test_tables_of_places_are_those_of_the_kernel(first):
     rows = enumerated(first)
     assert len(rows) >= 6
     assert rows == {name: getattr(layout, name) for name in rows}
+
+
+def test_places_and_constants_of_a_linkage_are_those_of_the_kernel():
+    code, header = LINKAGE, (RUNTIME / "edp_linkage.h").read_text()
+    for first in ("MASS", "GRAVITY", "ACTUATOR"):
+        rows = enumerated(first, code)
+        assert rows == {name: getattr(layout, name) for name in rows}
+    assert list(enumerated("STROKE", code).values()) == list(range(layout.KNOT_VALUES + 1))
+    assert float(re.search(r"#define BEYOND ([0-9.]+)", code)[1]) == linkage.BEYOND
+    counts = {name: int(value) for name, value in re.findall(r"#define EDP_(\w+) (\d+)u", header)}
+    assert counts == {"BODIES": layout.BODIES, "LINKAGE_KNOTS": layout.LINKAGE_KNOTS}
+
+
+@pytest.mark.parametrize("mixed", [True, False], ids=["mixed", "free"])
+def test_c_runs_as_the_twin_with_a_known_linkage(c, mixed, tmp_path):
+    bundle = front_bench()
+    plant = bundle.predictor
+    program = built(c, bundle, tmp_path, "host_test.c", "-O2")
+    rows = random_inputs(plant, 600, seed=6, mixed=mixed)
+    rows[:, : plant.required] *= 2.0
+    expected = stream(plant, rows)
+    apart = np.abs(c.stream(program, rows) - expected)
+    assert (apart <= grown_tolerance(plant, rows, expected)).all()
+    assert (apart[: plant.window] / plant.twin.scales.answer_width).max() < 1e-5
+    assert b"all tests passed" in c.run(program)
 
 
 def test_constants_are_those_of_the_kernel():
@@ -188,8 +219,9 @@ def test_cppcheck_and_clang_object_to_nothing(c, tmp_path):
     c.need("cppcheck", "clang")
     make_target("c").write(bench(), "predictor", tmp_path)
     options = ("--std=c99", "--enable=warning,performance,portability", "--inline-suppr", "--error-exitcode=1", "-q")
-    c.run("cppcheck", *options, "--suppress=missingIncludeSystem", "edp_hydraulics.c", "predictor.c", folder=tmp_path)
-    c.run("clang", *c.flags, "-O2", "-c", "edp_hydraulics.c", "predictor.c", folder=tmp_path)
+    files = ("edp_hydraulics.c", "edp_linkage.c", "predictor.c")
+    c.run("cppcheck", *options, "--suppress=missingIncludeSystem", *files, folder=tmp_path)
+    c.run("clang", *c.flags, "-O2", "-c", *files, folder=tmp_path)
 
 
 def test_the_header_says_that_the_time_of_a_tick_varies_and_what_stack_it_takes(tmp_path):

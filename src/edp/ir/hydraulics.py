@@ -26,6 +26,7 @@ class HydraulicTick(Layer):
         scale: see there.
         offset: of each answer, in units within; `answer_width` likewise.
         answer_width: see there.
+        linkage: of three cylinders, as `edp.networks.twin.grey.layout` orders it; one zero: the load is polynomials.
         sides: commands that extend and retract ``(valve, 2)``.
         valve_at: places of each valve's numbers ``(valve, 13)``.
         valve_actuator: of each valve.
@@ -34,8 +35,8 @@ class HydraulicTick(Layer):
         pump_at: places of each pump's; without any, one entry `NONE`.
         ports: velocity 0, stroke 1 or pressure 2, and which ``(answer, 2)``.
         exponents: of the load's monomials ``(term, actuator)``.
-        load: places of the first coefficient of the inertia's root and of the potential, and coefficients of each entry
-            of the root between them.
+        load: places of the first coefficient of the inertia's root (of the first body of a linkage) and of the
+            potential, and coefficients of each entry of the root between them.
         circuit: place of the circuit's numbers.
         remembered: ticks of demands.
         steps: implicit steps in a tick.
@@ -49,6 +50,7 @@ class HydraulicTick(Layer):
     scale: Array
     offset: Array
     answer_width: Array
+    linkage: Array
     sides: Indices
     valve_at: Indices
     valve_actuator: Indices
@@ -77,6 +79,11 @@ class HydraulicTick(Layer):
         """Pressures and velocities that an implicit stage solves for."""
         actuators, _, pumps = self.sizes
         return 3 * actuators + pumps
+
+    @property
+    def linked(self) -> bool:
+        """Whether bodies of a linkage are the load."""
+        return len(self.linkage) > 1
 
     @property
     def powers(self) -> int:
@@ -109,5 +116,5 @@ class HydraulicTick(Layer):
         n, valves, pumps = self.sizes
         nodes, terms = self.unknown + 2 - n, len(self.exponents)
         network = 4 * self.unknown + self.unknown**2 + 2 * nodes + nodes**2
-        load = 13 * n + 3 * n**2 + n**3 + terms * (1 + n) + 2 * n * self.powers
+        load = 12 * n + 4 * n**2 + n**3 + terms * (1 + n) + 2 * n * self.powers
         return network + load + valves * (1 + VALVE_STATES) + 2 * pumps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from edp.testing.expectations import expect, expect_near
 Array = NDArray[np.float32]
 RATE_HZ = 50.0
 BATCH, TICKS = 3, 24
+FRONT_PILOTS = (("Bm", "Up"), ("Bm", "Dwn"), ("Am", "In"), ("Am", "Out"), ("Bkt", "In"), ("Bkt", "Out"))
+FRONT_STROKES = (1.26, 1.504, 1.104)
+"""m, of boom, arm and bucket: those of machine M22."""
 
 
 def sample_actuators(
@@ -51,6 +54,30 @@ def sample_actuators(
     return Recording(f"actuators_{seed}", channels, values, RATE_HZ, "sample")
 
 
+def sample_front(ticks: int = 600, seed: int = 0) -> Recording:
+    """A recording with the channels of an excavator front; levers, strokes and pressures drawn apart, at 50 Hz.
+
+    Args:
+        ticks: length.
+        seed: of all values.
+    """
+    rng = np.random.default_rng(seed)
+    lever = np.repeat(rng.uniform(-4e6, 4e6, (ticks // 25 + 1, 3)), 25, axis=0)[:ticks]
+    pilots = np.stack([np.maximum(lever, 0.0), np.maximum(-lever, 0.0)], axis=2).reshape(ticks, 6)
+    names = [(f"{axis}{way}", Kind.PILOT_PRESSURE) for axis, way in FRONT_PILOTS]
+    names += [(f"CylVels_{i}", Kind.VELOCITY) for i in (1, 2, 3)]
+    names += [(f"CylStroke_{i}", Kind.POSITION) for i in (1, 2, 3)]
+    names += [(f"CylPressures_{i + side}", Kind.PRESSURE) for i in (1, 2, 3) for side in (0, 4)]
+    names += [(f"PumpPressure_{i}", Kind.PRESSURE) for i in (1, 2)]
+    phase = np.arange(ticks)[:, None] / RATE_HZ * np.array([0.7, 0.9, 1.1])
+    stroke = np.array(FRONT_STROKES) * (0.5 + 0.48 * np.sin(phase))
+    velocity = np.gradient(stroke, axis=0) * RATE_HZ
+    pressures = rng.uniform(1e6, 2e7, (ticks, 8))
+    values = np.concatenate([pilots, velocity, stroke, pressures], axis=1).astype(np.float32)
+    channels = tuple(Channel(name, kind) for name, kind in names)
+    return Recording(f"front_{seed}", channels, values, RATE_HZ, "sample")
+
+
 def sample_twin(spec: TwinSpec, recording: Recording | None = None) -> tuple[Twin, Array, Array]:
     """A twin of sample actuators, with commands and measured values ``(batch, tick, channel)`` to run it on.
 
@@ -69,17 +96,19 @@ def sample_twin(spec: TwinSpec, recording: Recording | None = None) -> tuple[Twi
     return twin, commands, measured
 
 
-def check_twin(name: str, options: TwinSpec | None = None) -> None:
+def check_twin(name: str, options: TwinSpec | None = None, recordings: Sequence[Recording] = ()) -> None:
     """Hold a registered formulation to its contract, for two actuators and for one with the least of sensors.
 
     Args:
         name: under which it is registered.
         options: of the formulation; its defaults where left out.
+        recordings: to hold it to in place of those, for options that need a machine of their own.
 
     Raises:
         ContractError: what does not hold, and for which channels.
     """
-    for recording in (sample_actuators(), sample_actuators(axes=1, strokes=False, pressures=False)):
+    samples = (sample_actuators(), sample_actuators(axes=1, strokes=False, pressures=False))
+    for recording in recordings or samples:
         spec: TwinSpec = options or TWINS[name]()
         twin, commands, measured = sample_twin(spec, recording)
         where = f"twin '{name}', {', '.join(channel.name for channel in twin.channels.answers)}"

@@ -28,6 +28,8 @@ SMALL = (
     ),
 )
 WORDS = [word for change in SMALL for word in ("--set", change)]
+LINKED = [word for change in SMALL if "degree" not in change for word in ("--set", change)]
+"""Without degrees of polynomials, so that bodies of the guess's linkage are the load."""
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +41,12 @@ def logs(tmp_path_factory):
 
 def test_a_machine_file_is_written_that_simulates_and_says_what_is_told(edp, logs, tmp_path):
     file = tmp_path / "mine.toml"
-    ended = edp("identify", logs, "--out", file, *WORDS, "--json")
+    ended = edp("identify", logs, "--out", file, *LINKED, "--json")
     assert ended.code == 0, ended.err
     machine = load_machine(str(file))
     assert machine.name == "mine"
+    assert machine.bodies != load_machine("M22").bodies
+    assert machine.bodies.length == load_machine("M22").bodies.length
     base = load_machine("M22")
     assert (machine.cylinders.bore, machine.boom_cylinder) == (base.cylinders.bore, base.boom_cylinder)
     facts = read_json(tmp_path / "mine.json")
@@ -119,6 +123,7 @@ def test_logs_and_machines_that_do_not_fit_are_refused_and_nothing_is_written(ed
     [
         ("twin.kind=residual", "twin.kind = 'residual' came"),
         ('twin.motors=[{name="swing", velocity="rate"}]', "the grey box has motors; a machine of the simulator has"),
+        ("twin.linkage=c14", "the linkage is that of --machine (M22): leave twin.linkage out"),
         ('twin.without=["play"]', "twin.without = ['play'] leaves out numbers that a machine file has"),
     ],
 )

@@ -260,7 +260,7 @@ def structs(layer: Layer) -> list[str]:
     if isinstance(layer, HydraulicTick):
         counts = (
             *(*layer.sizes, len(layer.ports), len(layer.knots), len(layer.exponents), layer.powers),
-            *(layer.remembered, layer.steps, *layer.load, layer.circuit),
+            *(layer.remembered, layer.steps, *layer.load, layer.circuit, int(layer.linked)),
         )
         machine = ", ".join([*at.values(), *(f"{count}u" for count in counts), number(layer.tick_s)])
         return [f"static const edp_hydraulics {name}_machine = {{{machine}}};"]

@@ -35,7 +35,7 @@ STRUCTS = {
     "edp_q_matrix": (3, 0),
     "edp_q_recurrent": (8, 1),
     "edp_adapt_law": (10, 14),
-    "edp_hydraulics": (15, 14),
+    "edp_hydraulics": (16, 15),
 }
 """Pointers, and numbers of 4 bytes behind them, of the runtime's structs."""
 

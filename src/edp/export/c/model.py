@@ -25,7 +25,7 @@ from edp.networks.integer import IntegerPredictor
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
-HYDRAULICS = ("edp_hydraulics.h", "edp_hydraulics.c")
+HYDRAULICS = ("edp_hydraulics.h", "edp_linkage.h", "edp_hydraulics.c", "edp_linkage.c")
 DOUBLE_BYTES = 8
 MOST_STACK = 2**18
 """Bytes: a quarter of the smallest stack that threads of desktop systems have (1 MiB, Windows)."""

@@ -26,6 +26,7 @@ from edp.networks.twin.grey.elements import (
     default_elements,
 )
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
+from edp.networks.twin.grey.known_linkage import KnownLinkage, check_linkage
 from edp.networks.twin.grey.lowering import add_layer
 from edp.networks.twin.grey.numbers import LEFT_OUT, NumberTable, number_table
 from edp.networks.twin.grey.plausible import KNOTS, Travel
@@ -36,6 +37,8 @@ from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
 from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, integer
 
 Doubles = NDArray[np.float64]
+POLYNOMIALS = (2, 4)
+"""Degrees of those of inertia and gravity, where settings name none."""
 LONGEST_DELAY_S = 0.3
 """Of a command; a fit cannot find a longer one."""
 LONGEST_STEP_S = 0.0125
@@ -56,21 +59,24 @@ class GreyBox:
         pumps: with their lines; none: valves are fed at constant pressure.
         inertia_degree: of the polynomials of the strokes that stand for the root of the inertia.
         potential_degree: of the polynomial that stands for gravity.
+        linkage: machine (a name, or a machine file) whose linkage the cylinders boom, arm and bucket move: bodies stand
+            for inertia and gravity then; empty: polynomials.
         without: what its equations leave out: `power_limit` of the pumps, `cushions` at the end stops, `play` of the
             spools.
         prefix_ticks: measured ticks before a free run.
         fit: how its numbers are fitted.
 
     Raises:
-        ConfigError: a value out of range, or no such part of the equations.
+        ConfigError: a value out of range, no such part of the equations, or polynomials beside a linkage.
     """
 
     cylinders: tuple[CylinderElement, ...] = ()
     motors: tuple[MotorElement, ...] = ()
     valves: tuple[ValveElement, ...] = ()
     pumps: tuple[PumpElement, ...] = ()
-    inertia_degree: int = 2
-    potential_degree: int = 4
+    inertia_degree: int = POLYNOMIALS[0]
+    potential_degree: int = POLYNOMIALS[1]
+    linkage: str = ""
     without: tuple[str, ...] = ()
     prefix_ticks: int = 30
     fit: GreyFitSpec = field(default_factory=GreyFitSpec)
@@ -81,6 +87,12 @@ class GreyBox:
         for name in ("cylinders", "motors", "valves", "pumps"):
             check_count("grey box", name, getattr(self, name), MOST_NAMES)
         check_count("grey box", "without", self.without, len(LEFT_OUT))
+        if self.linkage and self.degrees != POLYNOMIALS:
+            raise ConfigError(
+                f"grey box: inertia_degree = {self.inertia_degree} and potential_degree = {self.potential_degree} are "
+                f"of polynomials, which twin.linkage = '{self.linkage[:80]}' replaces; leave the degrees out, or the "
+                "linkage"
+            )
         for part in self.without:
             if part not in LEFT_OUT:
                 raise ConfigError(
@@ -99,15 +111,19 @@ class GreyBox:
         else:
             elements = default_elements(channels)
         check_elements(elements, channels)
+        if self.linkage:
+            check_linkage(self.linkage[:80], elements, channels)
         return elements
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> GreyTwin:
         """With plausible numbers; where all is measured, its load balances the forces that were measured."""
         elements = self.elements(channels)
-        table = self._table(elements, channels, scales)
+        front = KnownLinkage.read(self.linkage, elements, channels, scales) if self.linkage else None
+        table = self._table(elements, channels, scales, front)
         commands = np.concatenate([series.inputs for series in train])
         full = [_full(commands[:, _sides(valve, channels)]) for valve in elements.valves]
         arrays = {"numbers": table.nominal.astype(np.float32), "full": np.array(full, np.float32)}
+        arrays |= {} if front is None else front.arrays()
         twin = self.build(channels, scales, arrays | self._network(channels, seed))
         # Both sides of a motor are the same, so that there is nothing to learn of the second one.
         declared = [isinstance(one, MotorElement) or one.areas is not None for one in elements.actuators]
@@ -118,13 +134,15 @@ class GreyBox:
         """All numbers, and the full command of each valve."""
         elements = self.elements(channels)
         travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.actuators)
-        table = number_table(elements, travels, [1.0] * len(elements.pumps), self._degrees, self.without)
-        return {"numbers": (len(table.numbers),), "full": (len(elements.valves),)}
+        own = KnownLinkage.SHAPES if self.linkage else {}
+        front = KnownLinkage(*(np.ones(shape) for shape in own.values())) if own else None
+        table = number_table(elements, travels, [1.0] * len(elements.pumps), self.degrees, self.without, front)
+        return {"numbers": (len(table.numbers),), "full": (len(elements.valves),), **own}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
-        """The grey box with these numbers."""
+        """The grey box with these numbers; nothing of a linkage's machine is read again."""
         elements = self.elements(channels)
-        table = self._table(elements, channels, scales)
+        table = self._table(elements, channels, scales, KnownLinkage.of(arrays) if self.linkage else None)
         numbers = arrays["numbers"].astype(np.float64)
         if not (numbers[table.positive] > 0).all():
             raise ValueError("one of its numbers is not positive")
@@ -139,10 +157,13 @@ class GreyBox:
         return {}
 
     @property
-    def _degrees(self) -> tuple[int, int]:
+    def degrees(self) -> tuple[int, int]:
+        """Of the polynomials of inertia and gravity."""
         return self.inertia_degree, self.potential_degree
 
-    def _table(self, elements: Elements, channels: TwinChannels, scales: TwinScales) -> NumberTable:
+    def _table(
+        self, elements: Elements, channels: TwinChannels, scales: TwinScales, front: KnownLinkage | None
+    ) -> NumberTable:
         names = [channel.name for channel in channels.answers]
         count = len(channels.velocities)
 
@@ -156,7 +177,7 @@ class GreyBox:
             fastest, (first, second) = float(scales.high[i]) / FASTEST, actuator.chambers
             travels.append(Travel(float(low), float(high), fastest, (highest(first), highest(second))))
         pumps = [highest(pump.pressure) * HIGHEST for pump in elements.pumps]
-        return number_table(elements, travels, pumps, self._degrees, self.without)
+        return number_table(elements, travels, pumps, self.degrees, self.without, front)
 
 
 def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
@@ -308,15 +329,17 @@ class GreyTwin(Twin):
         limits = (self.scales.low / self.units, self.scales.high / self.units, self.units)
         run_lanes(
             demands, measured, judged.truth, state, judged.counts, (judged.weight, judged.delta), limits,
-            (numbers, KNOTS, *self.wiring.z_of), self.form, self.wiring.ports, self.table.places, self.table.exponents,
-            self.time, judged.full, nothing if answers is None else answers, judged.normal, *network,
+            (numbers, KNOTS, *self.wiring.z_of, self.table.linkage), self.form, self.wiring.ports, self.table.places,
+            self.table.exponents, self.time, judged.full, nothing if answers is None else answers, judged.normal,
+            *network,
         )  # fmt: skip
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
         return add_layer(build, self, fed)
 
     def arrays(self) -> dict[str, Array]:
-        return self.scales.arrays() | {"numbers": self.numbers.astype(np.float32), "full": self.full}
+        front = {} if self.table.front is None else self.table.front.arrays()
+        return self.scales.arrays() | {"numbers": self.numbers.astype(np.float32), "full": self.full} | front
 
 
 STATES = ("pressures_and_velocities", "strokes", "bristles", "displacements", "valves", "history")

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
+from edp.networks.twin.grey.layout import BODY_VALUES
 from edp.networks.twin.grey.numbers import NumberTable
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Bodies, Machine
@@ -145,6 +146,12 @@ def solved_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine)
     goal = np.concatenate([share * np.concatenate(goals), np.sign(begin) / GUESS_TRUST])
     size = np.abs(begin)
     return np.asarray(size * np.linalg.lstsq(matrix * size, goal, rcond=None)[0])
+
+
+def linked_bodies(load: Doubles, guess: Machine) -> Bodies:
+    """Bodies of a grey box with a known linkage, from the numbers of its load in its units; lengths are the guess's."""
+    mass, x, y, inertia = load.reshape(-1, BODY_VALUES).T * np.array([[GIGA], [1.0], [1.0], [GIGA]])
+    return replace(guess.bodies, mass=_triple(mass), com_x=_triple(x), com_y=_triple(y), inertia=_triple(inertia))
 
 
 def realised(base: Doubles, guess: Machine) -> Bodies:

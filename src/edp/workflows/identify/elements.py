@@ -10,6 +10,7 @@ from edp.data.roles import Axis, roles_of
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError
 from edp.networks.twin.grey.elements import CylinderElement, Elements, PumpElement, ValveElement
+from edp.networks.twin.grey.known_linkage import KnownLinkage
 from edp.networks.twin.greybox import GreyTwin
 from edp.recording import Recording
 from edp.signals import Channel, Kind
@@ -159,3 +160,19 @@ def check_strokes(channels: Sequence[Channel], low: np.ndarray, high: np.ndarray
                 f"machine {machine.name} from 0 to {stroke:.4g} m; give the --machine that was logged, with strokes "
                 "measured from closed"
             )
+
+
+def check_same_linkage(twin: GreyTwin, base: Machine, machine: str) -> None:
+    """Refuse a grey box whose known linkage is not that of the guess, whose lengths the bodies would get.
+
+    Raises:
+        ConfigError: pins or lengths that differ.
+    """
+    if twin.table.front is None:
+        return
+    own = KnownLinkage.read(machine, twin.spec.elements(twin.channels), twin.channels, twin.scales)
+    if not np.allclose(own.values, twin.table.linkage, rtol=1e-4):
+        raise ConfigError(
+            f"--run: its grey box has the linkage of '{twin.spec.linkage[:80]}', which is not that of --machine "
+            f"({base.name}): give the same machine, or leave --run out"
+        )

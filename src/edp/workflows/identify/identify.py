@@ -19,7 +19,7 @@ from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, UNEXCITED
 from edp.networks.twin.grey.elements import Elements
-from edp.networks.twin.greybox import GreyBox, GreyTwin
+from edp.networks.twin.greybox import POLYNOMIALS, GreyBox, GreyTwin
 from edp.networks.twin.kinds import KINDS, AutoTwin
 from edp.networks.twin.residual import Residual
 from edp.recording import Recording
@@ -30,9 +30,16 @@ from edp.storage import check_writable, write_bytes, write_json
 from edp.training.free_run import FreeRunProgress
 from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.twin_bundle import load_twin
-from edp.workflows.identify.bodies import Poses, realised
+from edp.workflows.identify.bodies import Poses, linked_bodies, realised
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
-from edp.workflows.identify.elements import NO_MOTORS, check_strokes, excavator_elements, full_commands, parts_of
+from edp.workflows.identify.elements import (
+    NO_MOTORS,
+    check_same_linkage,
+    check_strokes,
+    excavator_elements,
+    full_commands,
+    parts_of,
+)
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
 from edp.workflows.identify.machine_text import machine_text
 from edp.workflows.identify.mapping import GreyParts
@@ -127,11 +134,17 @@ def identify(
     settings = experiment or load_twin_experiment(None, ["twin.kind=greybox"])
     settings = loaded[1] if loaded is not None else settings
     grey = _whole_grey_box(settings.twin)
+    if grey.linkage and loaded is None:
+        raise ConfigError(
+            f"settings: twin.linkage = '{grey.linkage[:80]}' came; the linkage is that of --machine ({base.name}): "
+            "leave twin.linkage out"
+        )
     channels, data = prepared_twin(recordings, settings)
     _check_strokes(channels, data, base)
     if loaded is None:
-        fitted = _fitted(base, grey, (channels, data, settings.training.seed), (on_event, tell))
+        fitted = _fitted(base, machine, grey, (channels, data, settings.training.seed), (on_event, tell))
     else:
+        check_same_linkage(loaded[0], base, machine)
         fitted = _informed(loaded[0], data, settings.training.seed)
     celsius, notes = _celsius(recordings, base)
     parts = parts_of(fitted.twin, fitted.elements, base, celsius)
@@ -211,13 +224,20 @@ def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
     return bundle.twin, replace(load_twin_experiment(Path(run) / "config.toml"), twin=bundle.spec)
 
 
-def _fitted(base: Machine, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], report: Any) -> _Fitted:
-    """A grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed."""
+def _fitted(
+    base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], report: Any
+) -> _Fitted:
+    """A grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed.
+
+    `machine` is the name or file of `base`.
+    """
     channels, data, seed = logs
     on_event, tell = report
     elements = excavator_elements(channels, base)
     full = np.array(full_commands(channels, elements, base), np.float32)
     spec = replace(spec, cylinders=elements.cylinders, valves=elements.valves, pumps=elements.pumps)
+    # Its own pins and lengths hold; polynomials of the strokes where a degree of them is asked for.
+    spec = replace(spec, linkage=machine) if spec.degrees == POLYNOMIALS else spec
     begun = spec.start(channels, fit_scales(channels, data.train), data.train, seed)
     twin = GreyTwin(channels, begun.scales, spec, (begun.table, begun.wiring), begun.numbers, full)
     tell("fitting a grey box to free runs")
@@ -271,7 +291,7 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
     final = replace(tie, free=excited)
     settled = kept_back(theta, information, back)
-    machine, load = final.machine(settled), tie.load + tie.load_width * settled[count:]
+    machine, load = final.machine(settled), tie.load_at(settled)
     valves = machine.valves
     missing = np.array(tie.parts.conflux) < 0
     shares: dict[str, Any] = {
@@ -283,9 +303,10 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
     speeds = len(twin.channels.velocities)
     strokes = np.concatenate([part.targets[:, speeds : 2 * speeds] for part in data.train]).astype(np.float64)
     poses = Poses.of(machine, strokes)
-    of_load = spread[count:, count:] * tie.load_width * tie.load_width[:, None]
-    nine, body = body_rows(tie.base, tie.parts, load, of_load, twin.wiring.z_of, poses)
+    nine, body = body_rows(tie, load, spread[count:, count:], twin.wiring.z_of, poses)
     numbers = number_rows(tie.base, machine, left[:count], excited)
+    if tie.parts.table.front is not None:
+        return replace(machine, bodies=linked_bodies(load, tie.base)), numbers + body, []
     try:
         return replace(machine, bodies=realised(nine, tie.base)), numbers + body, []
     except ConfigError as error:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from edp.networks.twin.grey.datasheet import NORMAL, UNEXCITED
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
-from edp.workflows.identify.bodies import NAMES, Poses, base_parameters, grey_load, solved_base
+from edp.workflows.identify.bodies import NAMES, Poses, base_parameters, grey_load, linked_bodies, solved_base
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
-from edp.workflows.identify.mapping import GreyParts
+from edp.workflows.identify.tie import STEP, MachineTie
 
 Doubles = NDArray[np.float64]
 TOLD = 0.2
@@ -83,31 +83,32 @@ def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray
 
 
 def body_rows(
-    base: Machine, parts: GreyParts, load: Doubles, covariance: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
+    tie: MachineTie, load: Doubles, covariance: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
 ) -> tuple[Doubles, list[IdentifiedNumber]]:
     """The nine numbers of the bodies, and a row of each.
 
     Args:
-        base: the guess.
-        parts: which element is which.
+        tie: the guess, and which element is which.
         load: numbers of the load, in units of the grey box.
-        covariance: of them, in the same units.
+        covariance: of their coordinates.
         z_of: middle and scale of the strokes.
         poses: of the logs.
     """
+    base, table = tie.base, tie.parts.table
 
     def solved(values: Doubles) -> Doubles:
-        return solved_base(*grey_load(parts.table, values, z_of, poses), poses, base)
+        if table.front is not None:
+            return base_parameters(linked_bodies(values, base))
+        return solved_base(*grey_load(table, values, z_of, poses), poses, base)
 
     nine, guess = solved(load), base_parameters(base.bodies)
-    width = parts.table.width[parts.load]
     slopes = np.empty((len(nine), len(load)))
-    for k, step in enumerate(1e-4 * width):
+    for k, size in enumerate(tie.load_slope(load)):
         moved = np.zeros(len(load))
-        moved[k] = step
-        slopes[:, k] = (solved(load + moved) - solved(load - moved)) / (2.0 * step)
+        moved[k] = STEP * size
+        slopes[:, k] = (solved(load + moved) - solved(load - moved)) / (2.0 * STEP)
     left = np.sqrt(np.einsum("ik,kl,il->i", slopes, covariance, slopes))
-    before = np.sqrt(np.square(slopes * width).sum(axis=1))
+    before = np.sqrt(np.square(slopes).sum(axis=1))
     rows = []
     for i, name in enumerate(NAMES):
         reach, unit = NORMAL * float(left[i]), "kg m" if i < 6 else "kg m^2"

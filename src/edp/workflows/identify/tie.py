@@ -33,7 +33,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
 
 @dataclass(frozen=True, eq=False)
 class MachineTie:
-    """Coordinates of a fit: numbers of a machine, then those of the load, which stay polynomials.
+    """Coordinates of a fit: numbers of a machine, then those of the load: polynomials, or bodies of a known linkage.
 
     Attributes:
         base: the machine that is guessed.
@@ -55,10 +55,23 @@ class MachineTie:
         count = len(MACHINE_NUMBERS)
         return MachineTie(base, parts, load, np.ones(count, np.bool_), np.zeros(count + len(load)))
 
+    def load_at(self, theta: Doubles) -> Doubles:
+        """Numbers of the load at all coordinates, in units of the grey box."""
+        moved, positive = self._load_width * theta[len(MACHINE_NUMBERS) :], self._load_positive
+        grown = self.load * np.exp(np.clip(moved, -FARTHEST, FARTHEST))
+        return np.where(positive, grown, self.load + moved)
+
+    def load_slope(self, load: Doubles) -> Doubles:
+        """Derivatives of the numbers of the load by their own coordinates: deviations that were plausible before."""
+        return np.where(self._load_positive, load * self._load_width, self._load_width)
+
     @property
-    def load_width(self) -> Doubles:
-        """Plausible deviations of the load."""
+    def _load_width(self) -> Doubles:
         return self.parts.table.width[self.parts.load]
+
+    @property
+    def _load_positive(self) -> NDArray[np.bool_]:
+        return self.parts.table.positive[self.parts.load]
 
     @cached_property
     def _base_values(self) -> tuple[Doubles, Doubles]:
@@ -79,8 +92,7 @@ class MachineTie:
 
     def numbers(self, theta: Doubles) -> Doubles:
         """Numbers of the grey box, in its units ``(number,)``."""
-        load = self.load + self.load_width * theta[len(MACHINE_NUMBERS) :]
-        numbers = grey_numbers(self.machine(theta), self.parts, load)
+        numbers = grey_numbers(self.machine(theta), self.parts, self.load_at(theta))
         # A logarithm has no zero: a regeneration that is not there is a very small one.
         return np.where(self.parts.table.positive, np.maximum(numbers, TINY * self.parts.table.nominal), numbers)
 
@@ -92,7 +104,7 @@ class MachineTie:
             step = np.zeros(len(theta))
             step[k] = STEP
             result[:, k] = (self.numbers(theta + step) - self.numbers(theta - step)) / (2.0 * STEP)
-        result[self.parts.load, count:] = np.diag(self.load_width)
+        result[self.parts.load, count:] = np.diag(self.load_slope(self.load_at(theta)))
         return result
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,13 @@ from edp.evaluation.free_run import calibrated
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
+from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.recording import Recording
 from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
+from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.blas import one_blas_thread
@@ -89,7 +91,7 @@ def train_twin(
     if base is not None:
         base.check(channels, data.train)
         begun = {"from": base.digest}
-    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)} | begun, data.digest)
+    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)} | begun | _machine(experiment), data.digest)
     with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
@@ -113,6 +115,18 @@ def train_twin(
         run.write_status("finished")
         run.remove_parts()
     return TrainedTwin(bundle, scores, False)
+
+
+def _machine(experiment: TwinExperiment) -> dict[str, Any]:
+    """All numbers of the machine that settings name for its linkage: an edited file asks for another twin.
+
+    Raises:
+        ConfigError: no such machine.
+    """
+    spec = experiment.twin
+    if not isinstance(spec, GreyBox) or not spec.linkage:
+        return {}
+    return {"linkage": asdict(load_machine(spec.linkage))}
 
 
 def _helpers(workers: int) -> int:

@@ -1,5 +1,6 @@
 /* One tick of a grey box. See edp_hydraulics.h; the equations are those of the Python package's edp.networks.twin.grey. */
 #include "edp_hydraulics.h"
+#include "edp_linkage.h"
 
 #include <math.h>
 #include <stddef.h>
@@ -40,8 +41,8 @@ typedef struct {
     uint32_t n, nodes, unknown, all; /* actuators, pressures that are states, unknowns, nodes with tank and supply */
     double *y, *base, *reached, *residual, *by_y;        /* unknown; by_y (unknown, unknown) */
     double *p, *net, *jac;                               /* all; jac (all, all) */
-    double *s, *z, *zs, *base_z, *frozen, *scaled, *before, *at_start, *s_start, *force, *change, *w, *u; /* n */
-    double *low, *dot, *along;                           /* (n, n) */
+    double *s, *z, *zs, *base_z, *frozen, *scaled, *before, *at_start, *s_start, *force, *w, *u; /* n */
+    double *low, *dot, *along, *mass;                    /* (n, n) */
     double *by_low;                                      /* (n, n, n) */
     double *value, *first;                               /* terms; (terms, n) */
     double *table;                                       /* (2, n, powers) */
@@ -96,12 +97,12 @@ static void divide(const edp_hydraulics *h, double *room, rooms *r) {
     r->at_start = taken(&room, n);
     r->s_start = taken(&room, n);
     r->force = taken(&room, n);
-    r->change = taken(&room, n);
     r->w = taken(&room, n);
     r->u = taken(&room, n);
     r->low = taken(&room, n * n);
     r->dot = taken(&room, n * n);
     r->along = taken(&room, n * n);
+    r->mass = taken(&room, n * n);
     r->by_low = taken(&room, n * n * n);
     r->value = taken(&room, h->terms);
     r->first = taken(&room, h->terms * n);
@@ -174,13 +175,30 @@ static void turning(const rooms *r) {
     }
 }
 
-/* Strokes in the middle of the step, and the load there: L, its gradient, forces of gravity and of turning. */
+/* Inertia M = L L' from its root. */
+static void squared(const rooms *r) {
+    const uint32_t n = r->n;
+    zeroed(r->mass, n * n);
+    for (uint32_t i = 0; i < n; i++) {
+        for (uint32_t k = 0; k < n; k++) {
+            for (uint32_t c = 0; c <= ((i < k) ? i : k); c++) {
+                r->mass[i * n + k] += r->low[i * n + c] * r->low[k * n + c];
+            }
+        }
+    }
+}
+
+/* Strokes in the middle of the step, and the load there: inertia, forces of gravity and of turning. */
 static void freeze(const edp_hydraulics *h, const rooms *r, double step) {
     const uint32_t n = r->n;
     for (uint32_t i = 0; i < n; i++) {
         const double half = (h->scale[i] > 0.0f) ? (0.5 * step) : 0.0;
         r->frozen[i] = r->s[i] + half * r->before[i];
         r->scaled[i] = (r->frozen[i] - (double)h->middle[i]) * (double)h->scale[i];
+    }
+    if (h->linked != 0u) {
+        edp_linkage_load(h->linkage, h->numbers + h->inertia, r->frozen, r->before, r->mass, r->force);
+        return;
     }
     basis(h, r);
     zeroed(r->low, n * n);
@@ -203,6 +221,7 @@ static void freeze(const edp_hydraulics *h, const rooms *r, double step) {
             r->force[i] += number(h, h->potential + b - 1u) * r->first[b * n + i];
         }
     }
+    squared(r);
     turning(r);
 }
 
@@ -413,13 +432,6 @@ static double friction(const edp_hydraulics *h, uint32_t a, double v, double bef
 /* Rows of all velocities; `reach` is half the time from the start of the step to this stage. */
 static void motion_rows(const edp_hydraulics *h, const rooms *r, double step, double reach) {
     const uint32_t n = r->n;
-    zeroed(r->w, n);
-    for (uint32_t a = 0; a < n; a++) {
-        const double change = r->y[r->nodes + a] - r->base[r->nodes + a];
-        for (uint32_t c = 0; c <= a; c++) {
-            r->w[c] += r->low[a * n + c] * change;
-        }
-    }
     for (uint32_t i = 0; i < n; i++) {
         const uint32_t a = h->actuator_at[i];
         const double v = r->y[r->nodes + i];
@@ -438,18 +450,14 @@ static void motion_rows(const edp_hydraulics *h, const rooms *r, double step, do
         }
         const double stiffness = (depth != 0.0) ? number(h, a + STOP_STIFFNESS) : 0.0;
         double inertial = 0.0;
-        for (uint32_t c = 0; c <= i; c++) {
-            inertial += r->low[i * n + c] * r->w[c];
+        for (uint32_t k = 0; k < n; k++) {
+            inertial += r->mass[i * n + k] * (r->y[r->nodes + k] - r->base[r->nodes + k]);
+            row[r->nodes + k] = r->mass[i * n + k];
         }
         const double push = head * r->y[i] - rod * r->y[n + i] - r->force[i];
         r->residual[r->nodes + i] = inertial - step * (push - rubbing - stiffness * depth);
         row[i] = -step * head;
         row[n + i] = step * rod;
-        for (uint32_t k = 0; k < n; k++) {
-            for (uint32_t c = 0; c <= ((i < k) ? i : k); c++) {
-                row[r->nodes + k] += r->low[i * n + c] * r->low[k * n + c];
-            }
-        }
         row[r->nodes + i] += step * (slope + stiffness * reach);
     }
 }

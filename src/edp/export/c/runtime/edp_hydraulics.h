@@ -22,6 +22,7 @@ typedef struct {
     const float *scale;             /* from a stroke to -1..1; 0: that stroke is not measured */
     const float *offset;            /* of each answer */
     const float *width;             /* of each answer */
+    const float *linkage;           /* of edp_linkage.h, where `linked` */
     const uint16_t *sides;          /* (valves, 2): commands that extend and retract */
     const uint16_t *valve_at;       /* (valves, EDP_VALVE_PLACES) */
     const uint16_t *valve_actuator; /* (valves) */
@@ -43,6 +44,7 @@ typedef struct {
     uint32_t per_entry; /* coefficients of each of its entries, */
     uint32_t potential; /* and the first one of the potential */
     uint32_t circuit;   /* place of the circuit's numbers */
+    uint32_t linked;    /* 1: bodies of a linkage are the load, numbers from `inertia` on; 0: polynomials */
     float tick_s;
 } edp_hydraulics;
 

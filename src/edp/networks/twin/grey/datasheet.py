@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.known_linkage import GIGA
+from edp.networks.twin.grey.linkage import balance_by_base, base_of
 from edp.networks.twin.grey.numbers import NumberTable
 
 Doubles = NDArray[np.float64]
@@ -61,27 +64,57 @@ def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list
     It is the sum of squares of its row of the root, whose first coefficients are the root there; its interval follows
     from theirs and their covariance.
     """
-    covariance = np.linalg.inv(information + np.eye(len(values)))
+    covariance: Doubles = np.asarray(np.linalg.inv(information + np.eye(len(values))), np.float64)
     rows, first = [], table.inertia_at
+    if table.front is not None:
+        return _body_inertias(table, values, covariance)
     for a, first_number in enumerate(table.actuator_at):
         own = first + table.inertia_terms * np.arange(a + 1)
         first = int(own[-1]) + table.inertia_terms
         root = table.numbers[own[0]]
         value, slope = float(values[own] @ values[own]), 2.0 * values[own] * table.width[own]
-        deviation = float(np.sqrt(slope @ covariance[np.ix_(own, own)] @ slope))
-        reach, factor = NORMAL * deviation, root.factor**2
-        rows.append(
-            {
-                "element": "load",
-                "name": f"inertia_{table.numbers[first_number].element}",
-                "unit": root.unit.replace("kg^0.5", "kg").replace(" m", " m^2"),
-                "value": value * factor,
-                "low": max(value - reach, 0.0) * factor,
-                "high": (value + reach) * factor,
-                "excited": bool(deviation < UNEXCITED * float(np.sqrt(slope @ slope))),
-            }
-        )
+        unit = root.unit.replace("kg^0.5", "kg").replace(" m", " m^2")
+        of = table.numbers[first_number].element
+        rows.append(_inertia_row(of, unit, root.factor**2, value, slope, covariance[np.ix_(own, own)]))
     return rows
+
+
+def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> list[dict[str, Any]]:
+    """The same of a known linkage, at the middle of the strokes of its machine."""
+    span, n = slice(table.inertia_at, table.potential_at), len(table.actuator_at)
+    joints = table.linkage[at.JOINTS :].reshape(at.BODIES, at.JOINT_VALUES)
+    strokes, zero = np.zeros((1, n)), np.zeros((1, n))
+    which = joints[:, at.ACTUATOR].astype(int)
+    strokes[0, which] = 0.5 * (joints[:, at.KNOT] + joints[:, -at.KNOT_VALUES])
+    base, by_number = np.empty(at.BASE), np.empty((at.BASE, span.stop - span.start))
+    base_of(values, table.inertia_at, table.linkage, base, by_number)
+    by_coordinate = by_number * np.where(table.positive[span], values[span] * table.width[span], table.width[span])
+    resting, moved, rows = np.empty((1, n, at.BASE)), np.empty((1, n, at.BASE)), []
+    balance_by_base(strokes, zero, zero, table.linkage, resting)
+    for i, first_number in enumerate(table.actuator_at):
+        balance_by_base(strokes, zero, np.eye(n)[i : i + 1], table.linkage, moved)
+        parts = (moved - resting)[0, i]
+        of = table.numbers[first_number].element
+        slope = parts @ by_coordinate
+        rows.append(_inertia_row(of, "kg", GIGA, float(parts @ base), slope, covariance[span, span]))
+    return rows
+
+
+def _inertia_row(
+    of: str, unit: str, factor: float, value: float, slope: Doubles, covariance: Doubles
+) -> dict[str, Any]:
+    """Of an actuator's inertia, from its slope by coordinates in plausible deviations and their covariance."""
+    deviation = float(np.sqrt(slope @ covariance @ slope))
+    reach = NORMAL * deviation
+    return {
+        "element": "load",
+        "name": f"inertia_{of}",
+        "unit": unit,
+        "value": value * factor,
+        "low": max(value - reach, 0.0) * factor,
+        "high": (value + reach) * factor,
+        "excited": bool(deviation < UNEXCITED * float(np.sqrt(slope @ slope))),
+    }
 
 
 def datasheet_text(rows: Sequence[dict[str, Any]]) -> str:

@@ -30,6 +30,22 @@ CIRCUIT_VALUES = 11
 DELAY, PILOT_LAG, SPOOL_LAG, BAND, GAIN, INTO, OUT_OF, REGENERATION = 0, 1, 2, 3, 5, 7, 9, 11
 VALVE_PLACES = 13
 
+# linkage: gravity (m/s^2), lengths of the bodies that carry another one (m), then for each body from the first one on:
+# its actuator, and at each knot the stroke (m), the joint angle there (rad) and its first and second derivative by the
+# stroke; empty: inertia and gravity are polynomials
+BODIES, LINKAGE_KNOTS = 3, 33
+GRAVITY, LENGTH, JOINTS = 0, 1, BODIES
+ACTUATOR, KNOT = 0, 1
+KNOT_VALUES = 4
+JOINT_VALUES = KNOT + KNOT_VALUES * LINKAGE_KNOTS
+LINKAGE_VALUES = JOINTS + BODIES * JOINT_VALUES
+
+# numbers of one body, from the first one of the load
+MASS, CENTRE_X, CENTRE_Y, INERTIA = range(4)
+BODY_VALUES = 4
+BASE = 3 * BODIES
+"""Numbers in which inertia and gravity are linear: two moments and an inertia of each body."""
+
 # valves[j, ...]: pilot (two lags), play, spool (two lags), as shares of full, extension positive
 PILOT_1, PILOT_2, PLAYED, SPOOL_1, SPOOL = range(5)
 VALVE_STATES = 5

@@ -49,6 +49,8 @@ def add_layer(build: Builder, twin: GreyTwin, fed: str) -> str:
         scale=wiring.z_of[1],
         offset=scales.answer_offset / twin.units,
         answer_width=scales.answer_width / twin.units,
+        # C has no empty arrays.
+        linkage=table.linkage if table.front is not None else np.zeros(1),
         sides=_places(wiring.sides),
         valve_at=_places(table.valve_at),
         valve_actuator=_places(wiring.actuator),
@@ -104,7 +106,13 @@ def _tick(
         (0, 0, 1),
         (np.zeros(len(ports)), 1.0),
         (-unbounded, unbounded, np.ones(len(ports))),
-        (values["numbers"], values["knots"], values["middle"], values["scale"]),
+        (
+            values["numbers"],
+            values["knots"],
+            values["middle"],
+            values["scale"],
+            values["linkage"] if layer.linked else np.zeros(0),
+        ),
         tuple(_signed(table) for table in (layer.valve_at, layer.valve_actuator, layer.valve_pump)) + _places_of(layer),
         ports,
         (inertia, per_entry, potential, layer.circuit),

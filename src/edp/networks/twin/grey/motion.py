@@ -67,26 +67,26 @@ def freeze_load(
     places: tuple[int, int, int],
     v: Array,
     terms: tuple[Array, Array, Array],
-    low: Array,
-    by_s: Array,
+    root: tuple[Array, Array, Array, Array],
     force: tuple[Array, Array, Array, Array],
     full: bool,
 ) -> None:
-    """L and its gradient, and the forces of gravity and of turning, at the frozen strokes.
+    """Inertia and its gradient, and the forces of gravity and of turning, at the frozen strokes.
 
     Args:
         q: numbers.
         places: of the first coefficient of L, how many each entry has, and of the first of U.
         v: velocities ``(actuator,)``.
         terms: of `basis`.
-        low: written: L ``(actuator, actuator)``.
-        by_s: written: its gradient ``(actuator, actuator, stroke)``.
+        root: written: L ``(actuator, actuator)``, its gradient ``(actuator, actuator, stroke)``, then inertia M = L L'
+            and, if `full`, its gradient likewise.
         force: written: the forces, and their slopes by strokes, velocities and numbers.
         full: whether the slopes are wanted.
     """
     value, first, second = terms
     inertia_at, count, potential_at = places
     total, total_s, total_v, total_q = force
+    low, by_s = root[0], root[1]
     n = len(v)
     first_of_entry = inertia_at
     for a in range(n):
@@ -101,6 +101,7 @@ def freeze_load(
                 for k in range(n):
                     by_s[a, c, k] += q[first_of_entry + b] * first[b, k]
             first_of_entry += count
+    _squared(root, full)
     for i in range(n):
         total[i] = 0.0
         for b in range(1, len(value)):
@@ -114,6 +115,23 @@ def freeze_load(
                 for b in range(1, len(value)):
                     total_s[i, k] += q[potential_at + b - 1] * second[b, i, k]
     _turning(q, places, v, terms, low, by_s, force, full)
+
+
+@inner
+def _squared(root: tuple[Array, Array, Array, Array], full: bool) -> None:
+    """M = L L' and its gradient, from L and its own."""
+    low, by_s, mass, by_mass = root
+    n = len(low)
+    for i in range(n):
+        for k in range(n):
+            mass[i, k] = 0.0
+            for c in range(min(i, k) + 1):
+                mass[i, k] += low[i, c] * low[k, c]
+            for m in range(n if full else 0):
+                along = 0.0
+                for c in range(min(i, k) + 1):
+                    along += by_s[i, c, m] * low[k, c] + low[i, c] * by_s[k, c, m]
+                by_mass[i, k, m] = along
 
 
 @inner

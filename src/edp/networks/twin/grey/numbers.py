@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.elements import Actuator, Elements, MotorElement
+from edp.networks.twin.grey.known_linkage import KnownLinkage
 from edp.networks.twin.grey.plausible import (
     MEGA,
     GreyNumber,
@@ -42,7 +43,10 @@ LEFT_OUT = {
 
 @dataclass(frozen=True, eq=False)
 class NumberTable:
-    """All numbers in order, and where those of each element begin."""
+    """All numbers in order, and where those of each element begin.
+
+    With a known linkage `inertia_at` is the place of the first body's, and the load has no terms.
+    """
 
     numbers: tuple[GreyNumber, ...]
     valve_at: IntArray
@@ -53,6 +57,12 @@ class NumberTable:
     inertia_terms: int
     potential_at: int
     exponents: IntArray
+    front: KnownLinkage | None = None
+
+    @property
+    def linkage(self) -> Array:
+        """As `layout` orders it; empty where the load is polynomials of the strokes."""
+        return np.zeros(0) if self.front is None else self.front.values
 
     @property
     def places(self) -> tuple[int, int, int, int]:
@@ -112,6 +122,7 @@ def number_table(
     highest_pump: Sequence[float],
     degrees: tuple[int, int],
     left_out: Sequence[str] = (),
+    front: KnownLinkage | None = None,
 ) -> NumberTable:
     """Numbers of connected elements, with starting values from what the data show.
 
@@ -121,10 +132,12 @@ def number_table(
         highest_pump: highest pressure of each pump's line, MPa.
         degrees: of the polynomials of L and of U.
         left_out: keys of `LEFT_OUT`.
+        front: linkage whose bodies are the load; None: polynomials.
 
     Raises:
         ConfigError: the load would have more numbers than can be fitted.
     """
+    degrees = degrees if front is None else (0, 0)
     _check_load(elements, degrees)
     numbers: list[GreyNumber] = []
     actuator_at, areas = [], []
@@ -149,16 +162,16 @@ def number_table(
         )
     inertia_at = len(numbers)
     exponents = _load_exponents(elements, max(degrees))
-    inertia_terms = int((exponents.sum(axis=1) <= degrees[0]).sum())
+    inertia_terms = int((exponents.sum(axis=1) <= degrees[0]).sum()) if front is None else 0
     sizes = [area[0] for area in areas]
-    numbers += _inertia(elements.actuators, sizes, exponents[:inertia_terms])
+    numbers += _inertia(elements.actuators, sizes, exponents[:inertia_terms]) if front is None else front.numbers()
     potential_at = len(numbers)
     numbers += _potential(elements.actuators, sizes, travels, exponents)
     neutral = {name: value for part in left_out for name, value in LEFT_OUT[part].items()}
     every = tuple(_fixed(number, neutral[number.name]) if number.name in neutral else number for number in numbers)
     return NumberTable(
         every, valve_at, np.array(actuator_at), np.array(pump_at, dtype=np.int64), circuit_at, inertia_at,
-        inertia_terms, potential_at, exponents,
+        inertia_terms, potential_at, exponents, front,
     )  # fmt: skip
 
 

@@ -32,6 +32,8 @@ def _work(
     loads = (
         np.zeros(n), np.zeros((n, n)), np.zeros((n, n, n)), np.zeros((n, n)), np.zeros((n, n)),
         np.zeros((n, numbers)), np.zeros((3, n, degree + 1)), np.zeros((terms, n, n)),
+        np.zeros((n, n)), np.zeros((n, n, n)), np.zeros((at.BASE, n, n)),
+        np.zeros((at.BASE, at.BODIES * at.BODY_VALUES)),
     )  # fmt: skip
     monomials = (np.zeros(terms), np.zeros((terms, n)))
     vectors = (
@@ -189,7 +191,7 @@ def run_lanes(
             ticks from one row that counts to the next.
         errors_of: weight of each answer's error, and where the Huber loss turns to a line.
         limits: least and largest answers, and their units in SI units.
-        model: numbers, knots, middle and scale of the strokes.
+        model: numbers, knots, middle and scale of the strokes, and a known linkage, as `layout` orders it.
         form: places of valves and elements.
         ports: kind and number of the state behind each answer ``(answer, 2)``.
         places: of coefficients and circuit.

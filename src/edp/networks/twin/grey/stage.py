@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.jit import inlined, inner
+from edp.networks.twin.grey.linkage import inertia_by_numbers
 from edp.networks.twin.grey.motion import friction
 from edp.networks.twin.grey.network import port_flows, pump_flows, valve_flows
 
@@ -130,11 +131,10 @@ def motion_rows(
     bristle: Array,
     q: Array,
     form: tuple[IntArray, ...],
-    load: tuple[Array, Array, Array, Array],
+    load: tuple[Array, ...],
     places: tuple[int, int, int],
     out: tuple[Array, ...],
     full: bool,
-    value: Array,
 ) -> None:
     """Rows of all velocities.
 
@@ -144,23 +144,20 @@ def motion_rows(
         bristle: deflections of the base.
         q: numbers.
         form: of the model.
-        load: forces, L, and the gradient of L, from `motion.freeze_load`.
-        places: of its coefficients.
+        load: at the frozen strokes: forces, L, inertia and its gradient by the strokes; monomials; inertia of a known
+            linkage by the numbers of `linkage.base_of`, and these by masses and centres.
+        places: of its numbers.
         out: residual and derivatives.
         full: whether those beside by y are wanted.
-        value: monomials at the frozen strokes.
     """
     y, base, step = now
     residual, by_y, by_x, by_s, _, by_q = out
-    force, low, by_low, _ = load
+    force, mass = load[0], load[2]
     n = len(force)
     nodes = len(y) - n
-    w, change = np.zeros(n), np.zeros(n)
+    change = np.zeros(n)
     for i in range(n):
         change[i] = y[nodes + i] - base[nodes + i]
-    for a in range(n):
-        for c in range(a + 1):
-            w[c] += low[a, c] * change[a]
     for i in range(n):
         a, row = form[3][i], nodes + i
         for k in range(nodes):
@@ -173,14 +170,10 @@ def motion_rows(
         depth = min(reached - q[a + at.STOP_LOW], 0.0) + max(reached - q[a + at.STOP_HIGH], 0.0)
         stop = q[a + at.STOP_STIFFNESS]
         inertial = 0.0
-        for c in range(i + 1):
-            inertial += low[i, c] * w[c]
-        residual[row] = inertial - step * (push - rubbing - stop * depth)
         for k in range(n):
-            mass = 0.0
-            for c in range(min(i, k) + 1):
-                mass += low[i, c] * low[k, c]
-            by_y[row, nodes + k] = mass
+            inertial += mass[i, k] * change[k]
+            by_y[row, nodes + k] = mass[i, k]
+        residual[row] = inertial - step * (push - rubbing - stop * depth)
         touched = stop if depth != 0.0 else 0.0
         by_y[row, row] += step * (by_v + touched * stroke[2])
         if full:
@@ -197,37 +190,38 @@ def motion_rows(
                 by_q[row, a + at.COULOMB + k] += step * numbers[k]
             by_q[row, a + at.BRISTLE_DAMPING] += step * numbers[5]
             by_q[row, a + at.ASYMMETRY] += step * numbers[6]
-            _inertia_slopes(i, w, change, low, by_low, places, value, by_s, by_q, nodes)
+            _inertia_slopes(i, change, load, places, by_s, by_q, nodes)
 
 
 @inner
 def _inertia_slopes(
     i: int,
-    w: Array,
     change: Array,
-    low: Array,
-    by_low: Array,
+    load: tuple[Array, ...],
     places: tuple[int, int, int],
-    value: Array,
     by_s: Array,
     by_q: Array,
     nodes: int,
 ) -> None:
-    """Derivatives of row `i` of M (v - b) by strokes and coefficients."""
-    n = len(w)
+    """Derivatives of row `i` of M (v - b) by strokes and numbers."""
+    _, low, _, by_mass, value, parts, by_number = load
+    n = len(change)
     for k in range(n):
         along = 0.0
-        for c in range(n):
-            turned = 0.0
-            for a in range(n):
-                turned += by_low[a, c, k] * change[a]
-            along += by_low[i, c, k] * w[c] + low[i, c] * turned
+        for a in range(n):
+            along += by_mass[i, a, k] * change[a]
         by_s[nodes + i, k] = along
+    if places[1] == 0:
+        inertia_by_numbers(i, change, parts, by_number, places[0], nodes + i, by_q)
+        return
     index = places[0]
     for a in range(n):
         for c in range(a + 1):
+            turned = 0.0
+            for m in range(n):
+                turned += low[m, c] * change[m]
+            slope = low[i, c] * change[a] + (turned if i == a else 0.0)
             for b in range(places[1]):
-                slope = low[i, c] * change[a] + (w[c] if i == a else 0.0)
                 by_q[nodes + i, index + b] += value[b] * slope
             index += places[1]
 
@@ -276,13 +270,12 @@ def assemble(
     bristle: Array,
     q: Array,
     form: tuple[IntArray, ...],
-    load: tuple[Array, Array, Array, Array],
+    load: tuple[Array, ...],
     places: tuple[int, int, int, int],
     knots: Array,
     sums: tuple[Array, ...],
     out: tuple[Array, ...],
     full: bool,
-    value: Array,
 ) -> None:
     """Residual and derivatives of all rows, from the spools `x` ``(valve,)``, displacements and frozen strokes."""
     y = now[0]
@@ -299,7 +292,7 @@ def assemble(
     port_flows(q, p, form, circuit, sums, full)
     pump_flows(x, displacement, q, p, form, circuit, sums, full)
     pressure_rows(now, strokes, q, form, circuit, sums, out, full)
-    motion_rows(now, stroke, bristle, q, form, load, (places[0], places[1], places[2]), out, full, value)
+    motion_rows(now, stroke, bristle, q, form, load, (places[0], places[1], places[2]), out, full)
 
 
 @inner
@@ -312,12 +305,11 @@ def newton(
     bristle: Array,
     q: Array,
     form: tuple[IntArray, ...],
-    load: tuple[Array, Array, Array, Array],
+    load: tuple[Array, ...],
     places: tuple[int, int, int, int],
     knots: Array,
     sums: tuple[Array, ...],
     out: tuple[Array, ...],
-    value: Array,
 ) -> int:
     """Solve the stage in index of y, from a guess; returns the iterations."""
     y = now[0]
@@ -326,7 +318,7 @@ def newton(
     columns = np.empty((len(y), 1))
     share, before, at_before = 1.0, 0.0, -1
     for iteration in range(ITERATIONS):
-        assemble(now, x, displacement, strokes, stroke, bristle, q, form, load, places, knots, sums, out, False, value)
+        assemble(now, x, displacement, strokes, stroke, bristle, q, form, load, places, knots, sums, out, False)
         factorise(by_y)
         columns[:, 0] = residual
         solve(by_y, columns)

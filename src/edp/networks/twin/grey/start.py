@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.numbers import NumberTable
+from edp.networks.twin.grey.start_linkage import balance_columns, balanced_bodies
 
 Array = NDArray[np.float64]
 REACH = 2
@@ -47,20 +48,46 @@ def load_start(
         declared: whether the areas of each actuator are known, or one follows of the other.
     """
     values = table.nominal
-    by_stroke = np.asarray(table.exponents.any(axis=0))
+    by_stroke = np.asarray(table.exponents.any(axis=0)) | (len(table.linkage) > 0)
     needed = np.ones((len(columns), 4), np.bool_)
     needed[:, 1] = by_stroke
     if (needed & (np.array(columns) < 0)).any():
         return values
     rows = _rows(train, columns, by_stroke, rate_hz)
-    speed, pull, stroke, head, rod = (np.moveaxis(rows[:, :, k], 0, 0) for k in range(5))
-    n, exponents = len(columns), table.exponents
-    z = (stroke - z_of[0]) * z_of[1]
-    inertia = [(a, c) for a in range(n) for c in range(a + 1)]
-    width = len(inertia) + len(exponents) - 1 + 3 * n
-    matrix, goal = np.zeros((n, len(z), width)), np.zeros((n, len(z)))
+    speed, head, rod = (rows[:, :, k] for k in (0, 3, 4))
+    own = _load_columns(table, rows, z_of)
+    n, load = len(columns), own.shape[2]
+    matrix, goal = np.zeros((n, len(rows), load + 3 * n)), np.zeros((n, len(rows)))
+    matrix[:, :, :load] = own
     for i in range(n):
         a = table.actuator_at[i]
+        own_at = load + 3 * i
+        matrix[i, :, own_at] = np.tanh(speed[:, i] / values[a + at.STRIBECK])
+        matrix[i, :, own_at + 1] = speed[:, i]
+        goal[i] = values[a + at.HEAD_AREA] * head[:, i]
+        if declared[i]:
+            goal[i] -= values[a + at.ROD_AREA] * rod[:, i]
+        else:
+            matrix[i, :, own_at + 2] = rod[:, i]
+        size = max(float(goal[i].std()), 1e-9)
+        matrix[i] /= size
+        goal[i] /= size
+    flat = matrix.reshape(-1, matrix.shape[2]), goal.reshape(-1)
+    if table.front is not None:
+        values, others = balanced_bodies(table, *flat)
+        return _with_friction(table, others, declared, values)
+    solution = _ridge(*flat)
+    return _taken(table, solution, declared, values)
+
+
+def _load_columns(table: NumberTable, rows: Array, z_of: tuple[Array, Array]) -> Array:
+    """Forces on the actuators by what is linear in the load ``(actuator, row, column)``."""
+    if table.front is not None:
+        return balance_columns(table, rows)
+    n, exponents, pull = rows.shape[1], table.exponents, rows[:, :, 1]
+    z, inertia = (rows[:, :, 2] - z_of[0]) * z_of[1], _entries(n)
+    matrix = np.zeros((n, len(rows), len(inertia) + len(exponents) - 1))
+    for i in range(n):
         for k, (p, r) in enumerate(inertia):
             if i in (p, r):
                 matrix[i, :, k] = pull[:, r if i == p else p]
@@ -69,26 +96,18 @@ def load_start(
             if e[i]:
                 lower = e - (np.arange(n) == i)
                 matrix[i, :, len(inertia) + b - 1] = e[i] * z_of[1][i] * np.prod(z**lower, axis=1)
-        own = len(inertia) + len(exponents) - 1 + 3 * i
-        matrix[i, :, own] = np.tanh(speed[:, i] / values[a + at.STRIBECK])
-        matrix[i, :, own + 1] = speed[:, i]
-        goal[i] = values[a + at.HEAD_AREA] * head[:, i]
-        if declared[i]:
-            goal[i] -= values[a + at.ROD_AREA] * rod[:, i]
-        else:
-            matrix[i, :, own + 2] = rod[:, i]
-        size = max(float(goal[i].std()), 1e-9)
-        matrix[i] /= size
-        goal[i] /= size
-    solution = _ridge(matrix.reshape(-1, width), goal.reshape(-1))
-    return _taken(table, solution, inertia, declared, values)
+    return matrix
 
 
-def _taken(
-    table: NumberTable, solution: Array, inertia: list[tuple[int, int]], declared: Sequence[bool], values: Array
-) -> Array:
+def _entries(n: int) -> list[tuple[int, int]]:
+    """Of a symmetric matrix, row by row."""
+    return [(a, c) for a in range(n) for c in range(a + 1)]
+
+
+def _taken(table: NumberTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
     """The solution in its places, as far as it can be believed."""
     n = len(table.actuator_at)
+    inertia = _entries(n)
     mass = np.zeros((n, n))
     for k, (p, r) in enumerate(inertia):
         mass[p, r] = mass[r, p] = solution[k]
@@ -101,8 +120,13 @@ def _taken(
         values[table.inertia_at + k * table.inertia_terms] = low[p, r]
     potential = len(table.exponents) - 1
     values[table.potential_at : table.potential_at + potential] = solution[len(inertia) : len(inertia) + potential]
-    for i in range(n):
-        a, own = table.actuator_at[i], len(inertia) + potential + 3 * i
+    return _with_friction(table, solution[len(inertia) + potential :], declared, values)
+
+
+def _with_friction(table: NumberTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
+    """Friction and rod areas in their places, as far as they can be believed."""
+    for i in range(len(table.actuator_at)):
+        a, own = table.actuator_at[i], 3 * i
         for index, value in ((at.COULOMB, solution[own]), (at.VISCOUS, solution[own + 1])):
             values[a + index] = np.clip(value, 0.2 * values[a + index], 5.0 * values[a + index])
         if not declared[i]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.jit import inner
+from edp.networks.twin.grey.linkage import freeze_linkage
 from edp.networks.twin.grey.motion import basis, bristle_slopes, freeze_load, friction
 from edp.networks.twin.grey.stage import assemble, content, factorise, newton, solve
 from edp.networks.twin.grey.valve import advance_valves, displace, own_places
@@ -48,7 +49,7 @@ def _tangents_of_stage(
         stroke: of `stage.motion_rows`.
         q: numbers.
         form: of the model.
-        load: forces, L, its gradient, and slopes of the forces by strokes, velocities and numbers.
+        load: inertia, and slopes of its forces by strokes, velocities and numbers.
         out: derivatives of the stage.
         circuit: place of the circuit's numbers.
         frozen: tangents of the frozen strokes.
@@ -65,7 +66,7 @@ def _tangents_of_stage(
         for k in range(columns):
             solved[row, k] = -by_q[row, k] if numbered else 0.0
         for i in range(n):
-            slope = by_s[row, i] + (step * load[3][row - nodes, i] if row >= nodes else 0.0)
+            slope = by_s[row, i] + (step * load[1][row - nodes, i] if row >= nodes else 0.0)
             if slope != 0.0:
                 for k in range(columns):
                     solved[row, k] -= slope * frozen[i, k]
@@ -90,13 +91,10 @@ def _tangents_of_stage(
         inside = q[a + at.STOP_LOW] <= reached <= q[a + at.STOP_HIGH]
         touched = 0.0 if inside else step * q[a + at.STOP_STIFFNESS]
         for k in range(columns):
-            solved[row, k] -= (step * load[5][i, k] if numbered else 0.0) + by_before * bristle[1][i, k]
+            solved[row, k] -= (step * load[3][i, k] if numbered else 0.0) + by_before * bristle[1][i, k]
             solved[row, k] -= touched * (t_s[i, k] + stroke[2] * t_y[row, k])
         for m in range(n):
-            mass = 0.0
-            for c in range(min(i, m) + 1):
-                mass += load[1][i, c] * load[1][m, c]
-            slope = step * load[4][i, m]
+            mass, slope = load[0][i, m], step * load[2][i, m]
             for k in range(columns):
                 solved[row, k] += mass * base[nodes + m, k] - slope * t_y[nodes + m, k]
     factorise(by_y)
@@ -169,7 +167,7 @@ def tick(
         lane: y, strokes, bristles, displacements and valves; moved.
         tangents: of these ``(..., column)``; of valves by their own numbers; moved, if `columns_by`.
         history: demands ``(tick, valve)``, newest first.
-        model: numbers, knots, middle of the strokes and scale from stroke to z.
+        model: numbers, knots, middle of the strokes, scale from stroke to z, and a known linkage.
         form: places of valves and elements.
         places: of the load's coefficients and of the circuit.
         exponents: of the load's monomials.
@@ -182,7 +180,7 @@ def tick(
     """
     y, s, z, d, valves = lane
     t_y, t_s, t_z, t_d, t_valves = tangents
-    q, knots, _, scale = model
+    q, knots, _, scale, _ = model
     sums, out, loads, terms, vectors, matrices = work
     frozen_s, zs, before_v, base, base_z, start, _, reached = vectors
     t_frozen, t_base, t_base_z, t_first, t_start_z, t_reached = matrices
@@ -194,8 +192,8 @@ def tick(
     for _ in range(time[1]):
         before_v[:] = y[nodes:]
         _freeze(s, (t_y, t_s), model, places, exponents, step, work, columns_by)
-        load = (loads[0], loads[1], loads[2], loads[3], loads[4], loads[5])
-        small = (loads[0], loads[1], loads[2], loads[3])
+        load = (loads[8], loads[3], loads[4], loads[5])
+        small = (loads[0], loads[1], loads[8], loads[9], terms[0], loads[10], loads[11])
         start[:], zs[:], base_z[:] = y, z, z
         _contents(y, t_y, nodes, q, circuit, base, t_base, columns_by)
         if columns_by:
@@ -211,9 +209,9 @@ def tick(
             stroke = (s, before_v, 0.5 * (h if which == 0 else step))
             now = (y, base, h)
             x = valves[:, at.SPOOL].copy()
-            spent += newton(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out, terms[0])
+            spent += newton(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out)
             if columns_by:
-                assemble(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out, True, terms[0])
+                assemble(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out, True)
                 state, bases = (t_first, t_s, t_z, t_d, t_valves), (base_z, t_base_z)
                 _tangents_of_stage(
                     t_y, t_base, bases, state, now, stroke, q, form, load, out, circuit, t_frozen, columns_by
@@ -266,7 +264,7 @@ def _freeze(
     columns_by: int,
 ) -> None:
     """Strokes in the middle of the step, and the load there; `tangents`: those of y and of the strokes."""
-    q, _, middle, scale = model
+    q, _, middle, scale, linkage = model
     _, _, loads, terms, vectors, matrices = work
     t_y, t_s = tangents
     frozen_s, before_v, z = vectors[0], vectors[2], vectors[6]
@@ -278,7 +276,13 @@ def _freeze(
         if columns_by:
             for k in range(t_s.shape[1]):
                 matrices[0][i, k] = t_s[i, k] + half * t_y[nodes + i, k]
+    full = columns_by != at.NONE
+    force = (loads[0], loads[3], loads[4], loads[5])
+    if len(linkage) > 0:
+        bodies = (*force, loads[8], loads[9], loads[10], loads[11])
+        freeze_linkage(q, places[0], frozen_s, before_v, linkage, bodies, full)
+        return
     every = (terms[0], terms[1], loads[7])
     basis(z, exponents, scale, loads[6], every)
-    force = (loads[0], loads[3], loads[4], loads[5])
-    freeze_load(q, (places[0], places[1], places[2]), before_v, every, loads[1], loads[2], force, columns_by != at.NONE)
+    root = (loads[1], loads[2], loads[8], loads[9])
+    freeze_load(q, (places[0], places[1], places[2]), before_v, every, root, force, full)

@@ -1,0 +1,370 @@
+"""Known linkages of grey boxes: the simulator's own bodies, exact tangents, a start from forces, what is refused."""
+
+import re
+from dataclasses import replace
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from edp.config.twin import load_twin_experiment, twin_toml
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError
+from edp.networks.twin import fit_scales
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
+from edp.networks.twin.grey.elements import CylinderElement, MotorElement, PumpElement, ValveElement
+from edp.networks.twin.grey.known_linkage import BODY_NAMES
+from edp.networks.twin.grey.linkage import balance_by_base, base_of, load_at
+from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
+from edp.signals import Channel, Kind
+from edp.sim.machine import layout as sim
+from edp.sim.machine.machine_files import load_machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import dynamics, linkage
+from edp.training.grey_fit import fit_grey_box
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
+
+PREFIX = 30
+ORDER = ("arm", "boom", "bucket")
+"""Not that of the bodies: a log may have its cylinders in any order."""
+
+
+def front_channels():
+    """Levers, speeds, strokes and both chambers of a front, and its pump."""
+    return TwinChannels(
+        tuple(Channel(f"{name}_lever", Kind.RATIO) for name in ORDER),
+        tuple(Channel(f"{name}_speed", Kind.VELOCITY) for name in ORDER),
+        tuple(Channel(f"{name}_place", Kind.POSITION) for name in ORDER),
+        (*(Channel(f"{name}_{side}", Kind.PRESSURE) for name in ORDER for side in ("head", "rod")),
+         Channel("line", Kind.PRESSURE)),
+        100.0,
+    )  # fmt: skip
+
+
+def front(**changes):
+    """A grey box of a front with M22's linkage."""
+    cylinders = tuple(
+        CylinderElement(
+            name=name, velocity=f"{name}_speed", head=f"{name}_head", rod=f"{name}_rod", bore=0.13, rod_diameter=0.09
+        )
+        for name in ORDER
+    )
+    valves = tuple(
+        ValveElement(name=f"{name} spool", actuator=name, extend=f"{name}_lever", supply="pump") for name in ORDER
+    )
+    options = {
+        "cylinders": cylinders,
+        "valves": valves,
+        "pumps": (PumpElement(name="pump", pressure="line"),),
+        "linkage": "m22",
+        "prefix_ticks": PREFIX,
+        "fit": GreyFitSpec(lengths_s=(0.1,), rounds=(1,), starts=1, lanes=8, ticks=200, validation_s=1.0),
+    }
+    return GreyBox(**(options | changes))
+
+
+def series_of(seed=0, ticks=600, strokes=1.0):
+    """Levers of a front, and plausible values that set the scales."""
+    rng = np.random.default_rng(seed)
+    levers = np.repeat(rng.uniform(-1, 1, (ticks // 40 + 1, 3)), 40, axis=0)[:ticks]
+    full = strokes * np.array([1.504, 1.26, 1.104])
+    low = np.concatenate([[-0.3] * 3, 0.02 * full, [0.0] * 7])
+    high = np.concatenate([[0.3] * 3, 0.98 * full, [2e7] * 7])
+    return Series("levers", levers.astype(np.float32), rng.uniform(low, high, (ticks, 13)).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def twin():
+    """Its load is that of M22; everything else plausible."""
+    channels, series = front_channels(), [series_of()]
+    made = front().start(channels, fit_scales(channels, series), series, 0)
+    numbers = made.table.nominal
+    return made.with_numbers(numbers)
+
+
+def strokes_and_angles(count, seed=0):
+    """Poses of M22 as this twin orders its cylinders, and its joint angles, lever arms."""
+    axes, plant = pack(load_machine("m22"))
+    rng = np.random.default_rng(seed)
+    own = rng.uniform(0.01, 0.99, (count, 3)) * axes[:, sim.STROKE]
+    angles = np.array([[linkage.angle_at_stroke(i, s, axes, plant) for i, s in enumerate(row)] for row in own])
+    levers = np.array([[linkage.cylinder(i, psi, plant)[1] for i, psi in enumerate(row)] for row in angles])
+    return own, angles, levers, axes, plant
+
+
+PLACES = [ORDER.index(name) for name in BODY_NAMES]
+
+
+def loads_of(twin, numbers, strokes, speeds):
+    """Forces, slopes by strokes, velocities, numbers, inertia and its gradient at one pose."""
+    n = 3
+    loads = (
+        np.zeros(n), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, len(numbers))), np.zeros((n, n)),
+        np.zeros((n, n, n)), np.zeros((at.BASE, n, n)), np.zeros((at.BASE, at.BODIES * at.BODY_VALUES)),
+    )  # fmt: skip
+    load_at(numbers, twin.table.inertia_at, strokes, speeds, twin.table.linkage, loads)
+    return loads
+
+
+def test_inertia_and_forces_are_those_of_the_simulators_bodies(twin):
+    own, angles, levers, axes, plant = strokes_and_angles(60)
+    rng = np.random.default_rng(1)
+    worst = 0.0
+    for row, psi, lever in zip(own, angles, levers, strict=True):
+        speeds = rng.uniform(-0.4, 0.4, 3)
+        rate = speeds / lever
+        joint = np.empty((3, 3))
+        dynamics.mass_matrix(psi, axes, joint)
+        wanted = joint / np.outer(lever, lever) / 1e6
+        # Accelerations of the joints at constant cylinder velocities: - J' rate^2 / J, differenced.
+        bend = [(linkage.cylinder(i, psi[i] + 1e-5, plant)[1] - linkage.cylinder(i, psi[i] - 1e-5, plant)[1]) / 2e-5
+                for i in range(3)]  # fmt: skip
+        torque = dynamics.bias_torque(psi, rate, axes, plant) - joint @ (np.array(bend) * rate**2 / lever)
+        strokes, velocities = np.empty(3), np.empty(3)
+        strokes[PLACES], velocities[PLACES] = row, speeds
+        force, _, _, _, mass, _, _, _ = loads_of(twin, twin.numbers, strokes, velocities)
+        force_wanted = torque / lever / 1e6
+        worst = max(worst, np.abs(mass[np.ix_(PLACES, PLACES)] / wanted - 1.0).max())
+        worst = max(worst, np.abs(force[PLACES] - force_wanted).max() / np.abs(force_wanted).max())
+    # What the polynomials between the knots, and numbers of single precision, leave.
+    assert worst < 1e-3
+
+
+def test_slopes_of_the_load_are_those_of_differences(twin):
+    rng = np.random.default_rng(2)
+    strokes, speeds = np.array([0.71, 0.4, 0.33]), rng.uniform(-0.5, 0.5, 3)
+    numbers, first, last = twin.numbers, twin.table.inertia_at, twin.table.potential_at
+    _, by_s, by_v, by_q, mass, mass_s, parts, by_number = loads_of(twin, numbers, strokes, speeds)
+
+    def differenced(change):
+        above, below = (loads_of(twin, *change(side)) for side in (1e-6, -1e-6))
+        return (above[0] - below[0]) / 2e-6, (above[4] - below[4]) / 2e-6
+
+    for k in range(3):
+        unit = np.eye(3)[k]
+        slope, of_mass = differenced(lambda step, unit=unit: (numbers, strokes + step * unit, speeds))
+        np.testing.assert_allclose(by_s[:, k], slope, rtol=1e-5, atol=1e-6 * np.abs(by_s).max())
+        np.testing.assert_allclose(mass_s[:, :, k], of_mass, rtol=1e-5, atol=1e-6 * np.abs(mass_s).max())
+        slope, _ = differenced(lambda step, unit=unit: (numbers, strokes, speeds + step * unit))
+        np.testing.assert_allclose(by_v[:, k], slope, rtol=1e-5, atol=1e-6 * np.abs(by_v).max())
+    for m in range(first, last):
+        size = np.eye(len(numbers))[m] * max(abs(numbers[m]), 1e-3)
+        slope, of_mass = differenced(lambda step, size=size: (numbers + step * size, strokes, speeds))
+        np.testing.assert_allclose(by_q[:, m] * size[m], slope, rtol=1e-5, atol=1e-7)
+        own = np.einsum("b,bij->ij", by_number[:, m - first], parts)
+        np.testing.assert_allclose(own * size[m], of_mass, rtol=1e-5, atol=1e-7)
+    base = base_numbers(twin, numbers)
+    np.testing.assert_allclose(np.einsum("b,bij->ij", base, parts), mass, rtol=1e-12)
+
+
+def errors(twin, numbers, series, starts, full, ticks=8):
+    """Matrix, gradient and losses of free runs of `ticks`."""
+    rows = [slice(first, first + PREFIX + ticks + 1) for first in starts]
+    values = np.stack([series.targets[row] for row in rows]) / twin.units
+    demands = twin.demands(np.stack([series.inputs[row] for row in rows])[:, :-1])
+    measured = values[:, :-1].copy()
+    measured[:, PREFIX + 1 :] = np.nan
+    rest = twin.rest(demands[:, 0], (measured[:, 0] * twin.units).astype(np.float32))
+    state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
+    count = len(numbers) if full else 0
+    normal = (np.zeros((count, count)), np.zeros(count), np.zeros(len(starts)))
+    weight = twin.units / twin.scales.answer_width.astype(np.float64)
+    target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, (PREFIX, 0, 1), normal)
+    twin.lanes(numbers, demands, measured, state, judge=target)
+    return normal
+
+
+START = np.array([[0.0] * 3 + [0.7, 0.5, 0.4] + [6e6, 4e6] * 3 + [5e6]], np.float32)
+
+
+@pytest.fixture(scope="module")
+def runs(twin):
+    """What the machine does on levers of its own."""
+    made = []
+    for seed in range(3):
+        levers = series_of(seed, 500).inputs
+        state = twin.initial_state(levers[None, 0], START)
+        answers, _ = twin.rollout(levers[None, :-1], state)
+        made.append(Series(f"run {seed}", levers, np.concatenate([START, answers[0]])))
+    return made
+
+
+def test_tangents_are_those_of_differences_with_a_linkage(twin, runs):
+    table, rng = twin.table, np.random.default_rng(1)
+    moved = np.exp(rng.normal(0, 0.1, len(twin.numbers)))
+    numbers = np.where(table.positive, twin.numbers * moved, twin.numbers)
+    # Away from a whole number of ticks, where the interpolated dead time has a corner.
+    numbers[table.valve_at[:, at.DELAY]] = 0.0363
+    starts = (60, 230, 400)
+    _, gradient, _ = errors(twin, numbers, runs[1], starts, True)
+    size = np.where(table.positive, np.abs(numbers), table.width)
+    apart = []
+    for which in range(len(numbers)):
+        step = np.zeros(len(numbers))
+        step[which] = 1e-5 * size[which]
+        sides = [errors(twin, numbers + sign * step, runs[1], starts, False)[2].sum() for sign in (1, -1)]
+        apart.append(gradient[which] * size[which] - (sides[0] - sides[1]) / 2e-5)
+    assert np.abs(apart).max() < 2e-4 * np.abs(gradient * size).max()
+    bodies = slice(table.inertia_at, table.potential_at)
+    assert np.abs(apart[bodies]).max() < 1e-3 * np.abs(gradient * size)[bodies].max()
+    assert np.count_nonzero(gradient[bodies]) == at.BODIES * at.BODY_VALUES
+
+
+def test_no_load_makes_energy(twin):
+    """Power of the forces of inertia, gravity and turning is the change of kinetic and potential energy."""
+    rng, step = np.random.default_rng(3), 1e-5
+    strokes, speeds, pulls = np.array([0.9, 0.3, 0.6]), rng.uniform(-0.5, 0.5, 3), rng.uniform(-1, 1, 3)
+
+    def kinetic(at_s, v):
+        return 0.5 * v @ loads_of(twin, twin.numbers, at_s, v)[4] @ v
+
+    force, _, _, _, mass, _, _, _ = loads_of(twin, twin.numbers, strokes, speeds)
+    gravity = loads_of(twin, twin.numbers, strokes, 0 * speeds)[0]
+    power = speeds @ (mass @ pulls + force - gravity)
+    sides = [kinetic(strokes + side * step * speeds, speeds + side * step * pulls) for side in (1, -1)]
+    assert power == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-6)
+    # Gravity has a potential: its forces' slopes by the strokes are symmetric.
+    slopes = loads_of(twin, twin.numbers, strokes, 0 * speeds)[1]
+    np.testing.assert_allclose(slopes, slopes.T, atol=1e-9 * np.abs(slopes).max())
+
+
+@pytest.fixture
+def guess(tmp_path):
+    """A machine file with M22's linkage and bodies that are not its own."""
+    text = (resources.files("edp.sim") / "machines" / "m22.toml").read_text()
+    for key, values in (("mass", "2400.0, 700.0, 1200.0"), ("com_x", "2.3, 1.2, 0.55"), ("inertia", "4e3, 1.6e3, 4e2")):
+        text = re.sub(rf"^{key} = \[.*?\]", f"{key} = [{values}]", text, flags=re.M)
+    path = tmp_path / "guess.toml"
+    path.write_text(text)
+    return path
+
+
+def base_numbers(twin, numbers):
+    """The moments and inertias that inertia and gravity are linear in."""
+    table = twin.table
+    base = np.empty(at.BASE)
+    base_of(numbers, table.inertia_at, table.linkage, base, np.empty((at.BASE, table.potential_at - table.inertia_at)))
+    return base
+
+
+def test_a_fit_starts_from_bodies_that_balance_the_measured_forces(twin, runs, guess):
+    begun = front(linkage=str(guess)).start(twin.channels, twin.scales, runs, 0)
+    truth, before, after = (
+        base_numbers(twin, numbers) for numbers in (twin.numbers, begun.table.nominal, begun.numbers)
+    )
+    moments = [0, 2, 4]
+    wrong = np.abs(before / truth - 1.0)[moments]
+    assert wrong.max() > 0.1
+    assert np.abs(after / truth - 1.0)[moments].max() < 0.5 * wrong.max()
+    bodies = slice(begun.table.inertia_at, begun.table.potential_at)
+    assert (begun.numbers[bodies][[at.MASS, at.INERTIA]] > 0.0).all()
+
+
+def test_a_fit_moves_the_bodies_and_the_datasheet_has_them(twin, runs, guess, tmp_path):
+    spec = front(linkage=str(guess))
+    begun = spec.start(twin.channels, twin.scales, runs[:2], 0)
+    result = fit_grey_box(begun, runs[:2], runs[2:], 0)
+    table = begun.table
+    bodies = slice(table.inertia_at, table.potential_at)
+    assert not np.array_equal(result.twin.numbers[bodies], begun.numbers[bodies])
+    rows = {f"{row['element']}.{row['name']}": row for row in datasheet(table, result.twin.numbers, result.information)}
+    text = datasheet_text(list(rows.values()))
+    for name in BODY_NAMES:
+        units = {"mass": "kg", "centre_along": "m", "centre_across": "m", "inertia_about_centre": "kg m^2"}
+        for key, unit in units.items():
+            row = rows[f"{name}_body.{key}"]
+            assert row["unit"] == unit
+            assert row["low"] <= row["value"] <= row["high"]
+            assert f"{name}_body.{key}" in text
+    assert 100.0 < rows["boom_body.mass"]["value"] < 2e4
+    # Of the boom with all that it carries, at the middle of the strokes: much more than its own mass.
+    assert rows["load.inertia_boom"]["value"] > 5e3
+    assert not any("polynomial" in key or "root" in key for key in rows)
+    # A twin is whole without the file that it was made with.
+    commands = runs[0].inputs[None, :-1]
+    answers = result.twin.rollout(commands, result.twin.initial_state(commands[:, 0], START))[0]
+    save_twin(TwinBundle(spec, result.twin), tmp_path / "twin")
+    guess.unlink()
+    again = load_twin(tmp_path / "twin").twin
+    np.testing.assert_array_equal(again.rollout(commands, again.initial_state(commands[:, 0], START))[0], answers)
+
+
+def test_inertia_of_the_datasheet_is_that_of_the_load(twin):
+    table, zero = twin.table, np.zeros(3)
+    rows = datasheet(table, twin.numbers, np.zeros((len(twin.numbers),) * 2))
+    mass = loads_of(twin, twin.numbers, 0.5 * np.array([1.504, 1.26, 1.104]), zero)[4]
+    told = [row["value"] for row in rows if row["name"].startswith("inertia_") and row["element"] == "load"]
+    np.testing.assert_allclose(told, 1e6 * np.diag(mass), rtol=1e-6)
+
+
+def test_a_joint_goes_on_in_a_straight_line_far_beyond_its_stroke(twin):
+    speeds = np.array([0.1, 0.2, 0.3])
+    for stroke in (-5.0, -0.1, 3.0, 50.0):
+        loads = loads_of(twin, twin.numbers, np.full(3, stroke), speeds)
+        assert all(np.isfinite(values).all() for values in loads)
+        assert (np.linalg.eigvalsh(loads[4]) > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"linkage": "m23"}, "unknown machine 'M23'"),
+        ({"linkage": "none.toml"}, "machine file none.toml cannot be read"),
+        ({"inertia_degree": 3}, r"inertia_degree = 3 .* are of polynomials, which twin.linkage = 'm22' replaces"),
+        (
+            {"linkage": "c14"},
+            r"'\w+_place' lies from 0\.0\d+ to 1\.\d* m in the recordings; the linkage of machine C14",
+        ),
+    ],
+)
+def test_a_linkage_that_cannot_be_is_refused(changes, message):
+    series = [series_of()]
+    with pytest.raises(ConfigError, match=message):
+        front(**changes).start(front_channels(), fit_scales(front_channels(), series), series, 0)
+
+
+def test_other_cylinders_and_strokes_that_nobody_measures_are_refused():
+    channels = front_channels()
+    spec = front()
+    named = tuple(replace(one, name=one.name.replace("boom", "lift")) for one in spec.cylinders)
+    valves = tuple(replace(one, actuator=one.actuator.replace("boom", "lift")) for one in spec.valves)
+    with pytest.raises(ConfigError, match=r"cylinders called boom, arm, bucket; this twin has the cylinders arm, lift"):
+        front(cylinders=named, valves=valves).shapes(channels)
+    with pytest.raises(ConfigError, match=r"needs the strokes of all three cylinders, and this twin has none"):
+        spec.shapes(replace(channels, strokes=()))
+    swing = MotorElement(name="swing", velocity="turning")
+    more = replace(channels, velocities=(*channels.velocities, Channel("turning", Kind.ANGULAR_VELOCITY)),
+                   strokes=(*channels.strokes, Channel("heading", Kind.ANGLE)))  # fmt: skip
+    turn = ValveElement(name="turn", actuator="swing", extend="boom_lever")
+    with pytest.raises(ConfigError, match=r"and the motors swing: name them so"):
+        front(motors=(swing,), valves=(*spec.valves, turn)).shapes(more)
+
+
+@pytest.mark.parametrize("damage", ["joint", "actuator", "mass"])
+def test_a_damaged_linkage_of_a_bundle_is_refused(twin, damage):
+    arrays = {name: values.copy() for name, values in twin.arrays().items()}
+    if damage == "joint":
+        arrays["linkage"][at.JOINTS + at.KNOT + 2] *= -1.0
+    elif damage == "actuator":
+        arrays["linkage"][at.JOINTS + at.ACTUATOR] = 7.0
+    else:
+        arrays["bodies"][at.MASS] = 0.0
+    with pytest.raises(ValueError, match="linkage"):
+        twin.spec.build(twin.channels, twin.scales, arrays)
+
+
+def test_the_setting_comes_back(tmp_path):
+    experiment = load_twin_experiment(None, ["twin.kind=greybox", "twin.linkage=m22"])
+    (tmp_path / "again.toml").write_text(twin_toml(experiment))
+    assert load_twin_experiment(tmp_path / "again.toml").twin.linkage == "m22"
+
+
+def test_balance_by_base_is_inertia_times_acceleration_and_the_forces(twin):
+    rng = np.random.default_rng(5)
+    strokes, speeds, pulls = np.array([[0.9, 0.3, 0.6]]), rng.uniform(-0.5, 0.5, (1, 3)), rng.uniform(-1, 1, (1, 3))
+    out = np.empty((1, 3, at.BASE))
+    balance_by_base(strokes, speeds, pulls, twin.table.linkage, out)
+    force, _, _, _, mass, _, _, _ = loads_of(twin, twin.numbers, strokes[0], speeds[0])
+    np.testing.assert_allclose(out[0] @ base_numbers(twin, twin.numbers), mass @ pulls[0] + force, rtol=1e-10)
