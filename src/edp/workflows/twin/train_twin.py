@@ -91,7 +91,7 @@ def train_twin(
     if base is not None:
         base.check(channels, data.train)
         begun = {"from": base.digest}
-    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)} | begun | _machine(experiment), data.digest)
+    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)} | begun | _linkage(experiment), data.digest)
     with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
@@ -106,7 +106,7 @@ def train_twin(
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         tell("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
-        provenance = _provenance(source, experiment, data, fitted) | _machine(recordings) | result.facts
+        provenance = _provenance(source, experiment, data, fitted) | _full_strokes(recordings) | result.facts
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
         write_scores(run.path, scores, runs, intervals)
@@ -117,7 +117,7 @@ def train_twin(
     return TrainedTwin(bundle, scores, False)
 
 
-def _machine(experiment: TwinExperiment) -> dict[str, Any]:
+def _linkage(experiment: TwinExperiment) -> dict[str, Any]:
     """All numbers of the machine that settings name for its linkage: an edited file asks for another twin.
 
     Raises:
@@ -162,7 +162,7 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
     }
 
 
-def _machine(recordings: Sequence[Recording]) -> dict[str, Any]:
+def _full_strokes(recordings: Sequence[Recording]) -> dict[str, Any]:
     """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
     said = {tuple(recording.meta[STROKES]) for recording in recordings if STROKES in recording.meta}
     return {STROKES: list(said.pop())} if len(said) == 1 else {}
