@@ -59,4 +59,4 @@ def _dead_band(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.int
 def _errors(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.integer]) -> tuple[float, DoubleArray]:
     """Sum of squared errors, and sums of absolute errors of each fold."""
     error = predicted - truth
-    return float(error @ error), np.bincount(owner, np.abs(error))
+    return float(error @ error), np.asarray(np.bincount(owner, np.abs(error)), dtype=np.float64)

@@ -191,7 +191,8 @@ def _noted(job: CandidateTraining) -> TrainingProgress | None:
         return None
     try:
         row = read_object(note, names)
-        whole = [max(1, int(row[name])) for name in names[:4]]
-        return TrainingProgress(*whole, float(row["targets_per_s"]), float(row["seconds_left"]))
+        epoch, epochs, update, updates = (max(1, int(row[name])) for name in names[:4])
+        speed, left = float(row["targets_per_s"]), float(row["seconds_left"])
+        return TrainingProgress(epoch, epochs, update, updates, speed, left)
     except (EdpError, TypeError, ValueError):
         return None  # a note is for readers: what cannot be read now is read at the next look
