@@ -97,10 +97,10 @@ def main() -> None:
     parts = (channels, scales, data)
     if "recurrent" in only:
         models["recurrent"] = trained(experiment, training, parts)
-    if "greybox" in only:
-        models["greybox"] = fitted_grey_box(parts, arguments.seed, fit)
-    if LINKED in only:
-        models[LINKED] = fitted_linkage(parts, arguments.seed, fit)
+    for name, fitted in (("greybox", fitted_grey_box), (LINKED, fitted_linkage)):
+        if name in only:
+            print(f"fitting: {name}", flush=True)
+            models[name] = fitted(parts, arguments.seed, fit)
     if RESIDUAL in only:
         models[BARE], models[TOPPED] = fitted_residual(parts, arguments.seed, quick, LEFT_OUT, fit)
     if arguments.specialist:

@@ -62,7 +62,7 @@ def sample_front(ticks: int = 600, seed: int = 0) -> Recording:
         seed: of all values.
     """
     rng = np.random.default_rng(seed)
-    lever = np.repeat(rng.uniform(-4e6, 4e6, (ticks // 25 + 1, 3)), 25, axis=0)[:ticks]
+    lever = np.repeat(rng.uniform(-1.0, 1.0, (ticks // 25 + 1, 3)), 25, axis=0)[:ticks]
     pilots = np.stack([np.maximum(lever, 0.0), np.maximum(-lever, 0.0)], axis=2).reshape(ticks, 6)
     names = [(f"{axis}{way}", Kind.PILOT_PRESSURE) for axis, way in FRONT_PILOTS]
     names += [(f"CylVels_{i}", Kind.VELOCITY) for i in (1, 2, 3)]
