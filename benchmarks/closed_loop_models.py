@@ -155,7 +155,8 @@ def _training(settings: Sequence[str]) -> list[str]:
 
 def ahead_errors(models: Models, run: Path) -> dict[str, Any]:
     """Errors of the velocities, mm/s, ahead of measured ports on held-out recordings, told the commands."""
-    experiment = load_twin_experiment(run / "config.toml")
+    # The split of the first twin: what it was held out from, no later training has seen.
+    experiment = load_twin_experiment(models.twin() / "config.toml")
     _, data = prepare_twin(models.recordings(), experiment)
     twin = load_twin(run).twin
     parts = {

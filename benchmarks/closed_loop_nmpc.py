@@ -123,7 +123,7 @@ def loops(models: Models, size: LoopSize, seed: int) -> dict[str, dict[str, Any]
     # The last ones: the other machine is always among them.
     for name, variant in [AS_IT_WAS, *list(variants(folder).items())[1 - size.variants :]]:
         machine = OTHER if variant.other else MACHINE
-        twin = models.other_twin(models.size.other[0]) if variant.other else models.twin()
+        twin = models.other_twin(models.size.other[0]) if variant.other else models.control_twin()
         experiment = ControlExperiment(task=TASKS["grade"](), controller=nmpc, machine=machine, loops=1)
         known = ControlBench(experiment, ControlSources(twin=twin)).models
         contenders = {"pi": (tuned_pi(folder, machine, size, seed), known), "nmpc": (nmpc, known)}
@@ -218,7 +218,7 @@ def solve_times(models: Models, lines: int) -> dict[str, float]:
     experiment = ControlExperiment(
         task=TASKS["grade"](), controller=CONTROLLERS["nmpc"](), machine=MACHINE, loops=lines
     )
-    bench = ControlBench(experiment, ControlSources(twin=models.twin()))
+    bench = ControlBench(experiment, ControlSources(twin=models.control_twin()))
     ticks = max(task.reference.ticks for task in bench.tasks) + 1
     env = plant_of(MACHINE, ticks / experiment.rate_hz, experiment.rate_hz)
     watches = []

@@ -6,7 +6,7 @@ free air, in free air from or to an outstretched arm, where it falls, and in soi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,13 +48,13 @@ class Practice:
 
     Attributes:
         air: lines in free air.
-        outstretched: lines in free air that begin or end at an outstretched arm.
+        hard: lines in free air that begin or end at an outstretched arm.
         soil: lines in soil.
         every: of the twin's own training recordings every which one is learned from again, so that nothing is lost.
     """
 
     air: int
-    outstretched: int
+    hard: int
     soil: int
     every: int
 
@@ -68,10 +68,14 @@ def practised(folder: Path, recordings: DataSource, twin: Path, size: Practice, 
     out = make_folder(folder)
     done = out / "practised.txt"
     if not done.is_file():
-        experiment = ControlExperiment(task=TASKS["grade"](), controller=CONTROLLERS["nmpc"](), loops=1)
+        spec = CONTROLLERS["nmpc"]()
+        experiment = ControlExperiment(task=TASKS["grade"](), controller=spec, loops=1, seed=FIRST_SEED)
         bench = ControlBench(experiment, ControlSources(twin=twin))
-        answers = [channel.name for channel in bench.models.needed_twin("nmpc").channels.answers]
-        names = [*answers, *PILOTS]
+        channels = bench.models.needed_twin("nmpc").channels
+        own_names = sorted(load_twin(twin).provenance["data"]["names"]["train"])
+        trained = [recordings.path / f"{name}.parquet" for name in own_names]
+        wanted = {channel.name for channel in (*channels.answers, *channels.commands)}
+        names = [name for name in read_recording(trained[0]).channel_names if name in wanted]
         env = plant_of(experiment.machine, LONGEST_S, experiment.rate_hz)
         rng = np.random.default_rng(FIRST_SEED + seed)
         for kind, line, material in lines(bench.plant, size, rng):
@@ -80,41 +84,42 @@ def practised(folder: Path, recordings: DataSource, twin: Path, size: Practice, 
             controller = CONTROLLERS["nmpc"](**weights).build(interface_of(env), task.limits, bench.models)
             oil = {"oil_temperature": float(rng.uniform(*OIL_DEGC))}
             result = run_loop(env, controller, task, line, oil)
-            recording = as_log(result, bench.plant, names, f"m22_loop_{kind}_{line}_{material or 'air'}")
+            recording = as_log(result, bench.plant, names, (kind, line, material))
             write_recording(recording, out / f"{recording.name}.parquet")
-        trained = sorted(load_twin(twin).provenance["data"]["names"]["train"])
-        for name in trained[:: size.every]:
-            whole = read_recording(recordings.path / f"{name}.parquet")
+        for path in trained[:: size.every]:
+            whole = read_recording(path)
             values = np.ascontiguousarray(whole.select(names), dtype=np.float32)
-            channels = tuple(VOCABULARY[channel] for channel in names)
-            own = Recording(name, channels, values, whole.rate_hz, whole.source, dict(whole.meta))
-            write_recording(own, out / f"{name}.parquet")
+            kept = tuple(VOCABULARY[name] for name in names)
+            own = Recording(path.stem, kept, values, whole.rate_hz, whole.source, dict(whole.meta))
+            write_recording(own, out / path.name)
         done.write_text("all loops were run\n")
     return DataSource.of(out)
 
 
-def lines(plant: PlantInterface, size: Practice, rng: Any) -> Iterator[tuple[str, int, str]]:
-    """Kind, seed and soil of each line, until there are as many of each kind as are asked for."""
-    left = {"air": size.air, "outstretched": size.outstretched, "soil": size.soil}
+def lines(plant: PlantInterface, size: Practice, rng: Any) -> list[tuple[str, int, str]]:
+    """Kind, seed and soil of each line: as many of each kind as are asked for, in the order of their seeds."""
+    left = {"air": size.air, "hard": size.hard, "soil": size.soil}
+    found: list[tuple[str, int, str]] = []
     seed, soils = FIRST_SEED, 0
     while any(left.values()):
         seed += 1
         reference = draw_task(TASKS["grade"](), plant.geometry, plant.rate_hz, seed).reference
         arm = reference.strokes[[0, -1], 1].min() / plant.geometry.full_m[1]
-        others = [kind for kind in ("air", "soil") if left[kind]]
-        if arm < OUTSTRETCHED and left["outstretched"]:
-            kind = "outstretched"
-        elif others:
-            kind = str(rng.choice(others))
+        if arm < OUTSTRETCHED and left["hard"]:
+            kind = "hard"
         else:
-            continue
+            kind = "soil" if left["soil"] and rng.random() < 0.5 else "air"
+            if not left[kind]:
+                if left["hard"]:
+                    continue
+                kind = "soil" if left["soil"] else "air"
         left[kind] -= 1
-        material = SOILS[soils % len(SOILS)] if kind == "soil" else ""
+        found.append((kind, seed, SOILS[soils % len(SOILS)] if kind == "soil" else ""))
         soils += kind == "soil"
-        yield kind, seed, material
+    return found
 
 
-def as_log(result: LoopResult, plant: PlantInterface, names: list[str], name: str) -> Recording:
+def as_log(result: LoopResult, plant: PlantInterface, names: list[str], what: tuple[str, int, str]) -> Recording:
     """A loop as a simulated recording: pilot pressures beside the state from which they act on, none a tick late."""
     recording, columns = result.recording, []
     levers = recording.select(("Lever_1", "Lever_2", "Lever_3")).astype(float)
@@ -126,10 +131,8 @@ def as_log(result: LoopResult, plant: PlantInterface, names: list[str], name: st
             shown = channel if channel in recording.channel_names else f"{channel}{TRUE}"
             columns.append(recording.column(shown))
     values = np.ascontiguousarray(np.stack(columns, axis=1), dtype=np.float32)
-    meta = {
-        "machine": plant.geometry.machine.name,
-        "excitation": "loop",
-        "full_strokes_m": list(plant.geometry.machine.cylinders.stroke),
-    }
+    kind, line, material = what
+    meta = {"machine": plant.geometry.machine.name, "excitation": f"loop_{kind}"}
+    name = "_".join(part for part in ("m22_loop", kind, str(line), material) if part)
     channels = tuple(VOCABULARY[channel] for channel in names)
     return Recording(name, channels, values, recording.rate_hz, recording.source, meta)
