@@ -6,8 +6,7 @@ noise of velocities and pressures five times as large, all with the models of th
 position error to the reference of the same time; the distance to the path stands beside it.
 
 Part nmpc sets predictive control on a well-trained twin beside a PI loop that is tuned in the same run and an
-inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. That
-twin went on with loops of its own (practice), along lines that are not judged. Part
+inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part
 o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
 plant; part o4_other the same for C14 in loam. Their models are trained where --data has none: 3 h of recordings, some
 ten processor minutes.
@@ -98,8 +97,7 @@ def main() -> None:
 
 def predictive(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
     """Figures of part nmpc, and its verdicts."""
-    ahead = models_of.ahead_errors(models, models.control_twin())
-    before = models_of.ahead_errors(models, models.twin())
+    ahead = models_of.ahead_errors(models, models.twin())
     rows = nmpc_of.loops(models, size, seed)
     times = nmpc_of.solve_times(models, min(2, size.lines))
     verdicts = nmpc_of.loop_verdicts(rows, quick)
@@ -107,7 +105,7 @@ def predictive(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -
     for ticks, goal in ((20, 2.0), (50, 4.0)):
         name = f"velocities {ticks} ticks ahead, told the commands"
         verdicts.append(verdict(name, ahead["all"][str(ticks)], goal, "<= 1", "mm/s", quick))
-    return {"ahead_mm_s": ahead, "ahead_before_practice_mm_s": before, "loops": rows, "tick_ms": times, "size": asdict(size)}, verdicts
+    return {"ahead_mm_s": ahead, "loops": rows, "tick_ms": times, "size": asdict(size)}, verdicts
 
 
 def trained(folder: Path, size: Size, seed: int) -> dict[str, Path]:
