@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-import closed_loop_practice as practice_of
 from common import table
 from edp.config.twin import load_twin_experiment
 from edp.evaluation.ahead import look_ahead
@@ -55,7 +54,6 @@ class ModelSize:
         recordings: of M22.
         twin: settings of its twin.
         one_step: settings of the network that is trained on measured feedback alone.
-        practice: settings with which it goes on with loops of its own.
         other: minutes of C14 from which a twin goes on; the first for the controllers, all for tuning.
     """
 
@@ -63,26 +61,17 @@ class ModelSize:
     recordings: int
     twin: tuple[str, ...]
     one_step: tuple[str, ...]
-    practice: tuple[str, ...]
     other: tuple[int, ...]
 
-
-PRACTICE = (
-    *("training.lengths_s=[0.4]", "training.updates=[8000]", "training.validation_s=0.5"),
-    *("split.validation_share=0.1", "split.test_share=0.1"),
-)
-"""The horizon of a controller is all that is asked of the twin here."""
 
 FULL = ModelSize(
     *(180.0, 60, ("twin.kind=recurrent", "twin.units=96")),
     ONE_STEP,
-    PRACTICE,
     (20, 5, 45),
 )
 QUICK = ModelSize(
     *(20.0, 20, ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1,0.3]", "training.updates=[20,20]")),
     ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1]", "training.updates=[10]"),
-    (*PRACTICE[:1], "training.updates=[40]", "training.validation_s=0.5"),
     (5,),
 )
 
@@ -113,12 +102,6 @@ class Models:
     def twin(self) -> Path:
         """The twin of M22."""
         return self._twin(self.recordings(), "good_twin", self.size.twin)
-
-    def control_twin(self) -> Path:
-        """The twin of M22 gone on with loops that it controlled, over the horizon of a controller."""
-        size = practice_of.QUICK if self.size is QUICK else practice_of.FULL
-        source = practice_of.practised(self.folder / "practice", self.recordings(), self.twin(), size, self.seed)
-        return self._twin(source, "control_twin", self.size.practice, self.twin())
 
     def beside(self, name: str) -> Path:
         """A model that stands beside it: ``static``, ``arx`` or ``one_step``."""
