@@ -19,7 +19,7 @@ from edp.report.monitor.facts import AlarmFacts, MonitorFacts, start_time
 
 FloatArray = NDArray[np.float32]
 WIDTH = 960
-LEFT, RIGHT = 190, 12
+LEFT, RIGHT = 200, 34
 """Pixels beside the drawing: names of groups, and half of the last tick's text."""
 POINTS, CELLS, OVERVIEW_CELLS = 640, 320, 160
 """Most points of a line, and cells of a row: finer ones are pooled by their largest value; a page stays small."""

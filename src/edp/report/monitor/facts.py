@@ -156,13 +156,13 @@ def alarm_sheet(facts: MonitorFacts) -> Sheet:
         first = alarm.causes[0] if alarm.causes else None
         rows.append((
             short_label(alarm.recording), clock(alarm.since_s, start), clock(alarm.raised_s, start), alarm.severity,
-            first.words if first else MISSING, first.probability if first else None, alarm.detector,
+            first.words if first else MISSING, first.probability if first else None,
             alarm.statistic / alarm.limit if alarm.limit > 0.0 else None,
         ))  # fmt: skip
     share = figures([], decimals=2)
     heads = (
         Column("Recording"), Column("Since"), Column("Raised"), Column("Severity"), Column("Most likely"),
-        Column("Probability", "", share), Column("Detector"), Column("Statistic over limit", "", share),
+        Column("Probability", "", share), Column("Over limit", "", share),
     )  # fmt: skip
     return Sheet("alarms", "Alarms in the order in which they were raised", heads, tuple(rows))
 

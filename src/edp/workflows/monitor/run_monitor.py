@@ -29,7 +29,7 @@ START = "start"
 
 COLUMNS = (
     *("recording", "raised_s", "since_s", "severity", "sentence", "detector", "statistic", "limit"),
-    *("kind", "site", "size", "unit", "probability", "index", "evidence"),
+    *("component", "kind", "site", "size", "unit", "at_fault", "probability", "evidence"),
 )
 """Of the CSV file; of the causes the most probable one."""
 
