@@ -130,7 +130,7 @@ def _left_out(
             at, after = ((scatter.directions(means[part] + fault.change[part]), noise[part]) for part in (0, 1))
             judged.append(_Judged(without, fault, (at, after)))
     keep = chance.permutation(len(judged))[:MOST_JUDGED]
-    return [judged[place] for place in sorted(keep.tolist())]
+    return [judged[row] for row in sorted(keep.tolist())]
 
 
 def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
@@ -146,9 +146,9 @@ def _chosen(judged: Sequence[_Judged], whole: Dictionary) -> Dictionary:
             tried = replace(whole, changing=changing, temperature=temperature)
             loss, misfits = 0.0, []
             for case in judged:
-                found = _found(case, tried)
-                loss -= float(np.log(max(found.probabilities[case.fault.owner], 1e-6)))
-                misfits.append(found.misfit)
+                matched = _found(case, tried)
+                loss -= float(np.log(max(matched.probabilities[case.fault.owner], 1e-6)))
+                misfits.append(matched.misfit)
             if misfits and loss < least:
                 best, least = replace(tried, strange=max(float(np.quantile(misfits, UNUSUAL)), 1.0)), loss
     return best
@@ -165,8 +165,8 @@ def _confusions(judged: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]
     names = sorted({_name(fault) for fault in whole.classes})
     if not judged:
         return ()
-    place = {name: n for n, name in enumerate(names)}
-    columns = np.array([place[_name(fault)] for fault in whole.classes])
+    columns_by_name = {name: n for n, name in enumerate(names)}
+    columns = np.array([columns_by_name[_name(fault)] for fault in whole.classes])
     probabilities = np.zeros((len(judged), len(names)))
     for row, case in enumerate(judged):
         np.add.at(probabilities[row], columns, _found(case, whole).probabilities)

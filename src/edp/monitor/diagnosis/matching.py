@@ -68,8 +68,8 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
 def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
     """`match` from the directions at the onset and after it on; None where there are no rows of a part."""
     scores, sizes, misfits = [], [], []
-    for place, fault in enumerate(dictionary.classes):
-        tried, signatures = candidates(dictionary, place, fault)
+    for number, fault in enumerate(dictionary.classes):
+        tried, signatures = candidates(dictionary, number, fault)
         likelihoods, off, count = np.zeros(len(tried)), np.zeros(len(tried)), 0
         for part, entry in enumerate(seen):
             if entry is None:
@@ -92,9 +92,9 @@ def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Mat
     return Match((1.0 - none) * shares, np.array(sizes), none, misfit)
 
 
-def candidates(dictionary: Dictionary, place: int, fault: FaultClass) -> tuple[Array, Array]:
+def candidates(dictionary: Dictionary, number: int, fault: FaultClass) -> tuple[Array, Array]:
     """Sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
-    rows = dictionary.rows_of(place)
+    rows = dictionary.rows_of(number)
     signatures = dictionary.signatures[:, rows]
     if not fault.sizes:
         return np.array([np.nan]), signatures[:, :1]
@@ -103,29 +103,29 @@ def candidates(dictionary: Dictionary, place: int, fault: FaultClass) -> tuple[A
     ends = abs(fault.sizes[0] - fault.neutral), abs(fault.sizes[-1] - fault.neutral)
     tried = np.geomspace(LEAST_SIZE * ends[0], BEYOND * ends[1], GRID)
     # From nothing at the neutral size; beyond the largest size that was simulated it stays as it was there.
-    known = np.concatenate([[0.0], away])
+    known_sizes = np.concatenate([[0.0], away])
     values = np.concatenate([np.zeros((2, 1, signatures.shape[2])), signatures], axis=1)
-    upper = np.clip(np.searchsorted(known, tried), 1, len(known) - 1)
-    share = np.clip((tried - known[upper - 1]) / (known[upper] - known[upper - 1]), 0.0, 1.0)[:, None]
+    upper = np.clip(np.searchsorted(known_sizes, tried), 1, len(known_sizes) - 1)
+    share = np.clip((tried - known_sizes[upper - 1]) / (known_sizes[upper] - known_sizes[upper - 1]), 0.0, 1.0)[:, None]
     between = (1.0 - share) * values[:, upper - 1] + share * values[:, upper]
     return fault.neutral + sign * tried, between
 
 
-def causes_of(dictionary: Dictionary, found: Match, most: int = MOST_CAUSES) -> tuple[Cause, ...]:
+def causes_of(dictionary: Dictionary, matched: Match, most: int = MOST_CAUSES) -> tuple[Cause, ...]:
     """The most likely causes, the first of them from the most likely part.
 
     A part may have many kinds of faults that look alike: what a mechanic looks at first is the part whose faults
     together are the most likely, and of it the likeliest fault.
     """
     causes = [
-        _cause(fault, float(found.probabilities[place]), float(found.sizes[place]))
-        for place, fault in enumerate(dictionary.classes)
+        _cause(fault, float(matched.probabilities[number]), float(matched.sizes[number]))
+        for number, fault in enumerate(dictionary.classes)
     ]
     parts: dict[str, float] = {}
     for cause in causes:
         parts[cause.component] = parts.get(cause.component, 0.0) + cause.probability
-    causes.append(Cause(NONE_OF_THESE, "", "", "none", None, "", found.none, UNKNOWN))
-    parts[""] = found.none
+    causes.append(Cause(NONE_OF_THESE, "", "", "none", None, "", matched.none, UNKNOWN))
+    parts[""] = matched.none
     return tuple(_by_part(causes, parts)[:most])
 
 
@@ -141,11 +141,29 @@ def _by_part(causes: Sequence[Cause], parts: dict[str, float]) -> list[Cause]:
 def _cause(fault: FaultClass, probability: float, size: float) -> Cause:
     if not fault.sizes:
         return Cause(
-            fault.kind, fault.site, fault.component, fault.place, None, "", probability, fault.words, None, fault.grave
+            fault.kind,
+            fault.site,
+            fault.component,
+            fault.at_fault,
+            None,
+            "",
+            probability,
+            fault.words,
+            None,
+            fault.grave,
         )
     steps = np.abs(np.array(fault.sizes) - fault.neutral)
     grade = float(np.interp(np.log(abs(size - fault.neutral)), np.log(steps), np.linspace(0.0, 1.0, len(steps))))
+    words = cause_words(fault, size)
     return Cause(
-        fault.kind, fault.site, fault.component, fault.place, size, fault.unit, probability, cause_words(fault, size),
-        grade, fault.grave,
-    )  # fmt: skip
+        fault.kind,
+        fault.site,
+        fault.component,
+        fault.at_fault,
+        size,
+        fault.unit,
+        probability,
+        words,
+        grade,
+        fault.grave,
+    )
