@@ -12,6 +12,7 @@ _API = "edp.workflows.api"
 _PUBLIC = {
     "EdpError": "edp.errors",
     "JudgedScores": f"{_API}.scores",
+    "Monitor": "edp.monitor.monitor",
     "Predictions": f"{_API}.predictions",
     "Recording": "edp.recording",
     "Recordings": f"{_API}.recordings",
@@ -19,6 +20,7 @@ _PUBLIC = {
     "Stream": "edp.networks.stream",
     "TrainedPredictor": f"{_API}.predictor",
     "load": f"{_API}.predictor",
+    "load_monitor": "edp.monitor.monitor_file",
     "load_study": f"{_API}.scores",
     "read": f"{_API}.recordings",
     "testing": "",

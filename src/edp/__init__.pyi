@@ -1,5 +1,7 @@
 from edp import testing as testing
 from edp.errors import EdpError as EdpError
+from edp.monitor.monitor import Monitor as Monitor
+from edp.monitor.monitor_file import load_monitor as load_monitor
 from edp.networks.stream import Stream as Stream
 from edp.recording import Recording as Recording
 from edp.workflows.api.predictions import Predictions as Predictions

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Drift:
+class SlowDrift:
     """An offset of each summary that follows its rows.
 
     After each block an offset goes towards the row by at most `step`, and never further than `most` from zero: a fault
@@ -33,9 +33,9 @@ class Drift:
         if self.step == 0.0 or not len(rows):
             return rows - offset, offset
         out = np.empty_like(rows)
-        for place, row in enumerate(rows):
+        for index, row in enumerate(rows):
             left = row - offset
-            out[place] = left
+            out[index] = left
             # A missing row teaches nothing.
             move = np.where(np.isfinite(left), np.clip(left, -self.step, self.step), 0.0)
             offset = np.clip(offset + move, -self.most, self.most)
@@ -46,7 +46,7 @@ class Drift:
         return {"step": self.step, "most": self.most}
 
     @staticmethod
-    def of(plain: Mapping[str, Any]) -> Drift:
+    def of(plain: Mapping[str, Any]) -> SlowDrift:
         """From plain values.
 
         Raises:
@@ -56,4 +56,4 @@ class Drift:
         for value in (step, most):
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= 1e6:
                 raise ValueError(f"a number of the drift is {str(value)[:40]}; 0 to 1e6 must hold")
-        return Drift(float(step), float(most))
+        return SlowDrift(float(step), float(most))

@@ -9,27 +9,6 @@ SEVERITIES = ("note", "warning", "stop")
 
 
 @dataclass(frozen=True)
-class Cause:
-    """What may be wrong.
-
-    Attributes:
-        kind: of the fault.
-        site: where it sits.
-        size: estimate of it, in `unit`; None where there is none.
-        unit: of the size.
-        probability: 0 to 1.
-        place: ``sensor`` or ``machine``; empty where that is not known.
-    """
-
-    kind: str
-    site: str = ""
-    size: float | None = None
-    unit: str = ""
-    probability: float = 0.0
-    place: str = ""
-
-
-@dataclass(frozen=True)
 class MonitorAlarm:
     """One alarm of a monitor.
 
@@ -42,7 +21,7 @@ class MonitorAlarm:
         limit: that it passed.
         evidence: names of summaries with their mean conditioned deviation since `since_s`, in healthy standard
             deviations, the largest first.
-        causes: the most probable first; empty without a diagnosis.
+        causes: dataclasses of a diagnosis, the most probable first; empty without one.
         sentence: all of this for a reader.
         severity: one of `SEVERITIES`.
     """
@@ -54,7 +33,7 @@ class MonitorAlarm:
     statistic: float
     limit: float
     evidence: tuple[tuple[str, float], ...]
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[Any, ...] = ()
     sentence: str = ""
     severity: str = "warning"
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.monitor.adaptation import Drift
+from edp.monitor.adaptation import SlowDrift
 from edp.monitor.conditioning import Conditioning
 from edp.monitor.detectors.base import DETECTORS, Detector
 from edp.monitor.summaries import BlockSummaries, SummaryState
@@ -75,7 +75,7 @@ class BlockVerdict:
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class MonitorChain:
     """The fitted chain.
 
     Attributes:
@@ -90,7 +90,7 @@ class Chain:
 
     summaries: BlockSummaries
     conditioning: Conditioning
-    drift: Drift
+    drift: SlowDrift
     watches: tuple[Watch, ...]
     limit: float
     quiet: float
@@ -134,8 +134,8 @@ class Chain:
         z, state = self.conditioned(residuals, rows, state)
         verdicts = []
         white = self.bank.white(z)
-        for place, (row, seen) in enumerate(zip(z, white, strict=True)):
-            number = first + place + 1
+        for index, (row, seen) in enumerate(zip(z, white, strict=True)):
+            number = first + index + 1
             if number <= self.settle:
                 state.since = number
                 verdicts.append(BlockVerdict(number, (0.0,) * len(self.watches), row, None, number, np.zeros(len(row))))
@@ -176,12 +176,12 @@ class Chain:
         """Numbers of its file."""
         named: dict[str, NDArray[Any]] = {f"summaries.{k}": v for k, v in self.summaries.arrays().items()}
         named |= {f"conditioning.{name}": values for name, values in self.conditioning.arrays().items()}
-        for place, watch in enumerate(self.watches):
-            named |= {f"watch.{place}.mean": watch.mean, f"watch.{place}.matrix": watch.matrix}
+        for index, watch in enumerate(self.watches):
+            named |= {f"watch.{index}.mean": watch.mean, f"watch.{index}.matrix": watch.matrix}
         return named
 
     @staticmethod
-    def of(plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Chain:
+    def of(plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> MonitorChain:
         """From plain values and arrays.
 
         Raises:
@@ -201,22 +201,22 @@ class Chain:
         if isinstance(settle, bool) or not isinstance(settle, int) or not 0 <= settle <= 1_000_000:
             raise ValueError(f"settle is {str(settle)[:40]}; an integer from 0 to 1,000,000 must hold")
         limit, quiet = _number(plain["limit"], "limit"), _number(plain["quiet"], "quiet")
-        return Chain(summaries, conditioning, Drift.of(plain["drift"]), watches, limit, quiet, settle)
+        return MonitorChain(summaries, conditioning, SlowDrift.of(plain["drift"]), watches, limit, quiet, settle)
 
 
 def _watches(entries: Sequence[Any], arrays: Mapping[str, NDArray[Any]], summaries: int) -> tuple[Watch, ...]:
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_WATCHES:
         raise ValueError(f"it has no list of 1 to {MOST_WATCHES} watches")
     watches = []
-    for place, entry in enumerate(entries):
+    for index, entry in enumerate(entries):
         spec = _TREE.build(_Form, {"detector": entry["detector"]}, "of its watches").detector
-        mean = np.asarray(arrays[f"watch.{place}.mean"], np.float64)
-        matrix = np.asarray(arrays[f"watch.{place}.matrix"], np.float64)
+        mean = np.asarray(arrays[f"watch.{index}.mean"], np.float64)
+        matrix = np.asarray(arrays[f"watch.{index}.matrix"], np.float64)
         scale = _number(entry["scale"], "scale")
         if mean.shape != (summaries,) or matrix.ndim != 2 or len(matrix) != summaries:
-            raise ValueError(f"arrays of watch {place} have other shapes than the summaries")
+            raise ValueError(f"arrays of watch {index} have other shapes than the summaries")
         if not (np.isfinite(mean).all() and np.isfinite(matrix).all() and scale > 0.0):
-            raise ValueError(f"a number of watch {place} is not finite, or its scale is not positive")
+            raise ValueError(f"a number of watch {index} is not finite, or its scale is not positive")
         watches.append(Watch(spec, mean, matrix, scale))
     return tuple(watches)
 

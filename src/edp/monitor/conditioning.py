@@ -50,9 +50,9 @@ class Conditioning:
         scaled = np.clip((points[:, 1:] - self.offset) / self.width, -POINT_LIMIT, POINT_LIMIT)
         usual = np.repeat(self.usual[None, :, 0], len(summaries), 0)
         width = np.repeat(self.spread[None, :, 0], len(summaries), 0)
-        for place in range(scaled.shape[1]):
-            usual = usual + scaled[:, place, None] * self.usual[:, place + 1]
-            width = width + scaled[:, place, None] * self.spread[:, place + 1]
+        for index in range(scaled.shape[1]):
+            usual = usual + scaled[:, index, None] * self.usual[:, index + 1]
+            width = width + scaled[:, index, None] * self.spread[:, index + 1]
         z: Array = (summaries - usual) / np.maximum(width, self.floor)
         return np.clip(z, -self.clip, self.clip)
 

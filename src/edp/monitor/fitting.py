@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.monitor.adaptation import Drift
+from edp.monitor.adaptation import SlowDrift
 from edp.monitor.calibration import AlarmLimit, calibrated
-from edp.monitor.chain import Chain
+from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
 from edp.monitor.detectors.ewma import EwmaSpec
@@ -86,6 +86,15 @@ class ChainSpec:
 
 
 @dataclass(frozen=True, eq=False)
+class SessionBlocks:
+    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
+
+    name: str
+    summaries: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
 class FittedChain:
     """What came of it.
 
@@ -93,20 +102,13 @@ class FittedChain:
         chain: on all sessions that were kept.
         limit: from sessions that the judging parts were not fitted to.
         doubtful: names of sessions that were left out.
+        sessions: blocks of those that were not.
     """
 
-    chain: Chain
+    chain: MonitorChain
     limit: AlarmLimit
     doubtful: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class SessionBlocks:
-    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
-
-    name: str
-    summaries: Array
-    points: Array
+    sessions: tuple[SessionBlocks, ...]
 
 
 def fit_chain(
@@ -158,30 +160,30 @@ def fit_from_blocks(
 ) -> FittedChain:
     """`fit_chain` from the blocks of the sessions on."""
     note("conditioning, views and limit")
-    kept, doubtful = _without_doubtful(spec, blocks, settle)
+    remaining, doubtful = _without_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
-    rows: list[Array] = [np.zeros(0)] * len(kept)
-    white: list[Array] = [np.zeros(0)] * len(kept)
-    drift = Drift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
-    conditioning = _conditioning(spec, kept, settle)
-    whole = [_conditioned(conditioning, drift, part, settle) for part in kept]
+    rows: list[Array] = [np.zeros(0)] * len(remaining)
+    white: list[Array] = [np.zeros(0)] * len(remaining)
+    drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
+    conditioning = _conditioning(spec, remaining, settle)
+    whole = [_conditioned(conditioning, drift, part, settle) for part in remaining]
     watches = scaled_alike([fit_watch(w, whole, blocks_per_s, settle) for w in spec.watches], whole, settle)
     for fold in range(spec.folds):
-        others = [part for i, part in enumerate(kept) if i % spec.folds != fold]
+        others = [part for i, part in enumerate(remaining) if i % spec.folds != fold]
         own_conditioning = _conditioning(spec, others, settle)
         fitted = [_conditioned(own_conditioning, drift, part, settle) for part in others]
         own = [fit_watch(watch, fitted, blocks_per_s, settle) for watch in spec.watches]
         # Scales belong to the watches that will be used: limits of the folds must mean the same.
         own = [Watch(w.detector, w.mean, w.matrix, s.scale) for w, s in zip(own, watches, strict=True)]
-        for i in range(fold, len(kept), spec.folds):
-            rows[i] = _conditioned(own_conditioning, drift, kept[i], settle)
+        for i in range(fold, len(remaining), spec.folds):
+            rows[i] = _conditioned(own_conditioning, drift, remaining[i], settle)
             # The start of a session is operating time: its rows are missing, and count as healthy.
             white[i] = np.concatenate([watch(rows[i]) for watch in own], axis=1)
     bank = _widths_of(watches)
     limit = calibrated(bank, [_padded(part, bank) for part in white], blocks_per_s, promised_hours)
     quiet = _quiet(bank, [_padded(part, bank) for part in white])
-    chain = Chain(summaries, conditioning, drift, watches, limit.limit, quiet, settle)
-    return FittedChain(chain, limit, doubtful)
+    chain = MonitorChain(summaries, conditioning, drift, watches, limit.limit, quiet, settle)
+    return FittedChain(chain, limit, doubtful, tuple(remaining))
 
 
 def _widths_of(watches: Sequence[Watch]) -> BankSpec:
@@ -211,7 +213,7 @@ def _conditioning(spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: in
     return fit_conditioning([p.summaries[settle:] for p in sessions], [p.points[settle:] for p in sessions], spec.clip)
 
 
-def _conditioned(conditioning: Conditioning, drift: Drift, session: SessionBlocks, settle: int) -> Array:
+def _conditioned(conditioning: Conditioning, drift: SlowDrift, session: SessionBlocks, settle: int) -> Array:
     z = conditioning(session.summaries, session.points)
     z[:settle] = np.nan
     return drift.run(z, np.zeros(z.shape[1]))[0]
@@ -221,21 +223,44 @@ def _without_doubtful(
     spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int
 ) -> tuple[list[SessionBlocks], tuple[str, ...]]:
     """Sessions without those whose means lie far from all others, and the names of those."""
+    bad = _doubtful(spec, sessions, sessions, settle)
+    remaining = [session for session, out in zip(sessions, bad, strict=True) if not out]
+    return remaining, tuple(session.name for session, out in zip(sessions, bad, strict=True) if out)
+
+
+def doubtful_sessions(
+    fitted: FittedChain,
+    spec: ChainSpec,
+    sources: Sequence[ResidualSource],
+    channels: Sequence[Channel],
+    sessions: Sequence[Recording],
+) -> tuple[str, ...]:
+    """Names of further sessions whose means lie far from those that a chain was fitted to, such as of the training."""
+    chain = fitted.chain
+    blocks = [blocks_of(chain.summaries, sources, channels, session) for session in sessions]
+    bad = _doubtful(spec, blocks, fitted.sessions, chain.settle)
+    return tuple(block.name for block, out in zip(blocks, bad, strict=True) if out)
+
+
+def _doubtful(
+    spec: ChainSpec, sessions: Sequence[SessionBlocks], usual: Sequence[SessionBlocks], settle: int
+) -> NDArray[np.bool_]:
+    """Which sessions have means far from the usual ones."""
     # As they are: what is usual at an operating point would be learned from the doubtful sessions, too.
-    means = np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in sessions])
-    middle = np.median(means, axis=0)
-    width = 1.4826 * np.median(np.abs(means - middle), axis=0)
+    means, others = (
+        np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in part])
+        for part in (sessions, usual)
+    )
+    middle = np.median(others, axis=0)
+    width = 1.4826 * np.median(np.abs(others - middle), axis=0)
     # A summary that hardly varies between sessions would make every one stand out.
     width = np.maximum(width, 0.02 + 1e-3 * np.abs(middle))
-    worst = (np.abs(means - middle) / width).max(axis=1)
+    worst, usual_worst = ((np.abs(part - middle) / width).max(axis=1) for part in (means, others))
     # Healthy sessions differ as well: what is doubtful stands far out among their own largest deviations.
-    usual = float(np.median(worst))
-    bad = worst > spec.doubtful * usual
+    bad = worst > spec.doubtful * float(np.median(usual_worst))
     # A fifth at most: where more stand out, they are not exceptions.
-    if bad.sum() > len(sessions) // 5:
-        bad &= worst >= np.sort(worst)[-max(1, len(sessions) // 5)]
-    kept = [session for session, out in zip(sessions, bad, strict=True) if not out]
-    return kept, tuple(session.name for session, out in zip(sessions, bad, strict=True) if out)
+    most = max(1, len(sessions) // 5)
+    return np.asarray(bad & (worst >= np.sort(worst)[-most]), dtype=bool)
 
 
 def fit_summaries(

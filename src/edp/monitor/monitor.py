@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError, closest
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.calibration import AlarmLimit
-from edp.monitor.chain import BlockVerdict, Chain, ChainState
+from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
 from edp.monitor.residuals.base import ResidualSource, Rows, SourceState, rows_of
 from edp.recording import Recording
 from edp.settings.bounds import shown
@@ -84,7 +84,7 @@ class Monitor:
     channels: tuple[Channel, ...]
     rate_hz: float
     sources: tuple[ResidualSource, ...]
-    chain: Chain
+    chain: MonitorChain
     limit: AlarmLimit
     session_means: Array
     diagnosis: Any = None
@@ -124,10 +124,10 @@ class Monitor:
 
     def residuals(self, rows: Rows, state: MonitorState) -> tuple[Rows, tuple[SourceState, ...]]:
         """Residuals of a stretch of one machine, shape (ticks, residuals), and the states of the sources behind it."""
-        place = {name: i for i, name in enumerate(self.inputs)}
+        index = {name: i for i, name in enumerate(self.inputs)}
         parts, states = [], []
         for source, before in zip(self.sources, state.sources, strict=True):
-            part, after = source.run(rows[None, :, [place[name] for name in source.inputs]], before)
+            part, after = source.run(rows[None, :, [index[name] for name in source.inputs]], before)
             parts.append(part[0])
             states.append(after)
         return np.concatenate(parts, axis=1), tuple(states)

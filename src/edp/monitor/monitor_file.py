@@ -17,7 +17,7 @@ from safetensors.numpy import save as save_arrays
 from edp import __version__
 from edp.errors import BundleError
 from edp.monitor.calibration import AlarmLimit
-from edp.monitor.chain import Chain
+from edp.monitor.chain import MonitorChain
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
 from edp.signals import Channel, Kind
@@ -56,9 +56,9 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
     arrays: dict[str, Any] = {f"chain.{name}": values for name, values in monitor.chain.arrays().items()}
     arrays["session_means"] = monitor.session_means
     sources, written = [], set()
-    for place, source in enumerate(monitor.sources):
+    for index, source in enumerate(monitor.sources):
         parts = source.parts()
-        arrays |= {f"source.{place}.{name}": values for name, values in parts.arrays.items()}
+        arrays |= {f"source.{index}.{name}": values for name, values in parts.arrays.items()}
         networks = {name: _write_network(path, bundle) for name, bundle in parts.bundles.items()}
         written |= {entry["folder"] for entry in networks.values()}
         sources.append({"kind": _kind_of(source), "plain": dict(parts.plain), "networks": networks})
@@ -154,7 +154,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
     arrays = load_arrays(read_arrays(path, header["arrays"]))
     sources = _sources(header["sources"], arrays, path)
     chain_arrays = {k.removeprefix("chain."): v for k, v in arrays.items() if k.startswith("chain.")}
-    chain = Chain.of(object_with(header["chain"], (), "its chain"), chain_arrays)
+    chain = MonitorChain.of(object_with(header["chain"], (), "its chain"), chain_arrays)
     _check_fit(sources, chain, names)
     means = np.asarray(arrays["session_means"], np.float64)
     if means.shape != (2, len(channels)) or not np.isfinite(means).all() or not (means[1] > 0.0).all():
@@ -164,7 +164,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
     return Monitor(channels, float(rate_hz), sources, chain, limit, means, header.get("diagnosis"), provenance)
 
 
-def _check_fit(sources: tuple[ResidualSource, ...], chain: Chain, names: list[str]) -> None:
+def _check_fit(sources: tuple[ResidualSource, ...], chain: MonitorChain, names: list[str]) -> None:
     """Refuse parts that do not belong together."""
     if chain.summaries.residuals != sum(len(source.names) for source in sources):
         raise ValueError("its chain is for another number of residuals than its sources give")
@@ -180,9 +180,9 @@ def _sources(entries: Any, arrays: Mapping[str, Any], path: Path) -> tuple[Resid
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_SOURCES:
         raise ValueError(f"it has no list of 1 to {MOST_SOURCES} sources of residuals")
     sources = []
-    for place, entry in enumerate(entries):
+    for index, entry in enumerate(entries):
         spec = RESIDUALS[_text(entry["kind"])]
-        prefix = f"source.{place}."
+        prefix = f"source.{index}."
         own = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         networks = object_with(entry["networks"], (), "its networks")
         if len(networks) > MOST_NETWORKS:

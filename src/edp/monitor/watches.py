@@ -67,8 +67,8 @@ class Watch:
         centred = rows - self.mean
         centred = np.where(np.isfinite(centred), centred, 0.0)
         white = np.zeros((len(rows), self.directions))
-        for place in range(centred.shape[1]):
-            white = white + centred[:, place, None] * self.matrix[place]
+        for index in range(centred.shape[1]):
+            white = white + centred[:, index, None] * self.matrix[index]
         return white
 
 
@@ -91,14 +91,14 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
     centred = rows - mean
     covariance = centred.T @ centred / len(rows)
     variances = np.diag(covariance)
-    kept = variances > 1e-9 * max(float(variances.max()), 1e-300)
-    size = np.sqrt(np.where(kept, variances, 1.0))
-    correlation = (covariance / np.outer(size, size))[np.ix_(kept, kept)]
-    correlation = (1.0 - spec.shrink) * correlation + spec.shrink * np.eye(int(kept.sum()))
+    there = variances > 1e-9 * max(float(variances.max()), 1e-300)
+    size = np.sqrt(np.where(there, variances, 1.0))
+    correlation = (covariance / np.outer(size, size))[np.ix_(there, there)]
+    correlation = (1.0 - spec.shrink) * correlation + spec.shrink * np.eye(int(there.sum()))
     values, vectors = np.linalg.eigh(correlation)
     fine = values > 1e-6
     matrix = np.zeros((rows.shape[1], int(fine.sum())))
-    matrix[kept] = vectors[:, fine] / np.sqrt(values[fine] * blocks) / size[kept][:, None]
+    matrix[there] = vectors[:, fine] / np.sqrt(values[fine] * blocks) / size[there][:, None]
     # An average of `blocks` independent white rows has a variance of 1 / blocks: single rows then have about one.
     # Single precision: a controller stores half as much, and the bits stay the same.
     mean, matrix = (values.astype(np.float32).astype(np.float64) for values in (mean, matrix))
@@ -127,9 +127,9 @@ class _Bank(Detector):
         self.each = np.zeros((len(watches), lanes))
 
     def _take(self, rows: Array) -> Array:
-        for place, detector in enumerate(self.detectors):
-            part = rows[:, self.ends[place] : self.ends[place + 1]]
-            self.each[place] = detector.step(part) / self.scales[place]
+        for index, detector in enumerate(self.detectors):
+            part = rows[:, self.ends[index] : self.ends[index + 1]]
+            self.each[index] = detector.step(part) / self.scales[index]
         largest: Array = self.each.max(axis=0)
         return largest
 

@@ -80,7 +80,7 @@ class Balances(ResidualSource):
         return None, none, none.astype(bool)
 
     def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
-        before, residual, known_before = own
+        before, residual, there_before = own
         levels = rows[..., self.pairs[:, 0]].astype(np.float64)
         rates = rows[..., self.pairs[:, 1]].astype(np.float64)
         first = before is None
@@ -89,15 +89,15 @@ class Balances(ResidualSource):
         if first:
             steps[:, 0] = 0.0
         change = np.diff(levels, axis=1, prepend=before[:, None]) - steps
-        known = there[..., self.pairs[:, 0]]
-        earlier = np.concatenate([(known[:, 0] if first else known_before)[:, None], known[:, :-1]], axis=1)
-        change[~(known & earlier & there[..., self.pairs[:, 1]])] = 0.0
+        measured = there[..., self.pairs[:, 0]]
+        earlier = np.concatenate([(measured[:, 0] if first else there_before)[:, None], measured[:, :-1]], axis=1)
+        change[~(measured & earlier & there[..., self.pairs[:, 1]])] = 0.0
         out = np.empty(change.shape)
         left = 1.0 - 1.0 / (self.memories_s * self.rate_hz)
         for column, share in enumerate(left.tolist()):
             start = share * residual[:, column : column + 1]
             out[..., column], _ = lfilter([1.0], [1.0, -share], change[..., column], axis=1, zi=start)
-        return out.astype(np.float32), (levels[:, -1], out[:, -1], known[:, -1])
+        return out.astype(np.float32), (levels[:, -1], out[:, -1], measured[:, -1])
 
     def parts(self) -> SourceParts:
         """See `ResidualSource.parts`."""
@@ -157,18 +157,18 @@ class BalancesSpec(ResidualSpec):
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
         material.note("balances")
-        found = [
+        matches = [
             (level, rate, gain, max(memory, 2.0 / material.rate_hz))
             for level, rate, gain in matched_pairs(material.channels, material.train, material.rate_hz, self.match)
             for memory in (self.rate_memory_s if level.kind is Kind.VELOCITY else self.memory_s)
         ]
-        if not found:
+        if not matches:
             return None
-        used = {channel.name for level, rate, _, _ in found for channel in (level, rate)}
+        used = {channel.name for level, rate, _, _ in matches for channel in (level, rate)}
         inputs = tuple(name for name in material.names if name in used)
-        pairs = np.array([[inputs.index(level.name), inputs.index(rate.name)] for level, rate, _, _ in found])
-        gains, memories = (np.array([entry[place] for entry in found]) for place in (2, 3))
-        units = [KINDS[level.kind].si_unit for level, _, _, _ in found]
+        pairs = np.array([[inputs.index(level.name), inputs.index(rate.name)] for level, rate, _, _ in matches])
+        gains, memories = (np.array([entry[index] for entry in matches]) for index in (2, 3))
+        units = [KINDS[level.kind].si_unit for level, _, _, _ in matches]
         return Balances(inputs, pairs, gains, memories, material.rate_hz, mean_inputs(material, inputs), units)
 
 

@@ -81,12 +81,12 @@ class SourceState:
 
     Attributes:
         last: the last value of each input that was there, shape (streams, inputs).
-        known: whether there was one, shape (streams, inputs).
+        ever: whether there was one, shape (streams, inputs).
         own: what the source itself carries.
     """
 
     last: Rows
-    known: NDArray[np.bool_]
+    ever: NDArray[np.bool_]
     own: Any
 
 
@@ -146,7 +146,7 @@ class ResidualSource(ABC):
         if not there.all():
             gone = (~there).astype(np.float32) @ self._read_by.astype(np.float32)
             residuals[gone > 0.0] = np.nan
-        return residuals, SourceState(last, state.known | there.any(axis=1), own)
+        return residuals, SourceState(last, state.ever | there.any(axis=1), own)
 
     @property
     def _read_by(self) -> NDArray[np.bool_]:

@@ -47,13 +47,13 @@ class LookAhead(ResidualSource):
         judged: list[tuple[str, ...]] = []
         reads: list[tuple[str, ...]] = []
         units: list[str] = []
-        place = {name: i for i, name in enumerate(self.inputs)}
+        index = {name: i for i, name in enumerate(self.inputs)}
         self._columns = []
         for number, bundle in self.bundles.items():
             task, scaled = bundle.task, bool(bundle.predictor.output.coverages)
-            logged = [i for i, target in enumerate(task.targets) if target in place]
+            logged = [i for i, target in enumerate(task.targets) if target in index]
             self._columns.append(
-                ([place[name] for name in task.inputs], logged, [place[task.targets[i]] for i in logged])
+                ([index[name] for name in task.inputs], logged, [index[task.targets[i]] for i in logged])
             )
             for horizon in task.horizons:
                 for i in logged:
@@ -81,14 +81,14 @@ class LookAhead(ResidualSource):
             with torch.inference_mode():
                 x = torch.from_numpy(np.ascontiguousarray(rows[..., fed]))
                 predicted, width, state = _predicted(bundle.predictor, x, state)
-            kept = []
-            for place, horizon in enumerate(bundle.task.horizons):
-                now = np.stack([predicted[:, :, place][..., logged], width[:, :, place][..., logged]], axis=2)
-                all_of = np.concatenate([waiting[place], now], axis=1)
+            remaining = []
+            for index, horizon in enumerate(bundle.task.horizons):
+                now = np.stack([predicted[:, :, index][..., logged], width[:, :, index][..., logged]], axis=2)
+                all_of = np.concatenate([waiting[index], now], axis=1)
                 due = all_of[:, : rows.shape[1]]
                 parts.append((rows[..., measured] - due[:, :, 0]) / due[:, :, 1])
-                kept.append(all_of[:, len(all_of[0]) - horizon :])
-            states.append((state, kept))
+                remaining.append(all_of[:, len(all_of[0]) - horizon :])
+            states.append((state, remaining))
         return np.concatenate(parts, axis=-1), states
 
     def parts(self) -> SourceParts:

@@ -50,9 +50,9 @@ class TwinPorts(ResidualSource):
         channels = bundle.twin.channels
         answers = [channel.name for channel in channels.answers]
         units = {channel.name: channel.unit for channel in channels.answers}
-        place = {name: i for i, name in enumerate(self.inputs)}
-        self._commands = [place[channel.name] for channel in channels.commands]
-        self._answers = [place[name] for name in answers]
+        index = {name: i for i, name in enumerate(self.inputs)}
+        self._commands = [index[channel.name] for channel in channels.commands]
+        self._answers = [index[name] for name in answers]
         self._free = [[answers.index(name) for name in group] for group in self.groups]
         judged = [name for group in self.groups for name in group]
         self.names = tuple(f"twin:{name}" for name in judged)

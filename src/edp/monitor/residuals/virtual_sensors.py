@@ -65,9 +65,9 @@ class VirtualSensors(ResidualSource):
                 reads.append((target, *bundle.task.inputs))
                 units.append(Channel(target, kind).unit)
         self.names, self.judged, self.reads, self.units = tuple(names), tuple(judged), tuple(reads), tuple(units)
-        place = {name: i for i, name in enumerate(self.inputs)}
+        index = {name: i for i, name in enumerate(self.inputs)}
         self._columns = [
-            ([place[name] for name in bundle.task.inputs], [place[name] for name in bundle.task.targets])
+            ([index[name] for name in bundle.task.inputs], [index[name] for name in bundle.task.targets])
             for bundle in self.bundles.values()
         ]
 
@@ -177,12 +177,12 @@ class VirtualSensorsSpec(ResidualSpec):
         data = self._prepared(group, group.judged, material)
         fitted = fit(data, self.model(material.rate_hz), self.training(minutes, material))
         explained = _explained(fitted.predictor, data.validation or data.train)
-        kept = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)
-        if not kept:
+        remaining = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)
+        if not remaining:
             return None
-        if len(kept) < len(group.judged):
+        if len(remaining) < len(group.judged):
             # The others cost a training once more: a network whose outputs are cut off would be another network.
-            data = self._prepared(group, kept, material)
+            data = self._prepared(group, remaining, material)
             fitted = fit(data, self.model(material.rate_hz), self.training(minutes, material))
         facts = {"seconds": fitted.seconds}
         return Bundle(fitted.predictor, data.inputs, data.target_kinds, data.descriptions, facts)

@@ -14,7 +14,7 @@ import numpy as np
 from edp.config.monitor import MonitorExperiment, monitor_toml
 from edp.errors import ConfigError, DataError, closest
 from edp.logs.source import DataSource
-from edp.monitor.fitting import fit_chain, session_means
+from edp.monitor.fitting import doubtful_sessions, fit_chain, session_means
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import save_monitor
 from edp.monitor.residuals.base import FitMaterial, note_nothing
@@ -83,8 +83,9 @@ def fit_to_recordings(
     experiment: MonitorExperiment,
     bundles: Sequence[Bundle | TwinBundle] = (),
     note: Callable[[str], None] = note_nothing,
+    again: bool = False,
 ) -> FittedMonitor:
-    """`fit_monitor` without files.
+    """`fit_monitor` without files; `again` says that doubtful sessions were left out of the training before.
 
     Raises:
         EdpError: recordings that cannot be used, or too few hours for the promise.
@@ -115,6 +116,15 @@ def fit_to_recordings(
             "residuals"
         )
     fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note)
+    if not again:
+        note("sessions that trained, compared with the others")
+        trained = doubtful_sessions(fitted, experiment.chain, sources, channels, (*train, *validation))
+        if trained:
+            note(f"once more without {', '.join(trained)}")
+            left = [session for session in sessions if session.name not in trained]
+            better = fit_to_recordings(left, experiment, bundles, note, again=True)
+            seconds = time.process_time() - began
+            return FittedMonitor(better.monitor, (*trained, *better.doubtful), seconds)
     provenance: dict[str, Any] = {
         "sessions": len(sessions),
         "hours": sum(session.duration_s for session in sessions) / 3600.0,
@@ -155,8 +165,8 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
                 raise DataError(f"healthy log '{recording.name}' has no channel '{name}'{hint}")
     shared = set(first.channel_names).intersection(*(recording.channel_names for recording in recordings))
     offered = [channel for channel in sensed_channels(first.channels) if channel.name in shared]
-    wanted = experiment.channels or tuple(channel.name for channel in offered)
-    channels = tuple(channel for channel in first.channels if channel.name in wanted)
+    chosen = experiment.channels or tuple(channel.name for channel in offered)
+    channels = tuple(channel for channel in first.channels if channel.name in chosen)
     if len(channels) < 2:
         raise DataError(f"{len(channels)} channel can be watched; a monitor compares two at least: map more columns")
     return channels
@@ -182,8 +192,8 @@ def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
     pieces = []
     for recording in recordings:
         longest = round(CUT_S * recording.rate_hz)
-        wanted = -(-2 * LEAST_SESSIONS // len(recordings))
-        count = max(-(-recording.samples // longest), wanted)
+        least = -(-2 * LEAST_SESSIONS // len(recordings))
+        count = max(-(-recording.samples // longest), least)
         edges = np.linspace(0, recording.samples, count + 1).astype(int).tolist()
         pieces += [recording.rows(a, b) for a, b in itertools.pairwise(edges) if b > a]
     return pieces
@@ -208,11 +218,11 @@ def _divided(
 ) -> tuple[list[Recording], list[Recording], list[Recording]]:
     """Sessions that train residuals, that choose among fits, and the rest, drawn at random."""
     order = np.random.default_rng(experiment.seed).permutation(len(sessions)).tolist()
-    total, taken = sum(session.samples for session in sessions), 0
+    total, drawn = sum(session.samples for session in sessions), 0
     count = 0
-    for count, place in enumerate(order, start=1):
-        taken += sessions[place].samples
-        if taken >= experiment.train_share * total and count >= 2:
+    for count, index in enumerate(order, start=1):
+        drawn += sessions[index].samples
+        if drawn >= experiment.train_share * total and count >= 2:
             break
     count = min(count, len(sessions) - 4)
     chosen = [sessions[i] for i in order[:count]]

@@ -18,7 +18,7 @@ from edp.storage import write_bytes
 
 COLUMNS = (
     *("recording", "raised_s", "since_s", "severity", "sentence", "detector", "statistic", "limit"),
-    *("kind", "site", "size", "unit", "probability", "place", "evidence"),
+    *("kind", "site", "size", "unit", "probability", "index", "evidence"),
 )
 """Of the CSV file; of the causes the most probable one."""
 

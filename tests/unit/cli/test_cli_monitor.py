@@ -1,0 +1,109 @@
+"""``edp monitor fit`` and ``run``: a folder, an alarm log, exit codes, and what is refused."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.logs import write_recording
+from edp.recording import Recording
+from edp.signals import TABLE_A1, VOCABULARY
+from edp.testing.monitor import rig_sessions
+
+pytestmark = pytest.mark.training
+NAMES = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
+"""Of the rig's channels, so that logs need no map."""
+TICKS = 2000
+
+
+def logs(count, first=0):
+    channels = tuple(VOCABULARY[name] for name in NAMES)
+    return [
+        Recording(session.name, channels, session.values, session.rate_hz)
+        for session in rig_sessions(count, TICKS, seed=4, first=first)
+    ]
+
+
+def write(recordings, folder):
+    folder.mkdir()
+    for recording in recordings:
+        write_recording(recording, folder / f"{recording.name}.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory):
+    return write(logs(18), tmp_path_factory.mktemp("logs") / "healthy")
+
+
+@pytest.fixture(scope="module")
+def fitted(edp, healthy, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("monitors") / "rig"
+    ended = edp(
+        *("monitor", "fit", healthy, "--out", folder, "--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--json")
+    )
+    assert ended.code == 0, ended.err
+    return folder, json.loads(ended.out)
+
+
+def test_fit_says_what_is_watched_and_what_is_promised(fitted):
+    folder, facts = fitted
+    assert (folder / "monitor.json").is_file()
+    assert (folder / "settings.toml").is_file()
+    assert "virtual:CylVels_1" in facts["residuals"]
+    assert "asked for one in 0.06 h" in facts["promise"]
+    assert facts["doubtful"] == []
+
+
+def test_alarms_are_logged_and_end_with_exit_code_5(edp, fitted, tmp_path):
+    folder, _ = fitted
+    faulty = logs(1, first=40)[0]
+    values = faulty.values.copy()
+    values[800:, 3] += np.float32(4e6)
+    where = write([replace(faulty, values=values)], tmp_path / "today")
+    out = tmp_path / "alarms.jsonl"
+    ended = edp("monitor", "run", folder, where, "--out", out)
+    assert ended.code == 5
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert rows
+    assert all(row["recording"] == faulty.name for row in rows)
+    assert any(row["raised_s"] > 8.0 and row["sentence"] for row in rows)
+    with (tmp_path / "alarms.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["raised_s"]) for row in table] == [row["raised_s"] for row in rows]
+    as_json = edp("monitor", "run", folder, where, "--json")
+    assert as_json.code == 5
+    assert len(json.loads(as_json.out)["alarms"]) == len(rows)
+
+
+def test_a_log_that_lacks_a_channel_is_watched_with_the_rest(edp, fitted, tmp_path):
+    folder, _ = fitted
+    part = logs(1, first=41)[0]
+    part = Recording(part.name, part.channels[:4], part.values[:, :4].copy(), part.rate_hz)
+    ended = edp("monitor", "run", folder, write([part], tmp_path / "part"))
+    assert "lacks CylPressures_5" in " ".join(ended.out.split())
+    assert ended.code in (0, 5)
+
+
+def test_too_few_hours_are_one_message_before_anything_is_written(edp, healthy, tmp_path):
+    ended = edp("monitor", "fit", healthy, "--out", tmp_path / "m")
+    assert ended.code == 1
+    assert "supports one in" in " ".join(ended.err.split())
+    assert not (tmp_path / "m").exists() or not any((tmp_path / "m").iterdir())
+
+
+def test_bad_input_is_one_message(edp, fitted, healthy, tmp_path):
+    folder, _ = fitted
+    for arguments in (
+        ("monitor", "run", tmp_path, healthy),
+        ("monitor", "run", folder, tmp_path / "nothing"),
+        ("monitor", "fit", tmp_path / "no_run", healthy, "--out", tmp_path / "m"),
+        ("monitor", "fit", healthy, "--out", tmp_path / "m", "--set", "chain.block=2"),
+    ):
+        ended = edp(*arguments)
+        assert ended.code == 1, arguments
+        assert "Traceback" not in ended.err
+        assert ended.err.strip()
+    assert set(NAMES) - {"CylStroke_1"} <= set(TABLE_A1)
