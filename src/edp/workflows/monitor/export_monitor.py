@@ -25,6 +25,7 @@ from edp.export.monitor import (
     drawn_rows,
     write_monitor,
     write_monitor_fmu,
+    write_monitor_ros2,
 )
 from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import POINT_LIMIT
@@ -42,7 +43,7 @@ from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import plant_bundle
 
-FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries")}
+FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries"), "ros2": ()}
 """Forms of a monitor with their options; they are forms of networks, too."""
 GOLDEN_TICKS = 120
 """Of the self-test of residuals: more than a window, with ticks at which inputs are missing."""
@@ -86,7 +87,7 @@ def export_monitor(
     parts = monitor_parts(load_monitor(monitor))
     if to == "fmu":
         return write_monitor_fmu(parts, name, Path(folder), dict(options or {}))
-    return write_monitor(parts, name, Path(folder))
+    return (write_monitor_ros2 if to == "ros2" else write_monitor)(parts, name, Path(folder))
 
 
 def monitor_footprint_of(monitor: str | Path) -> MonitorFootprint:
