@@ -451,4 +451,4 @@ def test_the_package_of_a_monitor_is_one_that_colcon_builds(watch_package):
     compile((folder / "setup.py").read_text(), "setup.py", "exec")
     for path in watch_package.glob("*.py"):
         compile(path.read_text(), path.name, "exec")
-    assert (folder / "config" / "params.yaml").read_text().count("- \"") == 5
+    assert (folder / "config" / "params.yaml").read_text().count('- "') == 5
