@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.data.roles import Axis, roles_of
 from edp.errors import DataError
 from edp.monitor.adaptation import SlowDrift
 from edp.monitor.calibration import AlarmLimit, calibrated
@@ -293,7 +294,46 @@ def fit_summaries(
         change=change[judged],
         moving=moving,
         level=level,
+        drivers=drivers_of(channels, sessions[0], [names[i] for i in judged]),
     )
+
+
+def drivers_of(channels: Sequence[Channel], session: Recording, judged: Sequence[str]) -> NDArray[np.int64]:
+    """What drives each residual: the velocity and the signed command of the axis that its channel belongs to.
+
+    A channel of no axis has those whose sizes go with it most. Shape (drivers, residuals, 2); a driver that no residual
+    has is left out.
+    """
+    names = [channel.name for channel in channels]
+    axes = roles_of(session).axes
+    own = [
+        next((axis for axis in axes if name in (axis.velocity, axis.stroke, *axis.pressures, *axis.command)), None)
+        or _likely_axis(axes, session, name)
+        for name in judged
+    ]
+    rows = []
+    for choose in (lambda axis: (axis.velocity,), lambda axis: axis.command, lambda axis: axis.conflux):
+        pairs = [tuple(n for n in choose(axis) if n in names) if axis is not None else () for axis in own]
+        if any(pairs):
+            # Without a driver the residual is driven by itself against itself, which is nothing: 0 less 0.
+            rows.append([[names.index(p[0]), names.index(p[1]) if len(p) > 1 else -1] if p else [0, 0] for p in pairs])
+    return np.array(rows, np.int64).reshape(len(rows), len(judged), 2)
+
+
+def _likely_axis(axes: Sequence[Axis], session: Recording, name: str) -> Axis | None:
+    """The axis whose velocity has sizes that go with those of a channel most."""
+    if not axes or name not in session.channel_names:
+        return None
+    sizes = np.abs(session.column(name).astype(np.float64) - float(session.column(name).mean()))
+
+    def likeness(axis: Axis) -> float:
+        if axis.velocity not in session.channel_names or axis.velocity == name:
+            return -1.0
+        other = np.abs(session.column(axis.velocity).astype(np.float64))
+        width = float(sizes.std() * other.std())
+        return float(((sizes - sizes.mean()) * (other - other.mean())).mean()) / width if width > 0.0 else -1.0
+
+    return max(axes, key=likeness)
 
 
 def _robust_width(values: Array) -> Array:
