@@ -36,8 +36,10 @@ from edp.signals import Channel, Kind
 from embedded_step import BOARD, M4, instructions, run
 
 BLOCK, SETTLE = 100, 1
-SIZES = ((6, 30, 25, 20), (12, 30, 25, 40), (24, 30, 25, 60), (24, 12, 8, 120), (40, 40, 12, 60))
-"""Residuals, inputs, numbers of the operating point, directions of each of two watches."""
+FITTED = ((6, 30, 25, 20), (12, 30, 25, 40), (24, 30, 25, 60), (24, 12, 8, 120), (40, 40, 12, 60))
+"""Residuals, inputs, numbers of the operating point, directions of each of two watches: what cycles are fitted to."""
+HELD_OUT = ((9, 24, 16, 45), (18, 30, 24, 90), (30, 30, 10, 40))
+"""Sizes that they are judged by."""
 PROGRAM = """
 #include "watch.h"
 #include <stdio.h>
@@ -86,13 +88,16 @@ def main() -> None:
     quick, seed = arguments.quick, arguments.seed
     with tempfile.TemporaryDirectory() as temporary:
         root = Path(temporary)
-        rows = [measured(size, root / str(i), seed) for i, size in enumerate(SIZES[:2] if quick else SIZES)]
+        sizes = HELD_OUT[:1] if quick else (FITTED if arguments.fit else HELD_OUT)
+        rows = [measured(size, root / str(i), seed) for i, size in enumerate(sizes)]
         beside = beside_predictor(root / "beside", seed)
     each = float(np.mean([row["cycles_each"] for row in rows]))
     for row in rows:
         row["ratio"] = row["estimate"] / (row["mean"] * each)
-    heads = ["residuals", "inputs", "point", "directions", "instructions a tick", "longest tick", "estimate / counted"]
-    table(heads, [[*row["size"], row["mean"], row["most"], row["ratio"]] for row in rows])
+        row["longest_ratio"] = row["longest_estimate"] / (row["most"] * each)
+    heads = ["residuals", "inputs", "point", "directions", "instructions", "longest tick", "estimate", "longest"]
+    names = ("mean", "most", "ratio", "longest_ratio")
+    table(heads, [[*row["size"], *(row[name] for name in names)] for row in rows])
     if arguments.fit:
         print(fitted(rows, each))
     print(f"{each:.3f} cycles an instruction; predictor {beside['alone']:,} instructions a tick, in a monitor of its "
@@ -100,9 +105,11 @@ def main() -> None:
     worst = max(abs(row["ratio"] - 1.0) for row in rows)
     verdicts = [
         verdict("estimated cycles of a chain against counted ones, largest error", worst, 0.15, "<= 1", "share", quick),
+        verdict("the same, longest tick", max(abs(row["longest_ratio"] - 1.0) for row in rows), 0.3, "<= 1", "share",
+                quick),
         verdict("a monitor of look-ahead errors over 1.25 times the predictor alone, mean", beside["mean"],
                 1.25 * beside["alone"], "<= 1", "instructions", quick),
-        verdict("the same, longest tick", beside["most"], 1.25 * beside["alone"], "<= 1", "instructions", quick),
+        verdict("its longest tick", beside["most"], 1.25 * beside["alone"], "<= 1", "instructions", quick),
     ]  # fmt: skip
     finish("monitor_cycles", verdicts, seed, {"chains": rows, "cycles_an_instruction": each, "beside": beside})
 
@@ -116,6 +123,7 @@ def measured(size: tuple[int, int, int, int], folder: Path, seed: int) -> dict[s
     return {
         "size": size, "mean": float(counts.mean()), "most": int(counts.max()), "cycles_each": each,
         "work": chain_work(parts), "estimate": chain_cycles(parts).mean,
+        "longest_estimate": chain_cycles(parts).most,
     }  # fmt: skip
 
 

@@ -266,7 +266,7 @@ def stand_in(parameters):
     for room, kinds in names.items():
         made[room], made[f"{room}.msg"] = ModuleType(room), ModuleType(f"{room}.msg")
         for kind in kinds:
-            setattr(made[f"{room}.msg"], kind, type(kind, (Message,), {"OK": 0, "WARN": 1}))
+            setattr(made[f"{room}.msg"], kind, type(kind, (Message,), {"OK": 0, "WARN": 1, "ERROR": 2, "STALE": 3}))
     return made, sent, logged
 
 
@@ -364,3 +364,91 @@ def test_a_bag_is_replayed_without_ros(package_of, bundle_of, tmp_path):
     (tmp_path / "empty.yaml").write_text("")
     with pytest.raises(ValueError, match="no ros__parameters"):
         replay.sources_of(tmp_path / "empty.yaml")
+
+
+@pytest.fixture(scope="session")
+def watch_package(c, rig_monitor, tmp_path_factory):
+    """The exported and compiled package of a monitor: the folder of its modules."""
+    from edp.export.monitor import write_monitor_ros2
+    from edp.workflows.monitor.export_monitor import monitor_parts
+
+    c.need("gcc")
+    folder = tmp_path_factory.mktemp("watch")
+    write_monitor_ros2(monitor_parts(rig_monitor, golden=False), "watch", folder)
+    core.build("gcc", folder / "watch_ros")
+    return folder / "watch_ros"
+
+
+@pytest.fixture
+def watching(watch_package, monkeypatch):
+    """The node of a monitor against the stand-in, and what it published."""
+    sources = [f"{name}=position:{name}" for name in ("command", "velocity", "stroke")]
+    sources += [f"{name}=pressure:{name}" for name in ("pressure_a", "pressure_b")]
+    modules, sent, logged = stand_in({"sources": sources})
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "edp.export.ros2.package.watch_node", raising=False)
+    node = importlib.import_module("edp.export.ros2.package.watch_node")
+    watch = importlib.import_module("edp.export.ros2.package.watch")
+    monkeypatch.setattr(node, "MonitorCore", lambda: watch.MonitorCore(watch_package))
+    return node.MonitorNode(), sent, logged
+
+
+def tell(node, rows, first=0):
+    names = node.ticks.core.inputs
+    for at, row in enumerate(rows, first):
+        values = dict(zip(names, row.tolist()))
+        for name in ("pressure_a", "pressure_b"):
+            header = SimpleNamespace(stamp=SimpleNamespace(sec=at // 100, nanosec=at % 100 * 10**7), frame_id=name)
+            node.heard["pressures"](Message(header=header, fluid_pressure=values[name]))
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=at // 100, nanosec=at % 100 * 10**7), frame_id="")
+        joints = ["command", "velocity", "stroke"]
+        node.heard["joint_states"](Message(header=header, name=joints, position=[values[name] for name in joints]))
+
+
+def test_the_node_of_a_monitor_tells_its_alarms_as_diagnostics(watching, rig_fault):
+    node, sent, logged = watching
+    tell(node, rig_fault[:900])
+    assert sent == []
+    node.timers[0]()
+    status = sent[-1][1].status[0]
+    assert (status.level, status.message, status.name) == (0, "healthy", "monitor")
+    assert sent[-2][1].data is False
+    assert {value.key for value in status.values} >= {"alarms", "statistic_0", "silent", "rejected", "monitor_hash"}
+    # Nothing came since: the verdict is no longer one of now.
+    node.timers[0]()
+    assert sent[-1][1].status[0].level == 3
+    sent.clear()
+    tell(node, rig_fault[900:1300], 900)
+    # At once, without the timer.
+    status = next(message.status[0] for topic, message in sent if topic == "/diagnostics")
+    assert logged == ["alarm"] * len(logged)
+    assert status.level == 2
+    assert "deviates most" in status.message
+    evidence = {value.key: float(value.value) for value in status.values if value.key.startswith("evidence.")}
+    assert any("pressure_a" in name for name in evidence)
+    assert sent[0][1].data is True
+    assert sent[0][0] == "~/alarm"
+
+
+def test_the_node_of_a_monitor_names_an_input_that_is_missing(watching, rig_fault):
+    node, sent, _ = watching
+    rows = rig_fault[:300].copy()
+    rows[-1, node.ticks.core.inputs.index("stroke")] = np.nan
+    tell(node, rows)
+    node.timers[0]()
+    status = sent[-1][1].status[0]
+    assert (status.level, "stroke" in status.message) == (1, True)
+    values = {value.key: value.value for value in status.values}
+    assert float(values["silent"]) > 0
+    assert values["rejected"] == "1"
+
+
+def test_the_package_of_a_monitor_is_one_that_colcon_builds(watch_package):
+    folder = watch_package.parent
+    assert "monitor = " in (folder / "setup.py").read_text()
+    assert 'executable="monitor"' in (folder / "launch" / "monitor.launch.py").read_text()
+    compile((folder / "setup.py").read_text(), "setup.py", "exec")
+    for path in watch_package.glob("*.py"):
+        compile(path.read_text(), path.name, "exec")
+    assert (folder / "config" / "params.yaml").read_text().count('- "') == 5

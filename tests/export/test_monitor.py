@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from edp.data.features import FeatureSet
 from edp.data.scaling import fit_scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import BundleError, ConfigError, ExportError
+from edp.evaluation.controller import STACK_BYTES, Budget
+from edp.evaluation.monitor_footprint import monitor_footprint
 from edp.export.monitor import monitor_files, write_monitor
 from edp.export.monitor.golden import drawn_rows
 from edp.monitor.detectors import EDetectorSpec
@@ -321,3 +324,37 @@ def test_look_ahead_networks_and_twins_with_free_ports(c, ahead_monitor, tmp_pat
     assert np.isnan(expected[0]).any()
     scale = np.nanstd(expected, axis=0)
     assert (np.nan_to_num(np.abs(residuals - expected)) < 1e-3 * scale).all()
+
+
+def test_the_footprint_is_that_of_the_code(c, folder, rig_monitor, tmp_path):
+    c.need("gcc")
+    counts = monitor_footprint(monitor_parts(rig_monitor, golden=False))
+    (tmp_path / "size.c").write_text(
+        '#include "watch.h"\n#include <stdio.h>\n'
+        'int main(void) { (void)printf("%zu", sizeof(watch_state)); return 0; }\n'
+    )
+    c.run("gcc", "-std=c99", "-I", folder, tmp_path / "size.c", "-o", tmp_path / "size")
+    assert counts.ram_bytes - STACK_BYTES == pytest.approx(int(c.run(tmp_path / "size")), rel=0.1)
+    c.need("arm-none-eabi-gcc")
+    objects = [tmp_path / f"{source}.o" for source in ("watch.c", *(f"watch_n{i}.c" for i in range(4)))]
+    for path in objects:
+        c.run("arm-none-eabi-gcc", *c.flags, "-O2", *M4, "-c", folder / path.name[:-2], "-o", path)
+    told = c.run("arm-none-eabi-size", "-A", *objects).decode()
+    constants = sum(int(size) for size in re.findall(r"^\.rodata\S*\s+(\d+)", told, re.MULTILINE))
+    assert counts.constants == pytest.approx(constants, rel=0.05)
+    facts = counts.to_json(Budget())
+    assert [row["fits"] for row in facts["verdict"]] == [True] * 4
+    low, typical, high = counts.cycles["cortex_m4f"]
+    assert low < typical < high
+    assert high > 1.4 * counts.chain.most > 1.4 * counts.chain.mean
+
+
+def test_the_whole_self_test_passes_on_a_core_without_double_precision(c, folder, tmp_path):
+    c.need("arm-none-eabi-gcc", "qemu-system-arm")
+    board = Path(__file__).parent / "board"
+    flags = ["-std=gnu99", "-O2", "-ffp-contract=off", *M4, "--specs=rdimon.specs", "-nostartfiles", "-I."]
+    built = [*sources(folder), "host_test.c", board / "startup.c", "-lm", "-lrdimon", "-o", tmp_path / "image.elf"]
+    c.run("arm-none-eabi-gcc", *flags, "-DCLOCK_HZ=25000000u", "-T", board / "mps2.ld", *built, folder=folder)
+    emulator = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting-config", "enable=on,target=native"]
+    told = c.run(*emulator, "-kernel", "image.elf", folder=tmp_path).decode()
+    assert "watch: all tests passed" in told

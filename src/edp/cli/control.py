@@ -25,6 +25,10 @@ TwinOption = Annotated[Path | None, typer.Option("--twin", help="Run folder of a
 PredictorOption = Annotated[
     Path | None, typer.Option("--predictor", help="Run folder of edp train that the controller uses.")
 ]
+MonitorOption = Annotated[
+    Path | None,
+    typer.Option("--monitor", help="Folder of a monitor: its alarms take channels away and ask for the fallback."),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings (TOML).")]
 ChangesOption = Annotated[list[str], typer.Option("--set", help="One setting, for example task.slope_deg=45.")]
 
@@ -38,6 +42,7 @@ def control(
     plant: PlantOption = None,
     twin: TwinOption = None,
     predictor: PredictorOption = None,
+    monitor: MonitorOption = None,
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
     yes: YesOption = False,
@@ -54,14 +59,22 @@ def control(
     from edp.workflows.control import ControlSources, control_loops
 
     ask_for_fmus(yes, plant)
+    guard = None
+    if monitor is not None:
+        from edp.workflows.monitor.loop_guard import monitor_guard
+
+        guard = monitor_guard(monitor)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
     with progress(as_json) as shown:
         on_loop = counted(shown, Steps(as_json), "control", "loops run")
-        run = control_loops(experiment, folder, ControlSources(plant, twin, predictor, trusted=True), on_loop)
+        run = control_loops(experiment, folder, ControlSources(plant, twin, predictor, trusted=True), on_loop, guard)
 
     def show() -> None:
         out.print(run.content["sentence"])
         score_table(run.content)
+        for loop in run.content["loops"]:
+            for warning in loop["warnings"]:
+                out.print(f"{loop['name']}: monitor from tick {warning['tick']}: {warning['text']}")
         out.print(f"page: {run.page.resolve()}")
 
     emit(as_json, {"run": str(folder), "page": str(run.page), **run.content}, show)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
 
+if TYPE_CHECKING:
+    from edp.evaluation.controller import Budget
+
 
 def footprint(
-    file: Annotated[Path, typer.Argument(help="Settings file (.toml), bundle, or run folder.")],
+    file: Annotated[Path, typer.Argument(help="Settings file (.toml), bundle, run folder, or monitor.")],
     budget: Annotated[
         Path | None,
         typer.Option("--budget", help="Limits of another controller (TOML); by default those of the thesis."),
@@ -24,8 +28,12 @@ def footprint(
     """
     from edp.evaluation.controller import CORES, Budget, load_budget
     from edp.workflows.deployment import footprint_of
+    from edp.workflows.monitor.export_monitor import holds_monitor
 
     limits_of = Budget() if budget is None else load_budget(budget)
+    if holds_monitor(file):
+        _of_monitor(file, limits_of, as_json)
+        return
     counts, name = footprint_of(file, None if budget is None else limits_of)
     facts = {"name": name, **counts.to_json(limits_of)}
 
@@ -42,13 +50,44 @@ def footprint(
             for entry in counts.estimates
         ]
         table("Cycles per tick, estimates", ["core", "numbers", "low", "typical", "high"], estimates)
-        limits = [
-            (v["what"], v["value"], v["limit"], v["unit"], "fits" if v["fits"] else "too large", v["note"])
-            for v in facts["verdict"]
-        ]
         out.print()
-        table(f"Budget: {facts['budget']['name']}", ["", "value", "limit", "unit", "verdict", "meaning"], limits)
+        _budget_table(facts)
         for number_format, why in counts.refused.items():
             out.print(f"not in {number_format}: {why}")
 
     emit(as_json, facts, show)
+
+
+def _of_monitor(file: Path, limits: Budget, as_json: bool) -> None:
+    """Networks of a monitor, the chain behind them, and both against a budget."""
+    from edp.evaluation.controller import CORES
+    from edp.workflows.monitor.export_monitor import monitor_footprint_of
+
+    counts = monitor_footprint_of(file)
+    facts = {"name": file.name, **counts.to_json(limits)}
+
+    def show() -> None:
+        networks = facts["networks"]
+        rows = [(i, n["number_format"], n["parameters"], n["runs"], n["macs_tick"]) for i, n in enumerate(networks)]
+        table(file.name, ["network", "numbers", "parameters", "runs per tick", "MACs per tick"], rows)
+        chain = counts.chain
+        out.print(
+            f"behind the residuals, in double precision: {chain.mean:,.0f} cycles a tick of a Cortex-M4F on average, "
+            f"{chain.most:,.0f} in the longest; state {counts.state_bytes:,} bytes"
+        )
+        out.print()
+        cycles = [(core.label, *counts.cycles[key]) for key, core in CORES.items()]
+        table("Cycles per tick, estimates", ["core", "low", "typical", "high"], cycles)
+        out.print()
+        _budget_table(facts)
+
+    emit(as_json, facts, show)
+
+
+def _budget_table(facts: Mapping[str, Any]) -> None:
+    """What is held against a controller's limits."""
+    limits = [
+        (v["what"], v["value"], v["limit"], v["unit"], "fits" if v["fits"] else "too large", v["note"])
+        for v in facts["verdict"]
+    ]
+    table(f"Budget: {facts['budget']['name']}", ["", "value", "limit", "unit", "verdict", "meaning"], limits)

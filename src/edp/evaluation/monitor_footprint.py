@@ -8,16 +8,17 @@ from typing import Any
 
 from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate
 from edp.evaluation.footprint import Footprint, footprint
-from edp.export.monitor import MonitorParts, NetworkPart, TwinPart, monitor_files
+from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePart, TwinPart, monitor_files
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
-CORE_COSTS = {"residual": 900.0, "input": 400.0, "product": 130.0, "summary": 2_000.0, "tick": 300.0}
+CORE_COSTS = {"residual": 1_600.0, "input": 145.0, "product": 185.0, "summary": 1_500.0, "tick": 730.0}
 """Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library: of a
 residual and of an input at a tick, of a product with its sum, of a summary of a residual at the end of a block, and of
 a tick besides. Fitted to counted code of chains of several sizes (``benchmarks/monitor_cycles.py --fit``)."""
-CENTRE, CUSUM, EWMA, GLR, VERDICT = 0.5, 2.0, 2.5, 2.0, 0.6
-"""Products that take as long as a summary centred for a watch, a direction in a detector, a summary in a verdict."""
+CENTRE, CUSUM, EWMA, GLR, VERDICT, POINT = 0.5, 2.0, 2.5, 2.0, 0.6, 4.0
+"""Products that take as long as a summary centred for a watch, a direction in a detector, a summary in a verdict, and
+a number of the operating point."""
 CHAIN_PROGRAM_BYTES = 9_000
 """Code of the chain, its runtime and the double precision of the compiler's library on a Cortex-M4F."""
 
@@ -52,17 +53,26 @@ def _watch_products(detector: str, shape: Sequence[int], option: float) -> float
 
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
     """Cycles of the chain of a monitor."""
-    work, files = chain_work(parts), monitor_files(parts, "monitor")
-    mean = sum(CORE_COSTS[name] * amount for name, amount in work.items())
+    work, block = chain_work(parts), parts.chain.block
     every = sum(CORE_COSTS[name] * work[name] for name in ("residual", "input", "tick"))
-    chain = parts.chain
-    parts_of_block = [max(2 * parts.points * CORE_COSTS["product"], 5 * CORE_COSTS["summary"])]
-    parts_of_block += [VERDICT * parts.summaries * CORE_COSTS["product"]]
-    for watch in chain.watches:
-        summaries, directions = watch.matrix.shape
-        each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR}[watch.detector] * directions
-        parts_of_block.append(CORE_COSTS["product"] * max(summaries, each))
-    return ChainCycles(mean, every + -(-files.slices // chain.block) * max(parts_of_block))
+    costs = _slices(parts)
+    together = -(-len(costs) // block)
+    most = max(sum(costs[first : first + together]) for first in range(0, len(costs), together))
+    return ChainCycles(sum(CORE_COSTS[name] * amount for name, amount in work.items()), every + most)
+
+
+def _slices(parts: MonitorParts) -> list[float]:
+    """Cycles of each part of the work on a block, in its order."""
+    product, summaries = CORE_COSTS["product"], parts.summaries
+    costs = [POINT * product * parts.points]
+    costs += len(parts.residuals) * [5 * CORE_COSTS["summary"], *(5 * [2.0 * product * (parts.points + 1)])]
+    for watch in parts.chain.watches:
+        directions = int(watch.matrix.shape[1])
+        each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR}[watch.detector]
+        steps = int(watch.option) if watch.detector == "glr" else 1
+        costs += [CENTRE * product * summaries, *(directions * [product * summaries])]
+        costs += steps * [each * product * directions]
+    return [*costs, VERDICT * product * summaries]
 
 
 @dataclass(frozen=True)
@@ -157,10 +167,28 @@ def _network(part: NetworkPart | TwinPart) -> tuple[Footprint, str, int]:
 
 
 def state_bytes(parts: MonitorParts) -> int:
-    """Of the chain: sums of two blocks, summaries, drift, evidence, detectors, in double precision."""
+    """Of the chain: sums of two blocks, summaries, drift, evidence, detectors, in double precision; and of the sources
+    what stands beside their networks: values that are held, predictions that wait, sums.
+    """
     chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
     sums = 8 * residuals + len(chain.level) + len(chain.moving)
-    detectors = sum(w.matrix.shape[1] * (int(w.option) if w.detector == "glr" else 1) for w in chain.watches)
-    widest = max(w.matrix.shape[1] for w in chain.watches)
-    doubles = 2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 4 * len(chain.watches)
-    return int(8 * doubles + 4 * summaries + 5 * inputs + 4 * residuals + 64)
+    detectors = sum(int(w.matrix.shape[1]) * (int(w.option) if w.detector == "glr" else 1) for w in chain.watches)
+    widest = max(int(w.matrix.shape[1]) for w in chain.watches)
+    doubles = 2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 3 * len(chain.watches) + 5
+    own = 8 * doubles + 4 * summaries + 5 * inputs + 4 * residuals + 4 * len(chain.watches) + 80
+    return int(own + sum(map(_source_bytes, parts.sources)))
+
+
+def _source_bytes(part: SourcePart) -> int:
+    held = 4 * len(part.reads)
+    if isinstance(part, BalancePart):
+        return held + 17 * len(part.levels) + 7
+    task = part.bundle.task
+    # Counters and the last inputs, which the state of every network has beside what its layers remember.
+    network = 4 * (8 + len(part.bundle.inputs))
+    if isinstance(part, TwinPart):
+        return held + len(part.groups) * network + 4 * sum(map(len, part.groups)) + 4
+    coverages = len(part.bundle.predictor.output.coverages)
+    out = len(task.targets) * len(task.horizons) * (1 + 2 * coverages)
+    rings = 0 if max(part.delays) == 0 else (max(part.delays) + 1) * len(part.judged) * (2 if part.scaled else 1)
+    return held + network + 4 * (out + rings)

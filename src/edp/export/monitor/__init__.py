@@ -13,6 +13,7 @@ from edp.export.monitor.parts import (
     TwinPart,
     WatchPart,
 )
+from edp.export.monitor.ros2 import write_monitor_ros2
 from edp.export.monitor.write import DETECTORS, monitor_files, write_monitor
 
 __all__ = [
@@ -30,4 +31,5 @@ __all__ = [
     "monitor_files",
     "write_monitor",
     "write_monitor_fmu",
+    "write_monitor_ros2",
 ]

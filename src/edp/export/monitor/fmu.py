@@ -9,7 +9,7 @@ from edp.export.description import as_json
 from edp.export.escape import visible
 from edp.export.fmu.assemble import check_choice, fmu_files, model_header, token_of
 from edp.export.fmu.describe import About
-from edp.export.fmu.interface import OWN, Variable, unique
+from edp.export.fmu.interface import Variable, unique
 from edp.export.folder import write_export
 from edp.export.monitor.describe import description
 from edp.export.monitor.parts import MonitorParts
@@ -21,6 +21,11 @@ OUTPUTS = (
     ("alarms", "alarms since the reset"),
     ("since_s", "seconds before the end of the block of the last alarm at which the deviation began"),
     ("silent", "residuals without a value at this tick"),
+)
+COUNTS = (
+    ("rejected", "ticks with an input that was missing since the reset"),
+    ("held", "missed ticks since the reset"),
+    ("restarts", "times the networks forgot the past since the reset"),
 )
 
 
@@ -37,7 +42,8 @@ def monitor_variables(parts: MonitorParts) -> list[Variable]:
         for i, watch in enumerate(parts.chain.watches)
     ]
     own = [Variable("status", "output", STATUS, "whole")]
-    own += [Variable("valid", "output", "true if this tick is judged and no input is missing", "flag"), *OWN[2:]]
+    own.append(Variable("valid", "output", "true if this tick is judged and no input is missing", "flag"))
+    own += [Variable(name, "local", text, "whole") for name, text in COUNTS]
     return unique([*inputs, *outputs, *statistics, *own])
 
 

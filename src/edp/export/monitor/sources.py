@@ -79,14 +79,18 @@ static void {own}_residuals({name}_state *s) {{
 }}
 """
 BALANCE = """
-/* Levels less the integrals of their rates; what is older fades. */
+/* Levels less the integrals of their rates; what is older fades, and what happened while a value was missing is not
+   known. */
 static void {own}_residuals({name}_state *s) {{
 {hold}    for (uint32_t i = 0; i < {residuals}u; i++) {{
         const double level = (double)s->{own}_in[{own}_levels[i]];
         const double step = (double)s->{own}_in[{own}_rates[i]] * {own}_steps[i];
-        const double change = s->{own}_began ? ((level - s->{own}_level[i]) - step) : 0.0;
+        const bool now = s->there[{own}_reads[{own}_levels[i]]];
+        const bool whole = s->{own}_began && now && s->{own}_known[i] && s->there[{own}_reads[{own}_rates[i]]];
+        const double change = whole ? ((level - s->{own}_level[i]) - step) : 0.0;
         s->{own}_sum[i] = ({own}_left[i] * s->{own}_sum[i]) + change;
         s->{own}_level[i] = level;
+        s->{own}_known[i] = now;
         s->residuals[{first}u + i] = (float)s->{own}_sum[i];
     }}
     s->{own}_began = true;
@@ -200,7 +204,8 @@ class BalanceCode:
     def fields(self) -> list[str]:
         """See `SourceCode`."""
         sums = [f"double {self.own}_{what}[{self.residuals}];" for what in ("level", "sum")]
-        return [f"float {self.own}_in[{len(self.part.reads)}];", *sums, f"bool {self.own}_began;"]
+        known = f"bool {self.own}_known[{self.residuals}];"
+        return [f"float {self.own}_in[{len(self.part.reads)}];", *sums, f"bool {self.own}_began;", known]
 
     def constants(self, tables: MonitorTables) -> None:
         """See `SourceCode`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -76,12 +76,17 @@ def _content(described: Description) -> dict[str, Any]:
     about = described.content()
     for side in ("inputs", "targets"):
         channel_names = [entry["name"] for entry in about[side]]
-        names = shown_names(_plain(name) for name in channel_names)
+        names = message_names(channel_names)
         about[side] = [
             entry | {"name": name} | ({} if name == old else {"original": old})
             for entry, name, old in zip(about[side], names, channel_names, strict=True)
         ]
     return about
+
+
+def message_names(names: Iterable[str]) -> list[str]:
+    """Names that fit into parameters and messages; see `_content`."""
+    return shown_names(_plain(name) for name in names)
 
 
 def _plain(name: str) -> str:
@@ -95,12 +100,13 @@ def _blanks(model: Model, package: str, about: Mapping[str, Any]) -> dict[str, o
     # Behind the measured values of a plant are their flags.
     read = len(inputs) if not model.graph.fed_back else model.bundle.predictor.required + len(task.targets)
     sources = [
-        f"      - {yaml_scalar(f'{name}={_source(name, channel.kind) if at < read else FREE}')}"
+        f"      - {yaml_scalar(f'{name}={source_guess(name, channel.kind) if at < read else FREE}')}"
         for at, (name, channel) in enumerate(zip(inputs, model.bundle.inputs, strict=True))
     ]
     return {
         "name": model.name,
         "package": package,
+        "node": "predictor",
         "version": __version__,
         "model_hash": model_hash(model.graph),
         "rate": float(task.rate_hz),
@@ -110,7 +116,7 @@ def _blanks(model: Model, package: str, about: Mapping[str, Any]) -> dict[str, o
     }
 
 
-def _source(name: str, kind: Kind) -> str:
+def source_guess(name: str, kind: Kind) -> str:
     """A guess that the parameter file offers."""
     # Pressures have no field in a message of joints.
     if kind in PRESSURES:

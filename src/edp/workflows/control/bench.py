@@ -11,6 +11,7 @@ import numpy as np
 
 from edp.config.control import ControlExperiment
 from edp.control.controllers import ControllerSpec
+from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult, run_loop, start_options
 from edp.control.models import ControlModels
 from edp.control.plant import interface_of
@@ -86,16 +87,20 @@ class ControlBench:
         return ControlModels(valve_map, twin, predictor)
 
     def results(
-        self, spec: ControllerSpec | None = None, on_loop: Callable[[str, int, int], None] | None = None
+        self,
+        spec: ControllerSpec | None = None,
+        on_loop: Callable[[str, int, int], None] | None = None,
+        guard: LoopGuard | None = None,
     ) -> list[LoopResult]:
         """Every loop with a controller; that of the experiment by default.
 
         Args:
             spec: of the controller.
             on_loop: called with the name of the loop that begins, how many are done, and their number.
+            guard: of every loop; begins anew with each.
 
         Raises:
-            ConfigError: plant and controller do not fit.
+            ConfigError: plant and controller, or plant and guard, do not fit.
         """
         chosen = spec or self.experiment.controller
         results = []
@@ -103,7 +108,7 @@ class ControlBench:
             if on_loop is not None:
                 on_loop(f"{task.name} {task.seed}", number, len(self.tasks))
             controller = chosen.build(self.plant, task.limits, self.models)
-            results.append(run_loop(self._env, controller, task, task.seed, self._options))
+            results.append(run_loop(self._env, controller, task, task.seed, self._options, guard))
         return results
 
     def check(self) -> None:

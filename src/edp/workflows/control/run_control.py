@@ -12,7 +12,9 @@ import numpy as np
 
 from edp import __version__
 from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
+from edp.control.base import ControlEvent
 from edp.control.controllers import CONTROLLERS
+from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult
 from edp.control.tasks import TASKS, ControlTask
 from edp.logs import write_recording
@@ -46,6 +48,7 @@ def control_loops(
     out: str | Path,
     sources: ControlSources | None = None,
     on_loop: Callable[[str, int, int], None] | None = None,
+    guard: LoopGuard | None = None,
 ) -> ControlRun:
     """Run loops and write a run folder: ``results.json``, ``loops/NAME.parquet``, ``control.html``, ``controller``.
 
@@ -54,19 +57,23 @@ def control_loops(
         out: run folder; loops of the same settings are run again.
         sources: models and plant.
         on_loop: called with the name of the loop that begins, how many are done, and their number.
+        guard: what the controller may rely on, such as a monitor.
 
     Raises:
-        EdpError: settings, models or folder cannot be used.
+        EdpError: settings, models, guard or folder cannot be used.
     """
     chosen = sources or ControlSources()
     check_free(out, "edp control")
     # Before the folder is claimed: a reference or plant that is refused must not keep the corrected command out.
     bench = ControlBench(experiment, chosen)
     bench.check()
+    if guard is not None:
+        guard.reset(bench.plant)
+    key = repr(chosen) if guard is None else f"{chosen!r} {guard!r}"
     with RunFolder(out) as run:
-        run.claim(run_key(CONTROL_SETTINGS.plain(experiment), repr(chosen)), control_toml(experiment))
+        run.claim(run_key(CONTROL_SETTINGS.plain(experiment), key), control_toml(experiment))
         run.write_status("running")
-        results = bench.results(on_loop=on_loop)
+        results = bench.results(on_loop=on_loop, guard=guard)
         folder = make_folder(run.file(LOOPS))
         for result in results:
             write_recording(result.recording, folder / f"{result.recording.name}.parquet")
@@ -135,8 +142,13 @@ def _loop(task: ControlTask, result: LoopResult) -> dict[str, Any]:
             "p99": float(np.percentile(times, 99.0)),
             "max": float(times.max()),
         },
-        "events": [{"tick": event.tick, "ticks": event.ticks, "text": event.text} for event in result.events],
+        "events": _plain(result.events),
+        "warnings": _plain(result.warnings),
     }
+
+
+def _plain(events: Sequence[ControlEvent]) -> list[dict[str, Any]]:
+    return [{"tick": event.tick, "ticks": event.ticks, "text": event.text} for event in events]
 
 
 def _mean(values: Sequence[float]) -> float:

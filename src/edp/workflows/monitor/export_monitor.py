@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, ExportError, closest
+from edp.evaluation.monitor_footprint import MonitorFootprint, monitor_footprint
 from edp.export.golden import at_thresholds, grown_tolerance, stream, tolerance
 from edp.export.monitor import (
     DETECTORS,
@@ -24,8 +25,9 @@ from edp.export.monitor import (
     drawn_rows,
     write_monitor,
     write_monitor_fmu,
+    write_monitor_ros2,
 )
-from edp.monitor.chain import Chain
+from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import POINT_LIMIT
 from edp.monitor.detectors import DETECTORS as REGISTERED
 from edp.monitor.monitor import IMPOSSIBLE, Monitor
@@ -41,13 +43,15 @@ from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import plant_bundle
 
-FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries")}
+FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries"), "ros2": ()}
 """Forms of a monitor with their options; they are forms of networks, too."""
 GOLDEN_TICKS = 120
 """Of the self-test of residuals: more than a window, with ticks at which inputs are missing."""
 ROUNDING = 2.0**-22
 """Share of a measured value by which its difference to a prediction may round."""
 Rows = NDArray[np.float32]
+NO_CHAIN = GoldenChain(np.zeros((0, 0)), (), (), np.zeros(0))
+NO_RESIDUALS = GoldenResiduals(*(np.zeros((0, 0), np.float32),) * 2, np.zeros(0, np.float32))
 
 
 def holds_monitor(path: str | Path) -> bool:
@@ -83,11 +87,24 @@ def export_monitor(
     parts = monitor_parts(load_monitor(monitor))
     if to == "fmu":
         return write_monitor_fmu(parts, name, Path(folder), dict(options or {}))
-    return write_monitor(parts, name, Path(folder))
+    return (write_monitor_ros2 if to == "ros2" else write_monitor)(parts, name, Path(folder))
 
 
-def monitor_parts(monitor: Monitor) -> MonitorParts:
+def monitor_footprint_of(monitor: str | Path) -> MonitorFootprint:
+    """What a fitted monitor takes on a controller.
+
+    Raises:
+        EdpError: not a monitor, or a part without a form in C.
+    """
+    return monitor_footprint(monitor_parts(load_monitor(monitor), golden=False))
+
+
+def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
     """The numbers of a monitor, and what its self-test expects.
+
+    Args:
+        monitor: fitted.
+        golden: whether there will be a self-test; else nothing is run.
 
     Raises:
         ExportError: a source or a detector without a form in C.
@@ -105,8 +122,8 @@ def monitor_parts(monitor: Monitor) -> MonitorParts:
         reads=[tuple(place[n] for n in reads) for source in monitor.sources for reads in source.reads],
         sources=sources,
         chain=chain,
-        golden_chain=golden_chain(monitor.chain, chain),
-        golden_residuals=golden_residuals(monitor),
+        golden_chain=golden_chain(monitor.chain, chain) if golden else NO_CHAIN,
+        golden_residuals=golden_residuals(monitor) if golden else NO_RESIDUALS,
     )
     return parts
 
@@ -204,7 +221,7 @@ def _balances(source: Balances, place: Mapping[str, int]) -> BalancePart:
 # ---- chain -----------------------------------------------------------------------------------------------------------
 
 
-def chain_part(chain: Chain) -> ChainPart:
+def chain_part(chain: MonitorChain) -> ChainPart:
     """A chain as numbers.
 
     Raises:
@@ -250,7 +267,7 @@ def _watch(watch: Watch) -> WatchPart:
 # ---- self-test -------------------------------------------------------------------------------------------------------
 
 
-def golden_chain(chain: Chain, part: ChainPart) -> GoldenChain:
+def golden_chain(chain: MonitorChain, part: ChainPart) -> GoldenChain:
     """What the chain makes of drawn rows."""
     inputs, residuals = drawn_rows(part)
     verdicts, _ = chain.run(residuals, inputs, chain.initial_state())
