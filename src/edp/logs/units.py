@@ -5,7 +5,7 @@ from __future__ import annotations
 from edp.errors import ConfigError, DataError
 from edp.signals import UNITS, Kind, Unit, conversion
 
-_ALIASES = {
+ALIASES = {
     "m/s²": "m/s^2",
     "m/s2": "m/s^2",
     "m/s/s": "m/s^2",
@@ -33,7 +33,13 @@ _ALIASES = {
     "µs": "us",
     "sec": "s",
     "seconds": "s",
+    "U/min": "rpm",
+    "1/min": "rpm",
+    "min-1": "rpm",
+    "Grad": "deg",
+    "grad": "deg",
 }
+"""Spellings in files, each with the usual name."""
 
 
 def normalise_unit(text: str | None) -> str | None:
@@ -41,7 +47,7 @@ def normalise_unit(text: str | None) -> str | None:
     unit = (text or "").strip()
     if not unit:
         return None
-    return _ALIASES.get(unit, unit)
+    return ALIASES.get(unit, unit)
 
 
 def kind_of_unit(stated: str | None) -> Kind:
