@@ -150,8 +150,8 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
 
 def _machine(recordings: Sequence[Recording]) -> dict[str, Any]:
     """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
-    said = {tuple(recording.meta[STROKES]) for recording in recordings if STROKES in recording.meta}
-    return {STROKES: list(said.pop())} if len(said) == 1 else {}
+    machines = {tuple(recording.meta[STROKES]) for recording in recordings if STROKES in recording.meta}
+    return {STROKES: list(machines.pop())} if len(machines) == 1 else {}
 
 
 __all__ = ["FOLDER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]
