@@ -65,12 +65,12 @@ def twin_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -> 
     theirs, ours = bundle.provenance.get(STROKES), np.array(machine.cylinders.stroke)
     # Logs of real machines do not say it.
     if isinstance(theirs, list) and all(isinstance(m, int | float) for m in theirs):
-        known = np.array(theirs, float)
-        if known.shape != ours.shape or not np.allclose(known, ours, rtol=SAME_STROKE):
-            said = [", ".join(f"{m:.3f}" for m in strokes) for strokes in (known, ours)]
+        strokes = np.array(theirs, float)
+        if strokes.shape != ours.shape or not np.allclose(strokes, ours, rtol=SAME_STROKE):
+            texts = [", ".join(f"{m:.3f}" for m in row) for row in (strokes, ours)]
             raise ConfigError(
-                f"twin '{run}' learned from a machine whose cylinders have strokes of {said[0]} m, those of "
-                f"{machine.name} have {said[1]} m; name its machine with --machine, or let it go on with "
+                f"twin '{run}' learned from a machine whose cylinders have strokes of {texts[0]} m, those of "
+                f"{machine.name} have {texts[1]} m; name its machine with --machine, or let it go on with "
                 "recordings of this one: edp twin LOGS --start RUN"
             )
     return bundle.twin if rate_hz is None else of_rate(bundle.twin, f"twin '{run}'", rate_hz)

@@ -76,12 +76,12 @@ def check_levers(valves: ValveMap, reference: TipReference, limits: LoopLimits) 
     for axis, cylinder in enumerate(CYLINDERS):
         for side, (name, ends) in enumerate((("lever_high", limits.lever_high), ("lever_low", limits.lever_low))):
             asked = float((SIDES[side] * speeds[:, axis]).max())
-            given = abs(valves.speed(axis, ends[axis]))
+            fastest = abs(valves.speed(axis, ends[axis]))
             # At full levers the reference was held to the cylinder's top speed when it was drawn.
-            if abs(ends[axis]) < 1.0 and asked > max(MOVES_M_S, given / NEARLY):
+            if abs(ends[axis]) < 1.0 and asked > max(MOVES_M_S, fastest / NEARLY):
                 raise ConfigError(
-                    f"limits: {name} = {ends[axis]:g} of the {cylinder} gives {given:.3f} m/s, its reference asks for "
-                    f"{asked:.3f}; allow more, or choose a slower task (task.speed_m_s)"
+                    f"limits: {name} = {ends[axis]:g} of the {cylinder} gives {fastest:.3f} m/s, its reference asks "
+                    f"for {asked:.3f}; allow more, or choose a slower task (task.speed_m_s)"
                 )
 
 

@@ -164,8 +164,15 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
 
 def _full_strokes(recordings: Sequence[Recording]) -> dict[str, Any]:
     """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
-    said = {tuple(recording.meta[STROKES]) for recording in recordings if STROKES in recording.meta}
-    return {STROKES: list(said.pop())} if len(said) == 1 else {}
+    stated = [recording.meta[STROKES] for recording in recordings if STROKES in recording.meta]
+    # A log may say anything; what is no list of numbers says nothing.
+    if not stated or not all(_numbers(each) and each == stated[0] for each in stated):
+        return {}
+    return {STROKES: stated[0]}
+
+
+def _numbers(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(each, int | float) for each in value)
 
 
 __all__ = ["FOLDER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]
