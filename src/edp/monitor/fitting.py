@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.data.roles import Axis, roles_of
 from edp.errors import DataError
 from edp.monitor.adaptation import SlowDrift
 from edp.monitor.calibration import AlarmLimit, calibrated
@@ -86,6 +87,15 @@ class ChainSpec:
 
 
 @dataclass(frozen=True, eq=False)
+class SessionBlocks:
+    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
+
+    name: str
+    summaries: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
 class FittedChain:
     """What came of it.
 
@@ -93,20 +103,13 @@ class FittedChain:
         chain: on all sessions that were kept.
         limit: from sessions that the judging parts were not fitted to.
         doubtful: names of sessions that were left out.
+        sessions: blocks of those that were not.
     """
 
     chain: MonitorChain
     limit: AlarmLimit
     doubtful: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class SessionBlocks:
-    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
-
-    name: str
-    summaries: Array
-    points: Array
+    sessions: tuple[SessionBlocks, ...]
 
 
 def fit_chain(
@@ -181,7 +184,7 @@ def fit_from_blocks(
     limit = calibrated(bank, [_padded(part, bank) for part in white], blocks_per_s, promised_hours)
     quiet = _quiet(bank, [_padded(part, bank) for part in white])
     chain = MonitorChain(summaries, conditioning, drift, watches, limit.limit, quiet, settle)
-    return FittedChain(chain, limit, doubtful)
+    return FittedChain(chain, limit, doubtful, tuple(remaining))
 
 
 def _widths_of(watches: Sequence[Watch]) -> BankSpec:
@@ -221,21 +224,44 @@ def _without_doubtful(
     spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: int
 ) -> tuple[list[SessionBlocks], tuple[str, ...]]:
     """Sessions without those whose means lie far from all others, and the names of those."""
-    # As they are: what is usual at an operating point would be learned from the doubtful sessions, too.
-    means = np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in sessions])
-    middle = np.median(means, axis=0)
-    width = 1.4826 * np.median(np.abs(means - middle), axis=0)
-    # A summary that hardly varies between sessions would make every one stand out.
-    width = np.maximum(width, 0.02 + 1e-3 * np.abs(middle))
-    worst = (np.abs(means - middle) / width).max(axis=1)
-    # Healthy sessions differ as well: what is doubtful stands far out among their own largest deviations.
-    usual = float(np.median(worst))
-    bad = worst > spec.doubtful * usual
-    # A fifth at most: where more stand out, they are not exceptions.
-    if bad.sum() > len(sessions) // 5:
-        bad &= worst >= np.sort(worst)[-max(1, len(sessions) // 5)]
+    bad = _doubtful(spec, sessions, sessions, settle)
     remaining = [session for session, out in zip(sessions, bad, strict=True) if not out]
     return remaining, tuple(session.name for session, out in zip(sessions, bad, strict=True) if out)
+
+
+def doubtful_sessions(
+    fitted: FittedChain,
+    spec: ChainSpec,
+    sources: Sequence[ResidualSource],
+    channels: Sequence[Channel],
+    sessions: Sequence[Recording],
+) -> tuple[str, ...]:
+    """Names of further sessions whose means lie far from those that a chain was fitted to, such as of the training."""
+    chain = fitted.chain
+    blocks = [blocks_of(chain.summaries, sources, channels, session) for session in sessions]
+    bad = _doubtful(spec, blocks, fitted.sessions, chain.settle)
+    return tuple(block.name for block, out in zip(blocks, bad, strict=True) if out)
+
+
+def _doubtful(
+    spec: ChainSpec, sessions: Sequence[SessionBlocks], usual: Sequence[SessionBlocks], settle: int
+) -> NDArray[np.bool_]:
+    """Which sessions have means far from the usual ones."""
+    # As they are: what is usual at an operating point would be learned from the doubtful sessions, too.
+    means, others = (
+        np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in part])
+        for part in (sessions, usual)
+    )
+    middle = np.median(others, axis=0)
+    width = 1.4826 * np.median(np.abs(others - middle), axis=0)
+    # A summary that hardly varies between sessions would make every one stand out.
+    width = np.maximum(width, 0.02 + 1e-3 * np.abs(middle))
+    worst, usual_worst = ((np.abs(part - middle) / width).max(axis=1) for part in (means, others))
+    # Healthy sessions differ as well: what is doubtful stands far out among their own largest deviations.
+    bad = worst > spec.doubtful * float(np.median(usual_worst))
+    # A fifth at most: where more stand out, they are not exceptions.
+    most = max(1, len(sessions) // 5)
+    return np.asarray(bad & (worst >= np.sort(worst)[-most]), dtype=bool)
 
 
 def fit_summaries(
@@ -268,7 +294,46 @@ def fit_summaries(
         change=change[judged],
         moving=moving,
         level=level,
+        drivers=drivers_of(channels, sessions[0], [names[i] for i in judged]),
     )
+
+
+def drivers_of(channels: Sequence[Channel], session: Recording, judged: Sequence[str]) -> NDArray[np.int64]:
+    """What drives each residual: the velocity and the signed command of the axis that its channel belongs to.
+
+    A channel of no axis has those whose sizes go with it most. Shape (drivers, residuals, 2); a driver that no residual
+    has is left out.
+    """
+    names = [channel.name for channel in channels]
+    axes = roles_of(session).axes
+    own = [
+        next((axis for axis in axes if name in (axis.velocity, axis.stroke, *axis.pressures, *axis.command)), None)
+        or _likely_axis(axes, session, name)
+        for name in judged
+    ]
+    rows = []
+    for choose in (lambda axis: (axis.velocity,), lambda axis: axis.command, lambda axis: axis.conflux):
+        pairs = [tuple(n for n in choose(axis) if n in names) if axis is not None else () for axis in own]
+        if any(pairs):
+            # Without a driver the residual is driven by itself against itself, which is nothing: 0 less 0.
+            rows.append([[names.index(p[0]), names.index(p[1]) if len(p) > 1 else -1] if p else [0, 0] for p in pairs])
+    return np.array(rows, np.int64).reshape(len(rows), len(judged), 2)
+
+
+def _likely_axis(axes: Sequence[Axis], session: Recording, name: str) -> Axis | None:
+    """The axis whose velocity has sizes that go with those of a channel most."""
+    if not axes or name not in session.channel_names:
+        return None
+    sizes = np.abs(session.column(name).astype(np.float64) - float(session.column(name).mean()))
+
+    def likeness(axis: Axis) -> float:
+        if axis.velocity not in session.channel_names or axis.velocity == name:
+            return -1.0
+        other = np.abs(session.column(axis.velocity).astype(np.float64))
+        width = float(sizes.std() * other.std())
+        return float(((sizes - sizes.mean()) * (other - other.mean())).mean()) / width if width > 0.0 else -1.0
+
+    return max(axes, key=likeness)
 
 
 def _robust_width(values: Array) -> Array:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
-"""Of each residual and block, in this order."""
+"""Of each residual and block, in this order, and behind them one for each driver."""
+MOST_DRIVERS = 8
 NEAR_ZERO = 0.05
 """Variance in healthy units that is added below `gain` and `lag`: a channel at rest tells neither."""
 MOST_BLOCK = 1_000_000
@@ -31,6 +32,10 @@ class BlockSummaries:
         mean = sum r / n                      spread = sqrt(sqrt(max(sum r^2 / n - mean^2, 0)))
         gain = sum r u / (sum u^2 + 0.05 n)   lag    = sum r d / (sum d^2 + 0.05 n D)
         peak = sqrt(max |r|)
+        drive = sum r w / (sum w^2 + 0.05 n) for each driver, w one scaled input less another
+
+    A driver is what moves the part: friction shows as a residual that goes with the velocity, a dead band as one that
+    goes with the command.
 
     A block in which more than half of the ticks of a residual are missing gives NaN for it.
 
@@ -44,6 +49,7 @@ class BlockSummaries:
         change: D, healthy variance of d of the channel of each residual, shape (residuals,).
         moving: places of inputs whose mean size is part of the operating point.
         level: places of inputs whose mean is part of the operating point.
+        drivers: places of the two inputs of each driver, shape (drivers, residuals, 2); a second one of -1 is none.
     """
 
     block: int
@@ -54,6 +60,7 @@ class BlockSummaries:
     change: Array
     moving: NDArray[np.int64]
     level: NDArray[np.int64]
+    drivers: NDArray[np.int64]
 
     @property
     def residuals(self) -> int:
@@ -62,8 +69,8 @@ class BlockSummaries:
 
     @property
     def width(self) -> int:
-        """Numbers of a block: `SUMMARIES` of the first residual, of the second, and so on."""
-        return len(SUMMARIES) * self.residuals
+        """Numbers of a block: `SUMMARIES` and drivers of the first residual, of the second, and so on."""
+        return (len(SUMMARIES) + len(self.drivers)) * self.residuals
 
     @property
     def points(self) -> int:
@@ -73,7 +80,8 @@ class BlockSummaries:
     def initial_state(self) -> SummaryState:
         """Before the first tick of one machine."""
         sums = {name: np.zeros(self.residuals) for name in ("n", "r", "rr", "ru", "uu", "rd", "dd", "peak")}
-        inputs = len(self.centre)
+        inputs, driven = len(self.centre), (len(self.drivers), self.residuals)
+        sums |= {"rw": np.zeros(driven), "ww": np.zeros(driven)}
         sums |= {"y": np.zeros(inputs), "size": np.zeros(inputs)}
         return SummaryState(0, self.centre, False, sums)
 
@@ -123,6 +131,8 @@ class BlockSummaries:
         before = np.concatenate([first[None], y_flat[:-1]])
         y, d = y_flat.reshape(blocks, ticks, -1), (y_flat - before).reshape(blocks, ticks, -1)
         u, change = y[..., self.channel], d[..., self.channel]
+        first_of, second_of = self.drivers[..., 0], self.drivers[..., 1]
+        w = y[..., first_of] - np.where(second_of >= 0, y[..., np.maximum(second_of, 0)], 0.0)
         sums = {name: np.repeat(values[None], blocks, 0) for name, values in state.sums.items()}
         for tick in range(ticks):
             rt, ut, dt, finite = r[:, tick], u[:, tick], change[:, tick], there[:, tick]
@@ -133,6 +143,8 @@ class BlockSummaries:
             sums["uu"] = sums["uu"] + ut * ut
             sums["rd"] = sums["rd"] + rt * dt
             sums["dd"] = sums["dd"] + dt * dt
+            sums["rw"] = sums["rw"] + rt[:, None] * w[:, tick]
+            sums["ww"] = sums["ww"] + w[:, tick] * w[:, tick]
             sums["peak"] = np.maximum(sums["peak"], np.abs(rt))
             sums["y"] = sums["y"] + y[:, tick]
             sums["size"] = sums["size"] + np.abs(y[:, tick])
@@ -149,7 +161,9 @@ class BlockSummaries:
         whole = float(self.block)
         gain = sums["ru"] / (sums["uu"] + NEAR_ZERO * whole)
         lag = sums["rd"] / (sums["dd"] + NEAR_ZERO * whole * self.change)
-        summary = np.stack([mean, np.sqrt(np.sqrt(variance)), gain, lag, np.sqrt(sums["peak"])], axis=-1)
+        own = np.stack([mean, np.sqrt(np.sqrt(variance)), gain, lag, np.sqrt(sums["peak"])], axis=-1)
+        drive = sums["rw"] / (sums["ww"] + NEAR_ZERO * whole)
+        summary = np.concatenate([own, np.moveaxis(drive, -2, -1)], axis=-1)
         # More than half of the ticks are missing: the block says nothing of this residual.
         summary[2.0 * sums["n"] < whole] = np.nan
         levels = sums["y"][..., self.level] / whole
@@ -158,7 +172,8 @@ class BlockSummaries:
 
     def names(self, residuals: Sequence[str]) -> tuple[str, ...]:
         """Names of the summaries, such as ``virtual:CylVels_1.mean``."""
-        return tuple(f"{residual}.{summary}" for residual in residuals for summary in SUMMARIES)
+        summaries = (*SUMMARIES, *(f"drive{number + 1}" for number in range(len(self.drivers))))
+        return tuple(f"{residual}.{summary}" for residual in residuals for summary in summaries)
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values of its file."""
@@ -166,7 +181,7 @@ class BlockSummaries:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Numbers of its file."""
-        names = ("scale", "channel", "centre", "spread", "change", "moving", "level")
+        names = ("scale", "channel", "centre", "spread", "change", "moving", "level", "drivers")
         return {name: getattr(self, name) for name in names}
 
     @staticmethod
@@ -181,6 +196,7 @@ class BlockSummaries:
             raise ValueError(f"a block has {str(block)[:40]} ticks; 1 to {MOST_BLOCK:,} must hold")
         numbers = {name: np.asarray(arrays[name], np.float64) for name in ("scale", "centre", "spread", "change")}
         places = {name: np.asarray(arrays[name], np.int64) for name in ("channel", "moving", "level")}
+        drivers = np.asarray(arrays["drivers"], np.int64)
         inputs, residuals = numbers["centre"].shape, numbers["scale"].shape
         if any(values.ndim != 1 for values in (*numbers.values(), *places.values())):
             raise ValueError("arrays of the summaries are no lists of numbers")
@@ -190,6 +206,10 @@ class BlockSummaries:
             raise ValueError("arrays of the summaries have other lengths than each other")
         if any(((p < 0) | (p >= inputs[0])).any() for p in places.values()):
             raise ValueError("summaries name an input that there is not")
+        if drivers.ndim != 3 or drivers.shape[1:] != (*residuals, 2) or len(drivers) > MOST_DRIVERS:
+            raise ValueError("drivers of the summaries have another shape")
+        if ((drivers < [0, -1]) | (drivers >= inputs[0])).any():
+            raise ValueError("drivers of the summaries name an input that there is not")
         if not all(np.isfinite(values).all() for values in numbers.values()):
             raise ValueError("a number of the summaries is not finite")
         if not all((numbers[name] > 0.0).all() for name in ("scale", "spread", "change")):
@@ -197,7 +217,7 @@ class BlockSummaries:
         centre, spread = numbers["centre"], numbers["spread"]
         moving, level = places["moving"], places["level"]
         channel, change = places["channel"], numbers["change"]
-        return BlockSummaries(block, numbers["scale"], channel, centre, spread, change, moving, level)
+        return BlockSummaries(block, numbers["scale"], channel, centre, spread, change, moving, level, drivers)
 
 
 @dataclass(frozen=True, eq=False)

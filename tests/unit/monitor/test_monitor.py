@@ -124,16 +124,16 @@ def test_too_few_hours_name_the_rate_that_they_support(healthy):
         fit_to_recordings(healthy, load_monitor_experiment(None, (), {"hours_per_false_alarm": 8.0}))
 
 
-def test_a_healthy_log_with_a_fault_is_named(healthy):
+def test_a_healthy_log_with_a_fault_is_named(healthy, fitted):
     spoilt = list(healthy)
-    faulty = [len(spoilt) - 1, len(spoilt) - 2]
+    trained = fitted.monitor.provenance["trained_on"]
+    # One that trains residuals, and one that sets the limit.
+    faulty = [next(i for i, s in enumerate(spoilt) if (s.name in trained) == training) for training in (True, False)]
     for place in faulty:
         spoilt[place] = with_bias(spoilt[place], "pressure_a", 8e6, 0)
     doubtful = fit_to_recordings(spoilt, EXPERIMENT).doubtful
     named = {spoilt[place].name for place in faulty}
-    # Those that trained residuals are not judged; the division is drawn, so one at least is.
-    assert doubtful
-    assert {*doubtful} <= named
+    assert {*doubtful} == named
 
 
 def test_the_folder_gives_the_same_monitor(fitted, fresh, tmp_path):

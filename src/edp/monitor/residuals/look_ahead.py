@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edp.data.features import FeatureSet
+from edp.data.task import TargetMode, Task
 from edp.monitor.residuals.base import (
     RESIDUALS,
     FitMaterial,
@@ -20,8 +22,10 @@ from edp.monitor.residuals.base import (
     mean_inputs,
     middle_of,
 )
+from edp.monitor.residuals.committees import CommitteeOptions, constant_channels
 from edp.networks.predictor import Predictor
-from edp.signals import Channel
+from edp.settings.bounds import above, check_bounds, check_count
+from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 
 SMALLEST_WIDTH = 1e-9
@@ -122,13 +126,28 @@ def _predicted(predictor: Predictor, x: torch.Tensor, state: Any) -> tuple[Rows,
 
 @RESIDUALS.register("look_ahead")
 @dataclass(frozen=True, kw_only=True)
-class LookAheadSpec(ResidualSpec):
-    """Errors of the look-ahead networks that the monitor is given; without any there is nothing to judge."""
+class LookAheadSpec(CommitteeOptions, ResidualSpec):
+    """Errors of the look-ahead networks that the monitor is given; without any, of one that is trained for it.
+
+    Attributes:
+        horizons_s: of the network that is trained, s; at least a tick.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
 
     source: ClassVar[type[ResidualSource]] = LookAhead
+    horizons_s: tuple[float, ...] = (0.01, 0.1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "horizons_s", tuple(self.horizons_s))
+        check_bounds("look_ahead", self, horizons_s=above(0.0, 60.0))
+        check_count("look_ahead", "horizons_s", self.horizons_s, 16, least=1)
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
+        material.note("look-ahead errors")
         names = {*material.names}
         usable = [
             bundle
@@ -139,8 +158,29 @@ class LookAheadSpec(ResidualSpec):
             and abs(bundle.task.rate_hz - material.rate_hz) <= 1e-3 * material.rate_hz
         ]
         if not usable:
+            own = self._own(material)
+            usable = [] if own is None else [own]
+        if not usable:
             return None
-        material.note("look-ahead errors")
         used = {name for bundle in usable for name in (*bundle.task.inputs, *bundle.task.targets)}
         inputs = tuple(name for name in material.names if name in used)
         return LookAhead({str(i): b for i, b in enumerate(usable)}, inputs, mean_inputs(material, inputs))
+
+    def _own(self, material: FitMaterial) -> Bundle | None:
+        """A network of all channels for what moves and for pressures, or where there are none for every channel."""
+        constant = constant_channels(material)
+        channels = [channel for channel in material.channels if channel.name not in constant]
+        targets = [channel.name for channel in channels if channel.kind in AHEAD] or [c.name for c in channels]
+        if not targets:
+            return None
+        horizons = tuple(sorted({max(1, round(span * material.rate_hz)) for span in self.horizons_s}))
+        features = FeatureSet("all", tuple(channel.name for channel in channels))
+        task = Task(features, tuple(targets[:MOST_TARGETS]), horizons, TargetMode.DELTA, material.rate_hz)
+        return self.trained(task, material, MINUTES_SHARE * material.minutes)[0]
+
+
+AHEAD = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PRESSURE, Kind.FLOW, Kind.FORCE)
+"""Kinds that dynamics tell ahead; accelerations are mostly noise, positions follow from velocities."""
+MOST_TARGETS = 64
+MINUTES_SHARE = 0.2
+"""Of the time of all fits, for the one network that looks ahead."""

@@ -15,10 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from edp.data.features import FeatureSet
-from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
-from edp.errors import ConfigError
 from edp.monitor.residuals.base import (
     RESIDUALS,
     FitMaterial,
@@ -30,17 +28,13 @@ from edp.monitor.residuals.base import (
     middle_of,
     texts_of,
 )
+from edp.monitor.residuals.committees import CommitteeOptions, constant_channels
 from edp.monitor.residuals.groups import Group, groups_of
-from edp.networks.backbones import CommitteeSpec
-from edp.networks.heads import LinearHead
-from edp.networks.losses.mse import MeanSquared
-from edp.networks.predictor import ModelSpec, Predictor
+from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
-from edp.settings.bounds import MOST_ROWS, MOST_UNITS, above, check_bounds, check_count, integer
+from edp.settings.bounds import above, check_bounds
 from edp.signals import Channel
-from edp.training.bagging.spec import BaggingSpec
 from edp.training.bundle import Bundle
-from edp.training.fit import TrainingSpec, fit
 
 PREFIX = "virtual:"
 
@@ -108,14 +102,10 @@ class VirtualSensors(ResidualSource):
 
 @RESIDUALS.register("virtual_sensors")
 @dataclass(frozen=True, kw_only=True)
-class VirtualSensorsSpec(ResidualSpec):
+class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
     """Networks that tell each group of channels from the others: a linear map and a few perceptrons on changes.
 
     Attributes:
-        lags_s: spans of the changes of each channel that are read beside it, s; those shorter than a tick fall away.
-        members: perceptrons of a group.
-        units: hidden units of each of their two layers.
-        rows: ticks that train at most.
         least: share of a channel's mean deviation that a virtual sensor must explain on the sessions that choose; a
             channel that the others say less about is not judged.
 
@@ -124,26 +114,11 @@ class VirtualSensorsSpec(ResidualSpec):
     """
 
     source: ClassVar[type[ResidualSource]] = VirtualSensors
-    lags_s: tuple[float, ...] = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
-    members: int = 2
-    units: int = 64
-    rows: int = 100_000
     least: float = 0.1
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "lags_s", tuple(self.lags_s))
-        check_bounds(
-            "virtual_sensors",
-            self,
-            lags_s=above(0.0, 60.0),
-            members=integer(2, 1000),
-            units=integer(1, MOST_UNITS),
-            rows=integer(100, MOST_ROWS),
-            least=above(-1.0, 1.0),
-        )
-        check_count("virtual_sensors", "lags_s", self.lags_s, 16, least=1)
-        if self.members % FOLDS:
-            raise ConfigError(f"virtual_sensors: members = {self.members}; a multiple of {FOLDS} must hold")
+        super().__post_init__()
+        check_bounds("virtual_sensors", self, least=above(-1.0, 1.0))
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
@@ -151,14 +126,14 @@ class VirtualSensorsSpec(ResidualSpec):
             groups: tuple[Group, ...] = tuple(Group(" and ".join(names), names) for names in material.groups)
         else:
             groups = groups_of(material.channels)
-        constant = _constant(material)
+        constant = constant_channels(material)
         material = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
         groups = tuple(replace(g, judged=tuple(n for n in g.judged if n not in constant)) for g in groups)
         groups = tuple(group for group in groups if group.judged and self._fed(group, material))
         bundles = {}
         for group in groups:
             material.note(f"virtual sensors of {group.name}")
-            bundle = self._fitted(group, material, material.minutes / len(groups))
+            bundle = self._fitted(group, material, 0.8 * material.minutes / len(groups))
             if bundle is not None:
                 bundles[group.name] = bundle
         if not bundles:
@@ -174,76 +149,19 @@ class VirtualSensorsSpec(ResidualSpec):
 
     def _fitted(self, group: Group, material: FitMaterial, minutes: float) -> Bundle | None:
         """The network of a group; None where it explains none of its channels."""
-        data = self._prepared(group, group.judged, material)
-        fitted = fit(data, self.model(material.rate_hz), self.training(minutes, material))
-        explained = _explained(fitted.predictor, data.validation or data.train)
+        bundle, data = self.trained(self._task(group, group.judged, material), material, minutes)
+        explained = _explained(bundle.predictor, data.validation or data.train)
         remaining = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)
         if not remaining:
             return None
         if len(remaining) < len(group.judged):
             # The others cost a training once more: a network whose outputs are cut off would be another network.
-            data = self._prepared(group, remaining, material)
-            fitted = fit(data, self.model(material.rate_hz), self.training(minutes, material))
-        facts = {"seconds": fitted.seconds}
-        return Bundle(fitted.predictor, data.inputs, data.target_kinds, data.descriptions, facts)
+            bundle, _ = self.trained(self._task(group, remaining, material), material, minutes)
+        return bundle
 
-    def model(self, rate_hz: float) -> ModelSpec:
-        """The network of each group."""
-        lags = sorted({max(1, round(span * rate_hz)) for span in self.lags_s})
-        backbone = CommitteeSpec(
-            lags=tuple(lags), members=self.members, units=self.units, layers=2, activations=("tanh",)
-        )
-        return ModelSpec(backbone=backbone, head=LinearHead(), window=max(2, lags[-1]))
-
-    def training(self, minutes: float, material: FitMaterial) -> TrainingSpec:
-        """How each is trained: as many steps as the time allows."""
-        steps = max(200, min(MOST_STEPS, round(minutes * STEPS_PER_MINUTE)))
-        bagging = BaggingSpec(folds=FOLDS, steps=steps, batch=BATCH, rows=self.rows, checks=5)
-        return TrainingSpec(loss=MeanSquared(), bagging=bagging, seed=material.seed, device="cpu")
-
-    def _prepared(self, group: Group, judged: tuple[str, ...], material: FitMaterial) -> Prepared:
-        fed = self._fed(group, material)
-        features = FeatureSet("others", tuple(channel.name for channel in fed))
-        task = Task(features, judged, (0,), TargetMode.ABSOLUTE, material.rate_hz)
-        kinds = {channel.name: channel.kind for channel in material.channels}
-        texts = {channel.name: channel.description for channel in material.channels}
-        return Prepared(
-            task=task,
-            train=[task.series(recording) for recording in material.train],
-            validation=_shortened([task.series(recording) for recording in material.validation]),
-            test=[],
-            inputs=fed,
-            feature_kinds=tuple(channel.kind for channel in fed),
-            target_kinds=tuple(kinds[name] for name in judged),
-            descriptions=tuple(texts[name] for name in judged),
-            digest="",
-        )
-
-
-FOLDS = 2
-"""Each member leaves out half of the rows, and stops where its error there is least."""
-BATCH = 512
-STEPS_PER_MINUTE, MOST_STEPS = 10_000, 6_000
-"""On one core, about: the time of a fit is a wish and not a bound."""
-VALIDATED_TICKS = 120_000
-"""For the choice among weights: twenty minutes at 100 Hz say as much as hours."""
-
-
-def _constant(material: FitMaterial) -> set[str]:
-    """Channels that never change: there is nothing to tell about them, nor by them."""
-    rows = [session.select(material.names) for session in material.train]
-    low, high = (np.stack([f(part, axis=0) for part in rows]) for f in (np.min, np.max))
-    still = low.min(axis=0) == high.max(axis=0)
-    return {name for name, constant in zip(material.names, still, strict=True) if constant}
-
-
-def _shortened(series: list[Series]) -> list[Series]:
-    """Series of `VALIDATED_TICKS` in all, the same share of each."""
-    share = min(1.0, VALIDATED_TICKS / max(1, sum(part.samples for part in series)))
-    if share == 1.0:
-        return series
-    cut = [max(1000, int(part.samples * share)) for part in series]
-    return [Series(p.name, p.inputs[:n], p.targets[:n]) for p, n in zip(series, cut, strict=True)]
+    def _task(self, group: Group, judged: tuple[str, ...], material: FitMaterial) -> Task:
+        features = FeatureSet("others", tuple(channel.name for channel in self._fed(group, material)))
+        return Task(features, judged, (0,), TargetMode.ABSOLUTE, material.rate_hz)
 
 
 def _explained(predictor: Predictor, series: Sequence[Series]) -> list[float]:

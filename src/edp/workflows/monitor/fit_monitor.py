@@ -14,7 +14,7 @@ import numpy as np
 from edp.config.monitor import MonitorExperiment, monitor_toml
 from edp.errors import ConfigError, DataError, closest
 from edp.logs.source import DataSource
-from edp.monitor.fitting import fit_chain, session_means
+from edp.monitor.fitting import doubtful_sessions, fit_chain, session_means
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import save_monitor
 from edp.monitor.residuals.base import FitMaterial, note_nothing
@@ -86,8 +86,9 @@ def fit_to_recordings(
     experiment: MonitorExperiment,
     bundles: Sequence[Bundle | TwinBundle] = (),
     note: Callable[[str], None] = note_nothing,
+    again: bool = False,
 ) -> FittedMonitor:
-    """`fit_monitor` without files.
+    """`fit_monitor` without files; `again` says that doubtful sessions were left out of the training before.
 
     Raises:
         EdpError: recordings that cannot be used, or too few hours for the promise.
@@ -118,6 +119,15 @@ def fit_to_recordings(
             "residuals"
         )
     fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note)
+    if not again:
+        note("sessions that trained, compared with the others")
+        trained = doubtful_sessions(fitted, experiment.chain, sources, channels, (*train, *validation))
+        if trained:
+            note(f"once more without {', '.join(trained)}")
+            left = [session for session in sessions if session.name not in trained]
+            better = fit_to_recordings(left, experiment, bundles, note, again=True)
+            seconds = time.process_time() - began
+            return FittedMonitor(better.monitor, (*trained, *better.doubtful), seconds)
     provenance: dict[str, Any] = {
         "sessions": len(sessions),
         "hours": sum(session.duration_s for session in sessions) / 3600.0,
