@@ -67,32 +67,71 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
 
 def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
     """`match` from the directions at the onset and after it on; None where there are no rows of a part."""
-    scores, sizes, misfits = [], [], []
-    for number, fault in enumerate(dictionary.classes):
-        tried, signatures = candidates(dictionary, number, fault)
-        likelihoods, off, count = np.zeros(len(tried)), np.zeros(len(tried)), 0
-        for part, entry in enumerate(seen):
-            if entry is None:
-                continue
-            directions, noise = entry
-            variance = noise + dictionary.changing * signatures[part] ** 2
-            squares = (directions - signatures[part]) ** 2 / variance
-            likelihoods -= 0.5 * (squares + np.log(variance)).sum(axis=1) / dictionary.temperature
-            off += squares.mean(axis=1)
-            count += 1
-        best = int(likelihoods.argmax())
-        scores.append(float(logsumexp(likelihoods)) - np.log(len(likelihoods)))
-        sizes.append(tried[best])
-        misfits.append(float(off[best]) / max(count, 1))
-    logs = np.array(scores)
-    shares = np.exp(logs - logsumexp(logs))
-    misfit = misfits[int(logs.argmax())]
+    tried = candidates(dictionary)
+    return judged(tried, *likelihoods(tried, seen, dictionary.changing), dictionary)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Every fault at every size that is tried.
+
+    Attributes:
+        owner: number of the fault, ascending, shape (candidates,).
+        sizes: in the unit of the fault, NaN for faults without, shape (candidates,).
+        signatures: at the onset and after it, shape (2, candidates, features).
+        firsts: first candidate of each fault, shape (faults,).
+    """
+
+    owner: NDArray[np.int64]
+    sizes: Array
+    signatures: Array
+    firsts: NDArray[np.int64]
+
+
+def candidates(dictionary: Dictionary) -> Candidates:
+    """All that `match` compares with."""
+    parts = [_of_fault(dictionary, number, fault) for number, fault in enumerate(dictionary.classes)]
+    counts = np.array([len(sizes) for sizes, _ in parts])
+    return Candidates(
+        np.repeat(np.arange(len(parts)), counts),
+        np.concatenate([sizes for sizes, _ in parts]),
+        np.concatenate([signatures for _, signatures in parts], axis=1),
+        np.concatenate([[0], np.cumsum(counts)[:-1]]),
+    )
+
+
+def likelihoods(tried: Candidates, seen: Sequence[Seen | None], changing: float) -> tuple[Array, Array]:
+    """Logarithms of the densities of the evidence, and mean squared misfits, shape (candidates,) each."""
+    logs, misfits, count = np.zeros(len(tried.owner)), np.zeros(len(tried.owner)), 0
+    for part, entry in enumerate(seen):
+        if entry is None:
+            continue
+        directions, noise = entry
+        variance = noise + changing * tried.signatures[part] ** 2
+        squares = (directions - tried.signatures[part]) ** 2 / variance
+        logs -= 0.5 * (squares + np.log(variance)).sum(axis=1)
+        misfits += squares.mean(axis=1)
+        count += 1
+    return logs, misfits / max(count, 1)
+
+
+def judged(tried: Candidates, logs: Array, misfits: Array, dictionary: Dictionary) -> Match:
+    """Probabilities of the faults from the densities of the candidates."""
+    scaled = logs / dictionary.temperature
+    best = np.maximum.reduceat(scaled, tried.firsts)
+    sums = np.add.reduceat(np.exp(scaled - best[tried.owner]), tried.firsts)
+    counts = np.diff(np.append(tried.firsts, len(scaled)))
+    of_faults = best + np.log(sums / counts)
+    shares = np.exp(of_faults - logsumexp(of_faults))
+    # The last of equals would do as well; the first is the smaller size.
+    chosen = np.array([first + int(scaled[first : first + n].argmax()) for first, n in zip(tried.firsts, counts)])
+    misfit = float(misfits[chosen[int(of_faults.argmax())]])
     # Even odds at the misfit that hardly any left-out session reached, certainty at half as much again.
     none = float(np.clip(misfit / dictionary.strange - 0.5, 0.0, 1.0))
-    return Match((1.0 - none) * shares, np.array(sizes), none, misfit)
+    return Match((1.0 - none) * shares, tried.sizes[chosen], none, misfit)
 
 
-def candidates(dictionary: Dictionary, number: int, fault: FaultClass) -> tuple[Array, Array]:
+def _of_fault(dictionary: Dictionary, number: int, fault: FaultClass) -> tuple[Array, Array]:
     """Sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
     rows = dictionary.rows_of(number)
     signatures = dictionary.signatures[:, rows]
@@ -103,10 +142,10 @@ def candidates(dictionary: Dictionary, number: int, fault: FaultClass) -> tuple[
     ends = abs(fault.sizes[0] - fault.neutral), abs(fault.sizes[-1] - fault.neutral)
     tried = np.geomspace(LEAST_SIZE * ends[0], BEYOND * ends[1], GRID)
     # From nothing at the neutral size; beyond the largest size that was simulated it stays as it was there.
-    known_sizes = np.concatenate([[0.0], away])
+    simulated = np.concatenate([[0.0], away])
     values = np.concatenate([np.zeros((2, 1, signatures.shape[2])), signatures], axis=1)
-    upper = np.clip(np.searchsorted(known_sizes, tried), 1, len(known_sizes) - 1)
-    share = np.clip((tried - known_sizes[upper - 1]) / (known_sizes[upper] - known_sizes[upper - 1]), 0.0, 1.0)[:, None]
+    upper = np.clip(np.searchsorted(simulated, tried), 1, len(simulated) - 1)
+    share = np.clip((tried - simulated[upper - 1]) / (simulated[upper] - simulated[upper - 1]), 0.0, 1.0)[:, None]
     between = (1.0 - share) * values[:, upper - 1] + share * values[:, upper]
     return fault.neutral + sign * tried, between
 
