@@ -12,7 +12,7 @@ moved. The promise: 20 fits of conditioning, whitening and limit to other health
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from io import BytesIO
@@ -26,7 +26,7 @@ from common import Verdict, finish, in_folder, parser, table, verdict
 from edp.config.monitor import load_monitor_experiment
 from edp.errors import DataError
 from edp.monitor.alarms import MonitorAlarm
-from edp.monitor.chain import Chain, ChainState
+from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
 from edp.monitor.fitting import SessionBlocks, blocks_of, fit_from_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
@@ -53,6 +53,7 @@ from monitor_sessions import (
     read_session,
     session_facts,
     session_names,
+    session_plans,
     write_sessions,
 )
 
@@ -72,9 +73,9 @@ GOALS = {
 }
 LARGE = (0, 1)
 """Ranks of the two largest sizes."""
-FITS, FIT_SESSIONS, PROMISE_H = 20, 120, 2.0
-"""Of the promise: fits, sessions of each, and hours to a false alarm. A promise of 2 h shows in the hours there are
-what one of 8 h would need four times as many for."""
+FITS, FIT_SESSIONS, MEASURED_SESSIONS, PROMISE_H = 20, 60, 120, 1.0
+"""Of the promise: fits, sessions that each is fitted to and measured on, and hours to a false alarm. A promise of 1 h
+shows in the hours there are what one of 8 h would need eight times as many for."""
 QUICK_COUNTS = {"training": (16, 0), "test": (6, 1)}
 """Healthy sessions, and those of each nuisance set."""
 QUICK_SECONDS, QUICK_HOURS = 60.0, 0.1
@@ -119,19 +120,35 @@ class _Job:
     label: str
 
 
-class FromBlocks(Chain):
-    """A chain that takes summaries and operating points in place of residuals and raw rows.
+class ChainOfBlocks(MonitorChain):
+    """A chain that takes summaries and operating points in place of residuals and raw rows."""
+
+    def conditioned(self, residuals: Floats, rows: Floats, state: ChainState) -> tuple[Floats, ChainState]:
+        """See `MonitorChain.conditioned`; whole sessions only."""
+        z = self.conditioning(residuals, rows)
+        z[: self.settle] = np.nan
+        z, drift = self.drift.run(z, state.drift)
+        return z, replace(state, drift=drift, blocks=len(z))
+
+
+class MonitorOfBlocks(Monitor):
+    """A monitor that watches summaries of sessions.
 
     The networks of a session run once; what comes behind them is judged anew as often as it changes. `same_alarms`
     holds this way to `Monitor.run`.
     """
 
-    def conditioned(self, residuals: Floats, rows: Floats, state: ChainState) -> tuple[Floats, ChainState]:
-        """See `Chain.conditioned`; whole sessions only."""
-        z = self.conditioning(residuals, rows)
-        z[: self.settle] = np.nan
-        z, drift = self.drift.run(z, state.drift)
-        return z, replace(state, drift=drift, blocks=len(z))
+    def verdicts(self, recording: Any) -> Iterator[BlockVerdict]:
+        """See `Monitor.verdicts`, of `SessionBlocks`."""
+        yield from self.chain.run(recording.summaries, recording.points, self.chain.initial_state())[0]
+
+    @staticmethod
+    def of(monitor: Monitor, chain: MonitorChain | None = None) -> MonitorOfBlocks:
+        """Of a monitor, with another chain where one is given."""
+        source = monitor.chain if chain is None else chain
+        own = ChainOfBlocks(**{field.name: getattr(source, field.name) for field in fields(MonitorChain)})
+        values = {field.name: getattr(monitor, field.name) for field in fields(Monitor)}
+        return MonitorOfBlocks(**values | {"chain": own})
 
 
 @lru_cache(maxsize=1)
@@ -175,20 +192,10 @@ def blocks(plan: Plan, part: str, names: Sequence[str]) -> list[SessionBlocks]:
     return result
 
 
-def alarms_of(monitor: Monitor, part: SessionBlocks, chain: Chain | None = None) -> list[MonitorAlarm]:
-    """Alarms of a session, as `Monitor.run` gives them; of another chain where one is given."""
-    source = monitor.chain if chain is None else chain
-    names = [field.name for field in fields(Chain)]
-    own = FromBlocks(**{name: getattr(source, name) for name in names})
-    verdicts, _ = own.run(part.summaries, part.points, own.initial_state())
-    judging = replace(monitor, chain=own)
-    return [judging.alarm(verdict, part.name) for verdict in verdicts if verdict.alarm is not None]
-
-
 def watched(plan: Plan, names: Sequence[str]) -> dict[str, list[MonitorAlarm]]:
     """Alarms of test sessions by name; none where the monitor refuses a session as that of another machine."""
-    monitor = load_monitor(plan.monitor)
-    found = {part.name: alarms_of(monitor, part) for part in blocks(plan, "test", names)}
+    monitor = MonitorOfBlocks.of(load_monitor(plan.monitor))
+    found = {part.name: monitor.run(part) for part in blocks(plan, "test", names)}  # type: ignore[arg-type]
     for name in names:
         with np.load(plan.monitor / "blocks" / "test" / f"{name}.npz", allow_pickle=False) as arrays:
             if arrays["refused"]:
@@ -287,32 +294,41 @@ def place_of(kind: str) -> str:
     return "sensor" if hasattr(FAULTS[kind], "operation") else "machine"
 
 
-def rival_rows(plan: Plan, rival: Rival, folder: str, names: Sequence[str]) -> list[np.ndarray]:
-    """White rows of sessions."""
-    return [rival.rows(read_session(plan.data / folder, name).recording.values) for name in names]
+def rival_rows(plan: Plan, rivals: Mapping[str, Rival], folder: str, names: Sequence[str]) -> dict[str, list[Floats]]:
+    """White rows of sessions of every rival; each session is read once."""
+    rows: dict[str, list[Floats]] = {name: [] for name in rivals}
+    for number, session in enumerate(names, start=1):
+        values = read_session(plan.data / folder, session).recording.values
+        for name, rival in rivals.items():
+            rows[name].append(rival.rows(values))
+        if number % 50 == 0:
+            print(f"rivals: {number} of {len(names)} of {folder}", flush=True)
+    return rows
 
 
 def rival_results(plan: Plan, healthy: Sequence[str], faulty: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Every rival on the same sessions, with each of its charts."""
     learning, limiting = parts_of(plan)
-    # Sixty sessions are 8 h: what is linear or of neighbours has seen all there is to see by then.
-    material = [read_session(plan.data / "training", name).recording.values for name in learning[:60]]
+    # Forty sessions are 5 h: what is linear or of neighbours has seen all there is to see by then.
+    material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
     rate = 1.0
-    results: dict[str, dict[str, Any]] = {}
-    for name, rival in rivals_of(BEST_PYOD if has_pyod() else ()).items():
+    rivals = rivals_of(BEST_PYOD if has_pyod() else ())
+    for rival in rivals.values():
         rival.fit(material, ticks=100)
-        held = rival_rows(plan, rival, "training", limiting)
-        calm, wrong = (rival_rows(plan, rival, "test", names) for names in (healthy, faulty))
+    held = rival_rows(plan, rivals, "training", limiting)
+    calm, wrong = (rival_rows(plan, rivals, "test", names) for names in (healthy, faulty))
+    facts = [session_facts(plan.data / "test", name) for name in faulty]
+    results: dict[str, dict[str, Any]] = {}
+    for name in rivals:
         for chart, spec in CHARTS.items():
-            limit = limit_of(spec, held, rate, plan.hours).limit
-            false = sum(len(raised(spec, limit, rows, rate)) for rows in calm)
-            cases = []
-            for which, rows in zip(faulty, wrong, strict=True):
-                session, moving = session_facts(plan.data / "test", which)
-                cases.append(judged(session.fault, moving, raised(spec, limit, rows, rate)))
-            hours = sum(len(rows) for rows in calm) / 3600.0
+            limit = limit_of(spec, held[name], rate, plan.hours).limit
+            false = sum(len(raised(spec, limit, rows, rate)) for rows in calm[name])
+            cases = [
+                judged(session.fault, moving, raised(spec, limit, rows, rate))
+                for (session, moving), rows in zip(facts, wrong[name], strict=True)
+            ]
+            hours = sum(len(rows) for rows in calm[name]) / rate / 3600.0
             results[f"{name}, {chart}"] = summary(cases) | {"false": false_alarm_rate(false, hours)}
-        print(f"rival {name} done", flush=True)
     return results
 
 
@@ -328,35 +344,50 @@ def summary(cases: Sequence[Case]) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class _FitJob:
+    plan: Plan
+    seed: int
+    number: int
+    label: str
+
+
+@lru_cache(maxsize=1)
+def pool(plan: Plan) -> tuple[SessionBlocks, ...]:
+    """Healthy sessions that no residual was fitted to."""
+    parts = blocks(plan, "training", parts_of(plan)[1])
+    return (*parts, *blocks(plan, "test", session_names(plan.data / "test", "healthy")))
+
+
 def promise(plan: Plan, seed: int) -> dict[str, Any]:
-    """Fits of all behind the residuals to other healthy sessions each, and what they raise on the others."""
-    monitor = load_monitor(plan.monitor)
-    parts = blocks(plan, "test", session_names(plan.data / "test", "healthy"))
-    if not plan.quick:
-        parts += blocks(plan, "validation", session_names(plan.data / "validation", "healthy"))
-    fits, hours = (2, QUICK_HOURS / 4) if plan.quick else (FITS, PROMISE_H)
-    count, rows = min(FIT_SESSIONS, len(parts) // 2), []
-    for number in range(fits):
-        order = np.random.default_rng([seed, number]).permutation(len(parts))
-        chosen, others = ([parts[i] for i in some] for some in (order[:count], order[count:]))
-        rows.append(_one_fit(plan, monitor, chosen, others, hours))
-        print(f"promise {number + 1}: {rows[-1]}", flush=True)
+    """Fits of all behind the residuals to other healthy sessions each, and what they raise on others."""
+    pool(plan)
+    fits = 2 if plan.quick else FITS
+    jobs = [_FitJob(plan, seed, number, f"fit {number}") for number in range(fits)]
+    rows = []
+    for row in ordered(_one_fit, jobs, plan.workers):
+        rows.append(row)
+        print(f"promise {len(rows)}: {row}", flush=True)
     within = sum(row["low_hours"] <= row["measured_hours"] <= row["high_hours"] for row in rows)
+    hours = QUICK_HOURS / 4 if plan.quick else PROMISE_H
     as_promised = sum(row["measured_hours"] >= hours for row in rows)
     return {"fits": rows, "within": within, "of": fits, "as_promised": as_promised, "promised_hours": hours}
 
 
-def _one_fit(
-    plan: Plan, monitor: Monitor, chosen: Sequence[SessionBlocks], others: Sequence[SessionBlocks], hours: float
-) -> dict[str, Any]:
+def _one_fit(job: _FitJob) -> dict[str, Any]:
+    plan, parts, monitor = job.plan, pool(job.plan), _monitor(job.plan.monitor)
+    order = np.random.default_rng([job.seed, job.number]).permutation(len(parts))
+    count = min(FIT_SESSIONS, len(parts) // 2)
+    chosen, others = ([parts[i] for i in some] for some in (order[:count], order[count:][:MEASURED_SESSIONS]))
+    hours = QUICK_HOURS / 4 if plan.quick else PROMISE_H
     spec, old = load_monitor_experiment(None, plan.settings, {}).chain, monitor.chain
     result = fit_from_blocks(spec, old.summaries, chosen, monitor.rate_hz, old.settle, hours)
-    count = sum(len(alarms_of(monitor, part, result.chain)) for part in others)
+    own = MonitorOfBlocks.of(monitor, result.chain)
+    count = sum(len(own.run(part)) for part in others)  # type: ignore[arg-type]
     measured = sum(len(part.summaries) for part in others) * monitor.block_s / 3600.0
-    limit = result.limit
     return {
-        "low_hours": limit.low_hours,
-        "high_hours": min(limit.high_hours, NEVER_H),
+        "low_hours": result.limit.low_hours,
+        "high_hours": min(result.limit.high_hours, NEVER_H),
         # No alarm in H hours: the mean is H at least.
         "measured_hours": measured / max(count, 1),
         "alarms": count,
@@ -377,7 +408,10 @@ def prepared(plan: Plan) -> tuple[list[str], list[str]]:
     else:
         for part in COUNTS:
             write_sessions(plans_of(part, COUNTS[part]), plan.data / part, plan.workers)
-    return tuple(session_names(plan.data / "test", group) for group in ("healthy", "faulty"))  # type: ignore[return-value]
+        return tuple(  # type: ignore[return-value]
+            [one.name for one in session_plans("test", group, COUNTS["test"][group])] for group in ("healthy", "faulty")
+        )
+    return session_names(plan.data / "test", "healthy"), session_names(plan.data / "test", "faulty")
 
 
 def measure(plan: Plan, seed: int) -> dict[str, Any]:
@@ -461,19 +495,21 @@ def verdicts(found: dict[str, Any], plan: Plan) -> list[Verdict]:
 def choose(plan: Plan) -> None:
     """PyOD's detectors on the validation part: the two best are `BEST_PYOD`."""
     learning, limiting = parts_of(plan)
-    material = [read_session(plan.data / "training", name).recording.values for name in learning[:60]]
+    material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
     names, rows = session_names(plan.data / "validation", "faulty"), []
+    facts = [session_facts(plan.data / "validation", name) for name in names]
     for name in PYOD:
-        rival = rivals_of((name,))[f"PyOD {name}"]
-        rival.fit(material, ticks=100)
-        held = rival_rows(plan, rival, "training", limiting)
-        wrong = rival_rows(plan, rival, "validation", names)
+        rival = {name: rivals_of((name,))[f"PyOD {name}"]}
+        rival[name].fit(material, ticks=100)
+        held, wrong = (
+            rival_rows(plan, rival, part, some)[name] for part, some in (("training", limiting), ("validation", names))
+        )
         for chart, spec in CHARTS.items():
             limit = limit_of(spec, held, 1.0, plan.hours).limit
-            cases = []
-            for which, part in zip(names, wrong, strict=True):
-                session, moving = session_facts(plan.data / "validation", which)
-                cases.append(judged(session.fault, moving, raised(spec, limit, part, 1.0)))
+            cases = [
+                judged(session.fault, moving, raised(spec, limit, part, 1.0))
+                for (session, moving), part in zip(facts, wrong, strict=True)
+            ]
             rows.append([name, chart, share_found(cases), share_found(cases, LARGE), median_delay(cases)])
         print(rows[-2:], flush=True)
     table(["PyOD", "chart", "found", "two largest", "delay, s"], sorted(rows, key=lambda row: -row[2]))

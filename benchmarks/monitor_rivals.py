@@ -132,27 +132,27 @@ class Pca(OfBlocks):
 
 
 class Linear(Rival):
-    """A ridge predictor of every channel `steps` ticks ahead from the last ticks of all; residuals by block."""
+    """Ridge predictors of every channel some ticks ahead, from the last ticks of all; residuals by block."""
 
-    LAGS = (0, 1, 2, 4, 8)
+    LAGS = (0, 1, 4)
     RIDGE = 1e-6
+    STEPS = (1, 10)
 
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
-
-    def _past(self, values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _past(self, values: NDArray[np.float32]) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         # In single precision: hours at 100 Hz are many rows.
         scaled = ((values - self.mean) / self.size).astype(np.float32)
-        first, last = max(self.LAGS), len(scaled) - self.steps
-        past = np.concatenate([scaled[first - lag : last - lag] for lag in self.LAGS], axis=1)
-        return np.concatenate([past, np.ones((len(past), 1), np.float32)], axis=1), scaled[first + self.steps :]
+        first, last = max(self.LAGS), len(scaled) - max(self.STEPS)
+        past = [scaled[first - lag : last - lag] for lag in self.LAGS]
+        ahead = [scaled[first + steps : last + steps] for steps in self.STEPS]
+        return np.concatenate([*past, np.ones((last - first, 1), np.float32)], axis=1), ahead
 
     def _residual_blocks(self, values: NDArray[np.float32]) -> Floats:
-        past, wanted = self._past(values)
-        residuals = np.zeros((len(values), values.shape[1]))
-        residuals[len(values) - len(past) :] = wanted - past @ self.weights.astype(np.float32)
+        past, ahead = self._past(values)
+        residuals = np.zeros((len(values), len(ahead) * values.shape[1]), np.float32)
+        expected = past @ self.weights.astype(np.float32)
+        residuals[len(values) - len(past) :] = np.concatenate(ahead, axis=1) - expected
         blocks = blocks_of(residuals, self.ticks)
-        width = values.shape[1]
+        width = residuals.shape[1]
         return np.concatenate([blocks[:, :width], np.log(blocks[:, width:] + 1e-6)], axis=1)
 
     def fit(self, sessions: Sequence[NDArray[np.float32]], ticks: int) -> None:
@@ -163,14 +163,14 @@ class Linear(Rival):
         self.mean, size = rows.mean(axis=0), rows.std(axis=0)
         self.size = np.where(size > 0.0, size, 1.0)
         width = len(self.LAGS) * rows.shape[1] + 1
-        square, product = self.RIDGE * np.eye(width), np.zeros((width, rows.shape[1]))
+        square, product = np.zeros((width, width)), np.zeros((width, len(self.STEPS) * rows.shape[1]))
         count = 0
         for values in sessions[:half]:
-            past, wanted = self._past(values)
+            past, ahead = self._past(values)
             square += past.T @ past
-            product += past.T @ wanted
+            product += past.T @ np.concatenate(ahead, axis=1)
             count += len(past)
-        self.weights = np.linalg.solve(square + self.RIDGE * count * np.eye(width), product)
+        self.weights = np.linalg.solve(square + self.RIDGE * (1 + count) * np.eye(width), product)
         self.white = white_of([self._residual_blocks(values) for values in sessions[half:] or sessions])
 
     def rows(self, values: NDArray[np.float32]) -> Floats:
@@ -181,11 +181,7 @@ class Linear(Rival):
 def rivals_of(pyod: Sequence[str]) -> dict[str, Rival]:
     """All rivals by name; of PyOD these."""
     made: dict[str, Rival] = {f"PyOD {name}": Pyod(name) for name in pyod}
-    return made | {
-        "PCA T2 + SPE": Pca(),
-        "linear residuals, k = 1": Linear(1),
-        "linear residuals, k = 10": Linear(10),
-    }
+    return made | {"PCA T2 + SPE": Pca(), "linear residuals, k = 1 and 10": Linear()}
 
 
 def has_pyod() -> bool:

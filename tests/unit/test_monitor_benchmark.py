@@ -101,7 +101,7 @@ def test_the_area_under_the_curve_counts_ties_half(bench):
     assert area(np.array([1.0]), np.array([1.0, 0.0])) == 0.25
 
 
-@pytest.mark.parametrize("name", ["PCA T2 + SPE", "linear residuals, k = 1", "linear residuals, k = 10"])
+@pytest.mark.parametrize("name", ["PCA T2 + SPE", "linear residuals, k = 1 and 10"])
 def test_rivals_see_a_gross_change_and_little_else(bench, name):
     rivals = bench[2]
     rng = np.random.default_rng(0)
