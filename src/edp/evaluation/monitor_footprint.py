@@ -12,7 +12,7 @@ from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePar
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
-CORE_COSTS = {"residual": 1_600.0, "driver": 500.0, "input": 145.0, "product": 185.0, "summary": 1_500.0, "tick": 730.0}
+CORE_COSTS = {"residual": 1_650.0, "driver": 490.0, "input": 155.0, "product": 188.0, "summary": 1_000.0, "tick": 500.0}
 """Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library.
 
 Of a residual, of a driver of it and of an input at a tick, of a product with its sum, of a summary of a residual at the
