@@ -231,23 +231,10 @@ def exported_loop(c, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def rig_monitor():
-    """A monitor of the small rig: two kinds of residuals, all detectors with a form in C, fitted within seconds."""
-    from edp.config.monitor import load_monitor_experiment
-    from edp.testing.monitor import rig_sessions
-    from edp.workflows.monitor import fit_to_recordings
+    """A monitor of the small rig, see `small_monitors`."""
+    from small_monitors import fitted_monitor
 
-    watches = ",".join(
-        f"{{detector={{kind={kind}}},memory_s={memory}}}"
-        for kind, memory in (('"ewma",weight=0.5', 0.2), ('"cusum",slack=0.5', 1.0), ('"glr",window=5', 0.2))
-    )
-    sensors = '{kind="virtual_sensors",members=2,units=4,rows=2000,lags_s=[0.05,0.1]}'
-    changes = [
-        *("chain.block_s=0.2", "chain.settle_s=1.0", "chain.folds=2"),
-        f"chain.watches=[{watches}]",
-        f'residuals=[{sensors},{{kind="balances"}}]',
-    ]
-    experiment = load_monitor_experiment(None, changes, {"hours_per_false_alarm": 0.02, "minutes": 0.02})
-    return fit_to_recordings(rig_sessions(12, 2000, seed=1), experiment).monitor
+    return fitted_monitor()
 
 
 @pytest.fixture(scope="session")

@@ -101,6 +101,9 @@ def run(
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    mdf: Annotated[
+        Path | None, typer.Option("--mdf", help="Folder for the logs as MDF 4, with the alarms as events.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Watch logs: every alarm with when, since when, and what deviates; exit code 5 where there was one.
@@ -115,12 +118,19 @@ def run(
         on_recording = counted(shown, Steps(as_json), "monitor", "recordings watched")
         watched = run_monitor(folder, source_of(logs, signal_map, repair), target, on_recording)
 
+    if mdf is not None:
+        from edp.workflows.monitor.event_files import write_event_files
+
+        write_event_files(watched.alarms, source_of(logs, signal_map, repair).read(), mdf)
+
     def show() -> None:
         for name, channels in watched.silent.items():
             out.print(f"'{name}' lacks {', '.join(channels)}: what judges or reads these channels is silent")
         rows = [[a.recording, f"{a.raised_s:g}", f"{a.since_s:g}", a.severity, a.sentence] for a in watched.alarms]
         if rows:
             table("alarms", ["", "raised, s", "since, s", "severity", ""], rows[:MOST_SHOWN])
+        if mdf is not None:
+            out.print(f"logs with their alarms as events in {mdf}")
         if len(rows) > MOST_SHOWN:
             out.print(f"and {len(rows) - MOST_SHOWN:,} more")
         out.print(f"{len(rows):,} alarms in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")

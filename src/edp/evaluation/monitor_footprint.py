@@ -12,10 +12,12 @@ from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePar
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
-CORE_COSTS = {"residual": 1_600.0, "input": 145.0, "product": 185.0, "summary": 1_500.0, "tick": 730.0}
-"""Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library: of a
-residual and of an input at a tick, of a product with its sum, of a summary of a residual at the end of a block, and of
-a tick besides. Fitted to counted code of chains of several sizes (``benchmarks/monitor_cycles.py --fit``)."""
+CORE_COSTS = {"residual": 1_650.0, "driver": 490.0, "input": 155.0, "product": 188.0, "summary": 1_000.0, "tick": 500.0}
+"""Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library.
+
+Of a residual, of a driver of it and of an input at a tick, of a product with its sum, of a summary of a residual at the
+end of a block, and of a tick besides. Fitted to counted code of chains of several sizes
+(``benchmarks/monitor_cycles.py --fit``)."""
 CENTRE, CUSUM, EWMA, GLR, VERDICT, POINT = 0.5, 2.0, 2.5, 2.0, 0.6, 4.0
 """Products that take as long as a summary centred for a watch, a direction in a detector, a summary in a verdict, and
 a number of the operating point."""
@@ -38,6 +40,7 @@ def chain_work(parts: MonitorParts) -> dict[str, float]:
     products = 2.0 * summaries * points + watches + VERDICT * summaries
     return {
         "residual": float(len(chain.scale)),
+        "driver": float(len(chain.scale) * len(chain.drivers)),
         "input": float(len(chain.centre) + len(chain.level) + len(chain.moving)),
         "product": products / chain.block,
         "summary": summaries / chain.block,
@@ -54,7 +57,7 @@ def _watch_products(detector: str, shape: Sequence[int], option: float) -> float
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
     """Cycles of the chain of a monitor."""
     work, block = chain_work(parts), parts.chain.block
-    every = sum(CORE_COSTS[name] * work[name] for name in ("residual", "input", "tick"))
+    every = sum(CORE_COSTS[name] * work[name] for name in ("residual", "driver", "input", "tick"))
     costs = _slices(parts)
     together = -(-len(costs) // block)
     most = max(sum(costs[first : first + together]) for first in range(0, len(costs), together))
@@ -65,7 +68,10 @@ def _slices(parts: MonitorParts) -> list[float]:
     """Cycles of each part of the work on a block, in its order."""
     product, summaries = CORE_COSTS["product"], parts.summaries
     costs = [POINT * product * parts.points]
-    costs += len(parts.residuals) * [5 * CORE_COSTS["summary"], *(5 * [2.0 * product * (parts.points + 1)])]
+    costs += len(parts.residuals) * [
+        parts.each * CORE_COSTS["summary"],
+        *(parts.each * [2.0 * product * (parts.points + 1)]),
+    ]
     for watch in parts.chain.watches:
         directions = int(watch.matrix.shape[1])
         each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR}[watch.detector]
@@ -171,10 +177,12 @@ def state_bytes(parts: MonitorParts) -> int:
     what stands beside their networks: values that are held, predictions that wait, sums.
     """
     chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
-    sums = 8 * residuals + len(chain.level) + len(chain.moving)
+    sums = (8 + 2 * len(chain.drivers)) * residuals + len(chain.level) + len(chain.moving)
     detectors = sum(int(w.matrix.shape[1]) * (int(w.option) if w.detector == "glr" else 1) for w in chain.watches)
     widest = max(int(w.matrix.shape[1]) for w in chain.watches)
-    doubles = 2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 3 * len(chain.watches) + 5
+    doubles = (
+        2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 3 * len(chain.watches) + parts.each
+    )
     own = 8 * doubles + 4 * summaries + 5 * inputs + 4 * residuals + 4 * len(chain.watches) + 80
     return int(own + sum(map(_source_bytes, parts.sources)))
 

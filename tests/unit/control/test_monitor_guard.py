@@ -96,7 +96,15 @@ def monitor(env, models):
     inputs, count, width = len(channels), len(source.names), 5 * len(source.names)
     places = np.array([[c.name for c in channels].index(judged[0]) for judged in source.judged])
     summaries = BlockSummaries(
-        20, 1.0 / rows.std(axis=0), places, np.zeros(inputs), np.ones(inputs), np.ones(count), places[:0], places[:0]
+        20,
+        1.0 / rows.std(axis=0),
+        places,
+        np.zeros(inputs),
+        np.ones(inputs),
+        np.ones(count),
+        places[:0],
+        places[:0],
+        np.zeros((0, count, 2), np.int64),
     )
     plain = Conditioning(
         np.zeros(0), np.zeros(0), np.zeros((width, 1)), np.ones((width, 1)), np.full(width, 1e-3), 100.0

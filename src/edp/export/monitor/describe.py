@@ -8,6 +8,8 @@ from edp import __version__
 from edp.export.monitor.parts import MonitorParts
 
 SCHEMA = 1
+SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
+"""Of each residual and block."""
 
 
 def description(parts: MonitorParts, name: str) -> dict[str, Any]:
@@ -27,7 +29,7 @@ def description(parts: MonitorParts, name: str) -> dict[str, Any]:
             {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in parts.inputs
         ],
         "residuals": list(parts.residuals),
-        "summaries": ["mean", "spread", "gain", "lag", "peak"],
+        "summaries": [*SUMMARIES, *(f"drive{number + 1}" for number in range(len(chain.drivers)))],
         "watches": [
             {"detector": w.detector, "option": w.option, "directions": int(w.matrix.shape[1])} for w in chain.watches
         ],

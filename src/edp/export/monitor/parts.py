@@ -118,6 +118,8 @@ class ChainPart:
         channel: input that each residual judges.
         level: inputs whose mean is part of the operating point.
         moving: inputs whose mean size is.
+        drivers: of each residual, pairs of inputs whose difference moves what it judges, shape (drivers, residuals, 2);
+            a second one of -1 is none.
         point_offset: of the operating point, shape (points,); `point_width` likewise.
         point_limit: of its scaled numbers.
         usual: of each summary, shape (summaries, 1 + points); `wide` likewise.
@@ -140,6 +142,7 @@ class ChainPart:
     channel: Places
     level: Places
     moving: Places
+    drivers: NDArray[np.int64]
     point_offset: Array
     point_width: Array
     point_limit: float
@@ -221,6 +224,11 @@ class MonitorParts:
     def summaries(self) -> int:
         """Numbers of a block."""
         return len(self.chain.least)
+
+    @property
+    def each(self) -> int:
+        """Summaries of a residual and block."""
+        return 5 + len(self.chain.drivers)
 
     @property
     def points(self) -> int:

@@ -29,8 +29,8 @@ OWN = ("edp_chain.h", "edp_chain.c")
 LONGEST_NAME = 20
 """Of a monitor: names of its networks and functions are made from it."""
 DETECTORS = {"cusum": "EDP_CUSUM", "ewma": "EDP_EWMA", "glr": "EDP_GLR"}
-SUMMARIES = 5
-"""Of a residual and block: `EDP_SUMMARIES`."""
+NO_INPUT = 0xFFFF
+"""Stands for a driver without a second input: `EDP_NO_INPUT`."""
 MOST_MEMORY = 2**31 - 1
 
 
@@ -81,7 +81,7 @@ class MonitorFiles:
     @property
     def slices(self) -> int:
         """Parts of the work on a block: operating point, residuals and their summaries, watches, the verdict."""
-        return 2 + (SUMMARIES + 1) * len(self.parts.residuals) + sum(map(_watch_slices, self.parts.chain.watches))
+        return 2 + (self.parts.each + 1) * len(self.parts.residuals) + sum(map(_watch_slices, self.parts.chain.watches))
 
     def _numbers(self) -> Code:
         head = f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */\n"
@@ -98,8 +98,19 @@ class MonitorFiles:
             tables.doubles(name, getattr(chain, name))
         for name in ("channel", "level", "moving"):
             tables.places(name, getattr(chain, name))
-        sizes = (chain.block, len(chain.centre), len(chain.scale), len(chain.level), len(chain.moving))
-        named = ", ".join([*(f"{size}u" for size in sizes), "centre, spread, scale, change, channel, level, moving"])
+        pairs = chain.drivers.transpose(1, 0, 2).reshape(-1, 2)
+        tables.places("driver_first", pairs[:, 0].tolist())
+        tables.places("driver_second", np.where(pairs[:, 1] < 0, NO_INPUT, pairs[:, 1]).tolist())
+        sizes = (
+            chain.block,
+            len(chain.centre),
+            len(chain.scale),
+            len(chain.level),
+            len(chain.moving),
+            len(chain.drivers),
+        )
+        arrays = "centre, spread, scale, change, channel, level, moving, driver_first, driver_second"
+        named = ", ".join([*(f"{size}u" for size in sizes), arrays])
         tables.text(f"static const edp_blocks blocks = {{{named}}};")
         for name in ("point_offset", "point_width", "usual", "wide", "least"):
             tables.singles(name, getattr(chain, name))
@@ -122,7 +133,7 @@ class MonitorFiles:
         tables.text(
             f"static const uint32_t memory_from[{len(rows)}] = {{{', '.join(f'{m}u' for m in memories[:-1])}}};"
         )
-        first = 1 + (SUMMARIES + 1) * len(self.parts.residuals)
+        first = 1 + (self.parts.each + 1) * len(self.parts.residuals)
         starts = first + np.cumsum([0, *map(_watch_slices, self.parts.chain.watches)])
         slice_text = ", ".join(f"{start}u" for start in starts.tolist())
         tables.text(f"static const uint32_t slices_from[{len(starts)}] = {{{slice_text}}};")
@@ -171,6 +182,8 @@ class MonitorFiles:
             "limit": f"{chain.impossible:.0f}",
             "inputs": len(parts.inputs),
             "residuals": len(parts.residuals),
+            "each": parts.each,
+            "drivers": len(chain.drivers),
             "levels": len(chain.level),
             "moving": len(chain.moving),
             "points": max(1, parts.points),
@@ -203,7 +216,12 @@ class MonitorFiles:
         """Of a tick, on average: + - * / each count as one."""
         chain = self.parts.chain
         summaries, points = self.parts.summaries, self.parts.points
-        tick = 14 * len(chain.scale) + 2 * len(chain.centre) + len(chain.level) + len(chain.moving)
+        tick = (
+            (14 + 5 * len(chain.drivers)) * len(chain.scale)
+            + 2 * len(chain.centre)
+            + len(chain.level)
+            + len(chain.moving)
+        )
         white = sum(2 * watch.matrix.size + 5 * _memory(watch) for watch in chain.watches)
         return tick + round((summaries * (4 * points + 12) + white) / chain.block)
 

@@ -238,6 +238,7 @@ def chain_part(chain: MonitorChain) -> ChainPart:
         channel=tuple(summaries.channel.tolist()),
         level=tuple(summaries.level.tolist()),
         moving=tuple(summaries.moving.tolist()),
+        drivers=summaries.drivers,
         point_offset=conditioning.offset,
         point_width=conditioning.width,
         point_limit=POINT_LIMIT,

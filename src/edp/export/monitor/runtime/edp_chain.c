@@ -119,8 +119,24 @@ static void add_residual(double r, double u, double d, double *sums) {
     sums[7] = (size_of(r) > sums[7]) ? size_of(r) : sums[7];
 }
 
+/* Numbers of a residual in the sums of a block. */
+static uint32_t stride_of(const edp_blocks *b) { return EDP_SUMS + (2u * b->drivers); }
+
+/* What of a residual goes with what moves its part. */
+static void add_drivers(const edp_blocks *b, uint32_t residual, bool known, double r, const double *y, double *own) {
+    for (uint32_t k = 0; k < b->drivers; k++) {
+        const uint32_t at = (residual * b->drivers) + k;
+        const double one = y[b->first[at]];
+        const double w = (b->second[at] == EDP_NO_INPUT) ? one : (one - y[b->second[at]]);
+        if (known) {
+            own[EDP_SUMS + (2u * k)] += r * w;
+        }
+        own[EDP_SUMS + (2u * k) + 1u] += w * w;
+    }
+}
+
 void edp_block_tick(const edp_blocks *b, bool first, const float *in, const float *residuals, double *y, double *sums) {
-    double *const levels = &sums[EDP_SUMS * b->residuals];
+    double *const levels = &sums[stride_of(b) * b->residuals];
     double *const sizes = &levels[b->levels];
     /* Each residual first takes the channel of the tick before, then that of this one. */
     for (uint32_t i = 0; i < b->residuals; i++) {
@@ -128,7 +144,7 @@ void edp_block_tick(const edp_blocks *b, bool first, const float *in, const floa
         const double before = y[c];
         const double u = edp_known((double)in[c]) ? (((double)in[c] - b->centre[c]) * b->spread[c]) : before;
         const double d = first ? 0.0 : (u - before);
-        double *const own = &sums[EDP_SUMS * i];
+        double *const own = &sums[stride_of(b) * i];
         if (edp_known((double)residuals[i])) {
             add_residual((double)residuals[i] * b->scale[i], u, d, own);
         }
@@ -140,6 +156,10 @@ void edp_block_tick(const edp_blocks *b, bool first, const float *in, const floa
             y[c] = ((double)in[c] - b->centre[c]) * b->spread[c];
         }
     }
+    for (uint32_t i = 0; i < b->residuals; i++) {
+        const bool known = edp_known((double)residuals[i]);
+        add_drivers(b, i, known, known ? ((double)residuals[i] * b->scale[i]) : 0.0, y, &sums[stride_of(b) * i]);
+    }
     for (uint32_t i = 0; i < b->levels; i++) {
         levels[i] += y[b->level[i]];
     }
@@ -148,14 +168,14 @@ void edp_block_tick(const edp_blocks *b, bool first, const float *in, const floa
     }
 }
 
-void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double summaries[EDP_SUMMARIES]) {
-    const double *const own = &sums[EDP_SUMS * residual];
+void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double *summaries) {
+    const double *const own = &sums[stride_of(b) * residual];
     const double whole = (double)b->ticks;
     const double n = (own[0] > 1.0) ? own[0] : 1.0;
     const double mean = own[1] / n;
     const double variance = (own[2] / n) - (mean * mean);
     if ((2.0 * own[0]) < whole) {
-        for (uint32_t i = 0; i < EDP_SUMMARIES; i++) {
+        for (uint32_t i = 0; i < (EDP_SUMMARIES + b->drivers); i++) {
             summaries[i] = edp_unknown();
         }
     } else {
@@ -164,12 +184,16 @@ void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t resid
         summaries[2] = own[3] / (own[4] + (EDP_NEAR_ZERO * whole));
         summaries[3] = own[5] / (own[6] + ((EDP_NEAR_ZERO * whole) * b->change[residual]));
         summaries[4] = edp_root(own[7]);
+        for (uint32_t k = 0; k < b->drivers; k++) {
+            const double *const pair = &own[EDP_SUMS + (2u * k)];
+            summaries[EDP_SUMMARIES + k] = pair[0] / (pair[1] + (EDP_NEAR_ZERO * whole));
+        }
     }
 }
 
 void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
                      double *point) {
-    const double *const values = &sums[EDP_SUMS * b->residuals];
+    const double *const values = &sums[stride_of(b) * b->residuals];
     const double whole = (double)b->ticks;
     for (uint32_t i = 0; i < (b->levels + b->moving); i++) {
         point[i] = edp_within(((values[i] / whole) - (double)offset[i]) / (double)width[i], -limit, limit);

@@ -28,17 +28,20 @@ uint32_t edp_crc_doubles(uint32_t crc, const double *values, uint32_t n);
 
 /* ---- from residuals at every tick to numbers of a block ------------------------------------------------------------ */
 
-#define EDP_SUMS 8u      /* of a residual: ticks, r, r r, r u, u u, r d, d d, largest |r| */
-#define EDP_SUMMARIES 5u /* of a residual and block: mean, spread, gain, lag, peak */
+#define EDP_SUMS 8u      /* of a residual: ticks, r, r r, r u, u u, r d, d d, largest |r|; behind them r w, w w a driver */
+#define EDP_SUMMARIES 5u /* of a residual and block: mean, spread, gain, lag, peak; behind them one a driver */
+#define EDP_NO_INPUT 0xFFFFu
 
 /* How blocks are formed. r is a residual times `scale`, u the channel that it judges less its `centre` times `spread`, d
-   the change of u since the tick before: both factors are one over a usual width. */
+   the change of u since the tick before: both factors are one over a usual width. A driver w is one scaled input, less
+   another one unless that is EDP_NO_INPUT. */
 typedef struct {
     uint32_t ticks; /* of a block */
     uint32_t inputs;
     uint32_t residuals;
     uint32_t levels;
     uint32_t moving;
+    uint32_t drivers; /* of each residual */
     const double *centre;  /* (inputs) */
     const double *spread;  /* (inputs) */
     const double *scale;   /* (residuals) */
@@ -46,15 +49,19 @@ typedef struct {
     const uint16_t *channel; /* (residuals) input that each judges */
     const uint16_t *level;   /* (levels) inputs whose mean is part of the operating point */
     const uint16_t *size;    /* (moving) inputs whose mean size is */
+    const uint16_t *first;   /* (residuals, drivers) */
+    const uint16_t *second;  /* (residuals, drivers) */
 } edp_blocks;
 
 /* Doubles in `sums` of one block. */
-#define EDP_BLOCK_SUMS(residuals, levels, moving) (EDP_SUMS * (residuals) + (levels) + (moving))
+#define EDP_BLOCK_SUMS(residuals, drivers, levels, moving) \
+    (((EDP_SUMS + (2u * (drivers))) * (residuals)) + (levels) + (moving))
 
 /* A tick: NaN where an input or a residual is missing. `y` (inputs) is what the last tick left, zero before the first. */
 void edp_block_tick(const edp_blocks *b, bool first, const float *in, const float *residuals, double *y, double *sums);
-/* The summaries of a residual when the block has ended; NaN where more than half of its ticks are missing. */
-void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double summaries[EDP_SUMMARIES]);
+/* The summaries of a residual when the block has ended, EDP_SUMMARIES and one a driver; NaN where more than half of its
+   ticks are missing. */
+void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double *summaries);
 /* The operating point (levels + moving), scaled and limited. */
 void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
                      double *point);
