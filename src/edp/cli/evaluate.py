@@ -58,22 +58,29 @@ def evaluate(
         raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
     names = None if baselines is None else baseline_names(baselines)
     from edp.evaluation.guard import beaten_by
+    from edp.report.run.outputs import judged_line, losses_line
+    from edp.storage.runs import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json)
     beaten = beaten_by(scores)
+    lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
     importances = run_importance(run, source, as_json) if channel_importance else None
 
     def show() -> None:
         if beaten is not None:
             out.print(beaten.sentence(), style="bold red")
+        if lost:
+            out.print(lost, style="bold red")
         score_table(scores)
+        out.print(judged)
         out.print(f"scores in {folder / 'scores.json'}")
         if importances is not None:
             importance_table(importances)
             out.print(f"importance of the channels in {folder / 'channel_importance.json'}")
         out.print(f"next: edp report {folder}")
 
-    facts = {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **scores}
+    sentences = {"losses": lost, "tests": judged}
+    facts = {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **sentences, **scores}
     importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
     emit(as_json, facts | importance_json, show)
     if beaten is not None:
@@ -171,6 +178,10 @@ def score_table(scores: dict[str, Any]) -> None:
     rate = scores["task"]["rate_hz"]
     units = {target["unit"] for target in scores["targets"]}
     unit = units.pop() if len(units) == 1 else "mixed units"
+    if len(scores["targets"]) > 1 and unit in ("mixed units", "1"):
+        _tables_by_output(scores, rate)
+        interval_rows(scores, unit)
+        return
     for horizon in scores["task"]["horizons"]:
         rows = []
         for model in scores["models"].values():
@@ -186,6 +197,23 @@ def score_table(scores: dict[str, Any]) -> None:
     for name, model in scores["models"].items():
         for target, integral_scores in model.get("integrated", {}).items():
             out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g} {unit} s")
+
+
+def _tables_by_output(scores: dict[str, Any], rate: float) -> None:
+    """Print a table a horizon with a column an output: numbers in different units, or in none, have no mean."""
+    targets = scores["targets"]
+    heads = ["model", *(f"{t['name']}{'' if t['unit'] == '1' else ', ' + t['unit']}" for t in targets)]
+    for horizon in scores["task"]["horizons"]:
+        errors = {
+            model["label"]: [model["overall"][str(horizon)][t["name"]]["mae"] for t in targets]
+            for model in scores["models"].values()
+        }
+        ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
+        rows = [[label, *(f"{value:.4g}" for value in values)] for label, values in errors.items()]
+        table(f"{ahead}, MAE of each output", heads, rows)
+    for name, model in scores["models"].items():
+        for target, integral_scores in model.get("integrated", {}).items():
+            out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g}")
 
 
 def interval_rows(scores: dict[str, Any], unit: str) -> None:

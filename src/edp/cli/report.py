@@ -26,6 +26,7 @@ def report(
     from edp.errors import ConfigError
     from edp.report import build_report, build_twin_report, headline, holds_free_runs, read_facts
     from edp.report.run.facts import main_horizon
+    from edp.report.run.outputs import judged_line
     from edp.report.run.predictability import limit_line
 
     if holds_free_runs(run):
@@ -37,11 +38,14 @@ def report(
     page = build_report(run, output, title, limit)
     facts = read_facts(run, limit)
     line, least = headline(facts), limit_line(facts, main_horizon(facts))
+    judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
 
     def show() -> None:
         out.print(line)
+        if judged:
+            out.print(judged)
         if least:
             out.print(least)
         out.print(f"report: {page.resolve()}")
 
-    emit(as_json, {"report": str(page), "headline": line, "limit": least}, show)
+    emit(as_json, {"report": str(page), "headline": line, "tests": judged, "limit": least}, show)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -91,9 +93,8 @@ class ByRecording:
             raise DataError("split: a recording is named both in validation and in test; keep it in one")
         test, validation = list(self.test), list(self.validation)
         free = [name for name in names if name not in {*test, *validation}]
-        families = {r.name: str(r.meta.get(FAMILY, "")) for r in recordings}
-        order = np.random.default_rng(self.seed).permutation(len(free))
-        drawn = _spread([free[i] for i in order], families)
+        families = self._families(recordings)
+        drawn = _spread(self._drawn(free), families)
         if not test:
             test, drawn = _take(drawn, self.test_share, len(names))
             drawn = _spread(drawn, families)
@@ -108,6 +109,37 @@ class ByRecording:
         if not parts["validation"]:
             parts = _hold_tail(parts, self.tail_share, gap)
         return _checked(parts, recordings, gap)
+
+    def _families(self, recordings: Sequence[Recording]) -> dict[str, str]:
+        """What recordings are of, by name; each part has its share of every family."""
+        return {recording.name: str(recording.meta.get(FAMILY, "")) for recording in recordings}
+
+    def _drawn(self, names: Sequence[str]) -> list[str]:
+        """Names in the order of the draw."""
+        return [names[i] for i in np.random.default_rng(self.seed).permutation(len(names))]
+
+
+@SPLITS.register("names")
+@dataclass(frozen=True, kw_only=True)
+class ByName(ByRecording):
+    """Whole recordings as in `ByRecording`, drawn by nothing but their names and the seed.
+
+    The same logs draw the same tests in every format, in any order, beside any others of other kinds: formats differ in
+    what else they keep. Kinds are names without their numbers (``dig_01`` and ``dig_02`` are of one kind), and each
+    part has its share of every kind.
+    """
+
+    def _families(self, recordings: Sequence[Recording]) -> dict[str, str]:
+        return {recording.name: kind_of_name(recording.name) for recording in recordings}
+
+    def _drawn(self, names: Sequence[str]) -> list[str]:
+        # A hash, since a permutation of places would follow the order in which a folder is listed.
+        return sorted(names, key=lambda name: hashlib.blake2b(f"{self.seed}/{name}".encode()).digest())
+
+
+def kind_of_name(name: str) -> str:
+    """The name of a recording without its numbers: ``m22_003_dig`` is of the kind ``m dig``."""
+    return " ".join(re.findall(r"[^\W\d_]+", name))
 
 
 @SPLITS.register("time")

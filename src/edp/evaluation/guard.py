@@ -71,6 +71,41 @@ def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
     return worst if mean > LEAST else None
 
 
+@dataclass(frozen=True)
+class LostOutput:
+    """An output on which a baseline has less error than the network.
+
+    Attributes:
+        target: name of the output.
+        label: how tables call the best baseline on it.
+        less: by which share its error is less, over all horizons.
+    """
+
+    target: str
+    label: str
+    less: float
+
+
+def lost_outputs(scores: Mapping[str, Any]) -> list[LostOutput]:
+    """The outputs on which some baseline has less root-mean-square error than the network, the worst first.
+
+    Args:
+        scores: the content of ``scores.json``.
+    """
+    models, horizons = scores["models"], scores["task"]["horizons"]
+    lost = []
+    for target in scores["targets"] if NETWORK in models else ():
+        gains = {
+            str(model["label"]): _logarithm(models[NETWORK], model, target["name"], horizons)
+            for name, model in models.items()
+            if name != NETWORK
+        }
+        best = max((label for label in gains if gains[label] > LEAST), key=lambda label: gains[label], default=None)
+        if best is not None:
+            lost.append(LostOutput(str(target["name"]), best, 1.0 - math.exp(-gains[best])))
+    return sorted(lost, key=lambda output: -output.less)
+
+
 def twin_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
     """The floor that beats the twin by most on free runs; None where none does.
 

@@ -120,7 +120,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     if len(channels) > MOST_FEATURES:
         notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")
         channels = list(dict.fromkeys([*channels[:MOST_FEATURES], *targets]))
-    split = {"kind": "recordings"} if len(group.paths) >= _LEAST_RECORDINGS else {"kind": "time"}
+    split = {"kind": "names"} if len(group.paths) >= _LEAST_RECORDINGS else {"kind": "time"}
     files = {
         MAP: _text(_map_table(proposal.signal_map), _remarks(source, proposal)),
         SETTINGS: _settings(proposal, channels, targets, split),

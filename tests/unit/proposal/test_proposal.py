@@ -183,7 +183,7 @@ def test_many_logs_are_divided_by_recording_and_few_by_time(tmp_path):
         write(tmp_path / "many" / f"{i}.csv", machine(10.0, seed=i))
         if i < 2:
             write(tmp_path / "few" / f"{i}.csv", machine(10.0, seed=i))
-    assert 'kind = "recordings"' in propose(tmp_path / "many").files[SETTINGS]
+    assert 'kind = "names"' in propose(tmp_path / "many").files[SETTINGS]
     assert 'kind = "time"' in propose(tmp_path / "few").files[SETTINGS]
 
 

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from edp.errors import DataError, StorageError
+from edp.report.common.tables import comparison_tables, key_figures
 from edp.report.common.wording import decimals_for, duration, listed, number, percent, unbroken
 from edp.report.run.facts import (
     NETWORK,
@@ -14,6 +15,7 @@ from edp.report.run.facts import (
     spread_text,
     verdict_lines,
 )
+from edp.report.run.outputs import judged_line
 
 
 def edit_scores(folder, change):
@@ -67,7 +69,61 @@ def test_outputs_in_different_units_have_no_common_unit(run_folder):
     edit_scores(run_folder, change)
     facts = read_facts(run_folder)
     assert facts.unit == ""
-    assert "mm/s in boom cylinder velocity on average" in headline(facts)
+    assert not facts.averaged
+    line = headline(facts)
+    assert "mm/s in boom cylinder velocity" in line
+    assert "bar in stick cylinder velocity" in line
+    assert not any("best baseline" in line for line in verdict_lines(facts))
+    # Nor do tables and tiles show a mean of speeds and pressures.
+    assert all(table.columns[1][0] != "MAE" for table in comparison_tables(facts))
+    assert [unit for _, unit, _ in key_figures(facts)[:3]] == ["mm/s", "bar", "mm/s"]
+    assert spread_text(facts) == ""
+
+
+def test_outputs_without_a_unit_are_never_averaged(run_folder):
+    def change(scores):
+        for target in scores["targets"]:
+            target["unit"] = "1"
+
+    edit_scores(run_folder, change)
+    facts = read_facts(run_folder)
+    assert not facts.averaged
+    assert "network is off by 3.28 in boom cylinder velocity" in headline(facts)
+    assert " 1 " not in headline(facts)
+
+
+def test_outputs_that_lose_stand_first(run_folder):
+    def change(scores):
+        name = scores["targets"][1]["name"]
+        for horizon in scores["task"]["horizons"]:
+            best = scores["models"]["persistence"]["overall"][str(horizon)][name]
+            best["rmse"] = 0.5 * scores["models"]["network"]["overall"][str(horizon)][name]["rmse"]
+
+    assert "loses" not in headline(read_facts(run_folder))
+    edit_scores(run_folder, change)
+    facts = read_facts(run_folder)
+    name = facts.targets[1].name
+    start = f"The network loses to a baseline on 1 of 3 outputs: {name} (Persistence: 50 % less error)."
+    assert headline(facts).startswith(start)
+
+
+def test_test_logs_are_named_with_what_they_cannot_prove(run_folder):
+    facts = read_facts(run_folder)
+    judged = list(facts.scores["models"][NETWORK]["recordings"])
+    assert any(judged[0] in line and line.startswith("Judged on") for line in verdict_lines(facts))
+
+    def scores(*names):
+        return {"models": {NETWORK: {"recordings": {name: {} for name in names}}}}
+
+    trained = {"data": {"train": {"names": ["dig_1", "travel_1"]}}}
+    assert judged_line(scores(), trained) == ""
+    assert "So few that one odd log decides" in judged_line(scores("dig_2", "dig_3"), trained)
+    same = judged_line(scores("dig_2", "dig_3", "dig_4"), trained)
+    assert same == (
+        "Judged on 3 test logs: dig_2, dig_3 and dig_4. All are of one kind; the figure says nothing of travel."
+    )
+    assert "kind" not in judged_line(scores("dig_2", "dig_3", "travel_4"), trained)
+    assert "and others" in judged_line(scores(*(f"{i}" for i in range(9))), trained)
 
 
 def test_verdict_names_what_exceeds_the_budget(run_folder):

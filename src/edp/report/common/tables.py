@@ -26,9 +26,18 @@ class TextTable:
     marked: frozenset[int] = frozenset()
 
 
+_TILES = 3
+"""Outputs that have a tile of their own where they have no common unit."""
+
+
 def comparison_tables(facts: Facts) -> list[TextTable]:
-    """Metrics of every model, one table per horizon, the headline's horizon first."""
+    """Metrics of every model, one table per horizon, the headline's horizon first.
+
+    Means over outputs where they have one unit, else the mean absolute error of each output.
+    """
     order = sorted(facts.horizons, key=lambda k: (k != main_horizon(facts), k))
+    if not facts.averaged:
+        return [table for horizon in order if (table := _by_output(facts, horizon)) is not None]
     return [table for table in (_comparison(facts, horizon) for horizon in order) if table.rows]
 
 
@@ -59,15 +68,19 @@ def _any(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
 
 
 def output_table(facts: Facts) -> TextTable | None:
-    """Mean absolute error by output at the longest horizon."""
-    horizon = main_horizon(facts)
-    rows = comparison_rows(facts)
+    """Mean absolute error by output at the longest horizon; None where `comparison_tables` shows it already."""
+    return _by_output(facts, main_horizon(facts)) if facts.averaged else None
+
+
+def _by_output(facts: Facts, horizon: int | None) -> TextTable | None:
+    rows = comparison_rows(facts, horizon)
     if horizon is None or not rows or len(facts.targets) < 2:
         return None
     names = [target.name for target in facts.targets]
     places = {name: decimals_for(row["outputs"][name] for row in rows) for name in names}
     lines = tuple((row["label"], *(number(row["outputs"][name], places[name]) for name in names)) for row in rows)
-    columns = (("Model", ""), *((target.description, target.unit) for target in facts.targets))
+    units = ["" if target.unit == "1" else target.unit for target in facts.targets]
+    columns = (("Model", ""), *((target.description, unit) for target, unit in zip(facts.targets, units)))
     marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
     return TextTable(f"MAE by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
 
@@ -221,12 +234,17 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
     rows = comparison_rows(facts)
     tiles: list[tuple[str, str, str]] = []
     ours = next((row for row in rows if row["is_network"]), None)
+    if not facts.averaged and ours:
+        for target in facts.targets[:_TILES]:
+            unit = "" if target.unit == "1" else target.unit
+            tiles.append((number(ours["outputs"][target.name]), unit, f"mean absolute error, {target.name}"))
+        ours = None
     if ours:
         tiles.append((number(ours["mae"]), facts.unit, "mean absolute error"))
         if ours["p95"] is not None:
             tiles.append((number(ours["p95"]), facts.unit, "95 % of errors are below"))
     best = next((row for row in rows if row["change"] is not None), None)
-    if best:
+    if best and facts.averaged:
         tiles.append((percent(best["change"], signed=True), "", f"error against {best['label']}, the best baseline"))
     elif ours and ours["r2"] is not None:
         tiles.append((number(ours["r2"], 4), "", "R²"))

@@ -15,6 +15,7 @@ from edp.errors import DataError, StorageError
 from edp.evaluation.guard import beaten_by
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
+from edp.report.run.outputs import by_output, judged_line, losses_line
 from edp.report.run.predictability import limit_line, read_limit
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
 
@@ -94,9 +95,18 @@ class Facts:
 
     @property
     def unit(self) -> str:
-        """The unit that all outputs share; empty where they differ, because then a mean over outputs has none."""
+        """The unit that all outputs share; empty where they differ, because then a mean over outputs has none.
+
+        Outputs without a unit have no common one: their numbers may be anything.
+        """
         units = {target.unit for target in self.targets}
-        return units.pop() if len(units) == 1 else ""
+        shared = units.pop() if len(units) == 1 else ""
+        return "" if shared == "1" else shared
+
+    @property
+    def averaged(self) -> bool:
+        """Whether a mean over the outputs says something: of one output, or of several in one unit."""
+        return len(self.targets) < 2 or bool(self.unit)
 
 
 def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts:
@@ -260,9 +270,9 @@ def comparison_rows(facts: Facts, horizon: int | None = None) -> list[dict[str, 
 
 
 def headline(facts: Facts) -> str:
-    """The verdict in one sentence: the network's mean error at the longest horizon, and the baselines'.
+    """The verdict: outputs that a baseline predicts better, then the network's error at the longest horizon.
 
-    Outputs in different units have no common mean, so the sentence then speaks of the first output.
+    Outputs in different units, or without one, have no common mean: each then stands by itself.
     """
     samples = main_horizon(facts)
     rows = comparison_rows(facts)
@@ -271,16 +281,17 @@ def headline(facts: Facts) -> str:
     beaten = beaten_by(facts.scores) if facts.scores else None
     if beaten is not None:
         return beaten.sentence()
-    unit, what, key = facts.unit, "", "mean"
-    if not unit and facts.targets:
-        first = facts.targets[0]
-        unit, what, key = first.unit, f" in {first.description[:1].lower()}{first.description[1:]}", first.name
-    values = {row["model"]: score(facts.models[row["model"]], samples, output=key) for row in rows}
+    first = losses_line(facts.scores) if facts.scores else ""
+    if not facts.averaged and facts.scores:
+        targets = [(target.name, target.description, target.unit) for target in facts.targets]
+        return f"{first} {by_output(facts.scores, samples, targets, horizon_text(facts, samples))}".strip()
+    unit = facts.unit
+    values = {row["model"]: score(facts.models[row["model"]], samples) for row in rows}
     places = min(max(decimals_for(values.values(), significant=2), 1), 4)
     parts = [f"{row['label']} {number(values[row['model']], places)}" for row in rows if not row["is_network"]]
     shown = parts if len(parts) <= 4 else [*parts[:3], f"{len(parts) - 3} more above that"]
     start = f"At {horizon_text(facts, samples)} ahead the network is off by {number(values[NETWORK], places)} {unit}"
-    return "; ".join([f"{start.rstrip()}{what} on average", *shown]) + "."
+    return f"{first} {'; '.join([f'{start.rstrip()} on average', *shown])}.".strip()
 
 
 def verdict_lines(facts: Facts) -> list[str]:
@@ -288,7 +299,7 @@ def verdict_lines(facts: Facts) -> list[str]:
     lines = []
     rows = comparison_rows(facts)
     baselines = [row for row in rows if row["change"] is not None]
-    if baselines:
+    if baselines and facts.averaged:
         best = baselines[0]
         lower = best["change"] < 0
         lines.append(
@@ -298,9 +309,9 @@ def verdict_lines(facts: Facts) -> list[str]:
         won, both = recordings_won(facts, best["model"])
         if both:
             lines.append(f"It is the better of the two on {won} of {both} test recordings.")
+    judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))
-    if limit:
-        lines.append(limit)
+    lines += [line for line in (judged, limit) if line]
     checks = (facts.footprint or {}).get("verdict", [])
     if checks:
         over = [str(check["what"]) for check in checks if not check["fits"]]
@@ -328,7 +339,11 @@ def spread_text(facts: Facts) -> str:
     """How the network's error spreads over the test recordings, as a sentence; empty where it was not computed."""
     samples = main_horizon(facts)
     spread = facts.models.get(NETWORK, {}).get("spread", {}).get(str(samples)) if samples is not None else None
-    if not spread or any(spread.get(key) is None for key in ("median", "q25", "q75", "min", "max")):
+    if (
+        not facts.averaged
+        or not spread
+        or any(spread.get(key) is None for key in ("median", "q25", "q75", "min", "max"))
+    ):
         return ""
     places = decimals_for(spread[key] for key in ("median", "q25", "q75"))
     text = {key: number(spread[key], places) for key in ("median", "q25", "q75", "min", "max")}

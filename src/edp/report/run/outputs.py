@@ -1,0 +1,83 @@
+"""What a run's scores say output by output, and what its test logs can prove: the sentences around the headline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from edp.data.splits import kind_of_name
+from edp.evaluation.guard import NETWORK, lost_outputs
+from edp.report.common.wording import listed, number, percent
+
+SHOWN = 4
+"""Outputs or logs that a sentence names."""
+FEW = 3
+"""Test logs below which one odd log decides the figure."""
+
+
+def losses_line(scores: Mapping[str, Any]) -> str:
+    """The outputs on which a baseline has less error than the network, worst first; empty where there are none."""
+    losses = lost_outputs(scores)
+    if not losses:
+        return ""
+    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less error)" for loss in losses[:SHOWN]]
+    more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
+    return (
+        f"The network loses to a baseline on {len(losses)} of {len(scores['targets'])} outputs: {listed(parts)}{more}."
+    )
+
+
+def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> str:
+    """Which logs were judged, and a warning where they are few or all of one kind; empty where scores name none.
+
+    Args:
+        scores: the content of ``scores.json``.
+        provenance: of the run; None where it is unknown what trained.
+    """
+    judged = list(scores["models"].get(NETWORK, {}).get("recordings", {}))
+    if not judged:
+        return ""
+    shown = listed(judged[:SHOWN]) if len(judged) <= SHOWN else f"{', '.join(judged[:SHOWN])} and others"
+    line = f"Judged on {len(judged)} test log{'s' if len(judged) > 1 else ''}: {shown}."
+    trained = (provenance or {}).get("data", {}).get("train", {}).get("names", [])
+    kinds = {kind_of_name(name) for name in judged}
+    others = {kind_of_name(name) for name in trained} - kinds
+    if len(judged) < FEW:
+        line += " So few that one odd log decides the figure: judge on more (edp evaluate RUN --data LOGS)."
+    elif len(kinds) == 1 and others and "" not in kinds:
+        line += f" All are of one kind; the figure says nothing of {listed(sorted(others)[:SHOWN])}."
+    return line
+
+
+def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[str, str, str]], ahead: str) -> str:
+    """The headline where outputs have no common unit: each with its own error, and the best baseline's.
+
+    Args:
+        scores: the content of ``scores.json``.
+        horizon: samples ahead.
+        targets: name, description and unit of each output.
+        ahead: the horizon in words.
+    """
+    parts = []
+    for name, description, unit in targets[:SHOWN]:
+        errors = {
+            str(model["label"]): model["overall"].get(str(horizon), {}).get(name, {}).get("mae")
+            for key, model in scores["models"].items()
+            if key != NETWORK
+        }
+        ours = scores["models"][NETWORK]["overall"].get(str(horizon), {}).get(name, {}).get("mae")
+        if ours is None:
+            continue
+        finite = {label: error for label, error in errors.items() if error is not None and math.isfinite(error)}
+        best = min(finite, key=lambda label: finite[label], default=None)
+        beside = "" if best is None else f" ({best} {number(finite[best], _places(finite[best]))})"
+        of_unit = "" if unit in ("", "1") else f" {unit}"
+        parts.append(f"{number(ours, _places(ours))}{of_unit} in {description[:1].lower()}{description[1:]}{beside}")
+    more = f"; {len(targets) - SHOWN} more outputs below" if len(targets) > SHOWN else ""
+    return f"At {ahead} ahead the network is off by {', '.join(parts)} on average{more}."
+
+
+def _places(value: float) -> int:
+    """Decimals that show three digits of a value."""
+    return 4 if not value else int(min(max(2 - math.floor(math.log10(abs(value))), 0), 8))
