@@ -195,14 +195,14 @@ def _divided(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
     split, recordings = settings.split, source.read()
     if not isinstance(split, ByRecording) or split.validation or split.test:
         return settings
-    shares = {"validation_share": split.validation_share, "test_share": split.test_share}
+    by_time = ByTime(validation_share=split.validation_share, test_share=split.test_share)
     if len(recordings) == 1:
-        return replace(settings, split=ByTime(**shares))
+        return replace(settings, split=by_time)
     gap = LEAST_SPAN + max(settings.task.horizons)
     # Of equal recordings that are too short to be divided nothing would be left to validate.
     if _even(split, recordings, gap) or all(recording.samples < LEAST_DIVIDED * gap for recording in recordings):
         return settings
-    return replace(settings, split=ByTime(**shares, whole_short=True))
+    return replace(settings, split=replace(by_time, whole_short=True))
 
 
 def _even(split: ByRecording, recordings: Sequence[Recording], gap: int) -> bool:
