@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
 from edp.report import build_report
@@ -153,6 +154,23 @@ def test_a_network_with_a_validation_part_of_its_own_is_compared_on_that_part(tm
     # A network of a few updates hardly beats the mean change; the linear model does.
     assert facts["chosen"] == "linear"
     assert linear < recurrent < 3 * facts["persistence"]["4"]["y"]
+
+
+@pytest.mark.parametrize(
+    ("lengths", "kind"),
+    [((900,), "time"), ((900, 900, 900), "recordings"), ((4000, 200), "time"), ((150,) * 9, "recordings")],
+)
+def test_recordings_are_divided_by_time_where_whole_ones_are_no_parts(tmp_path, lengths, kind):
+    for number, ticks in enumerate(lengths):
+        write(tmp_path / "logs", ticks=ticks, seed=number)
+        (tmp_path / "logs" / "log.csv").rename(tmp_path / "logs" / f"{number}.csv")
+    (tmp_path / "logs" / "map.toml").rename(tmp_path / "map.toml")
+    source = DataSource.of(tmp_path / "logs", tmp_path / "map.toml")
+    settings = [*SET[:3], "auto.candidates=['linear']", "judge.baselines=[]"]
+    train_auto(source, load_auto(None, settings), tmp_path / "run")
+    _, experiment, _, data = trained_run(tmp_path / "run")
+    assert SPLITS.name_of(experiment.split) == kind
+    assert sum(part.samples for part in data.train) > 0.5 * sum(lengths)
 
 
 @pytest.mark.processes

@@ -129,7 +129,38 @@ def many_outputs() -> Columns:
     return {name: columns[name] for name in ("u", "v", "p")} | later
 
 
+def collinear() -> Columns:
+    """A copy of the target, a copy of the lever, and sums of channels."""
+    columns = rig(31, 60, 50)
+    u, v, p = columns["u"], columns["v"], columns["p"]
+    return columns | {"v2": v, "u2": u, "sum": u + 0.5 * v, "turned": -2 * p}
+
+
+def spiked() -> Columns:
+    """Twenty ticks each at which speed and pressure are off by fifty spreads."""
+    columns, draw = rig(32, 60, 50), np.random.default_rng(32)
+    for name in ("v", "p"):
+        spikes = draw.integers(0, len(columns[name]), 20)
+        columns[name][spikes] += 50 * columns[name].std() * draw.choice([-1.0, 1.0], 20)
+    return columns
+
+
+def delayed() -> Columns:
+    """A second measurement of the speed that comes three ticks late."""
+    columns = rig(33, 60, 50)
+    return columns | {"late": np.roll(columns["v"], 3)}
+
+
 ODDITIES = {
+    "columns that say the same": Oddity(lambda: [collinear()], 50, ["task.targets=['v']", "task.horizons=[1, 5]"]),
+    "outliers": Oddity(lambda: [spiked()], 50, ["task.targets=['v']", "task.horizons=[5]"]),
+    "a delayed copy of the target": Oddity(lambda: [delayed()], 50, ["task.targets=['v']", "task.horizons=[5]"]),
+    "two recordings of very different lengths": Oddity(
+        lambda: [rig(36, 100, 50), rig(37, 4, 50)], 50, ["task.targets=['v']", "task.horizons=[1, 5]"]
+    ),
+    "a recording far shorter than the others": Oddity(
+        lambda: [rig(36, 60, 50), rig(38, 60, 50), rig(37, 2, 50)], 50, ["task.targets=['v']", "task.horizons=[5]"]
+    ),
     "a channel that first moves in the test part": Oddity(
         lambda: [moves_late()], 50, ["task.targets=['v']", "task.horizons=[5]"]
     ),
@@ -242,6 +273,21 @@ def check(source: DataSource, settings: Sequence[str], factor: float, folder: Pa
     assert math.exp(np.mean(excess)) <= factor, np.exp(excess)
     page = build_report(folder).read_text(encoding="utf-8")
     assert "Why this model" in page
+
+
+def test_a_machine_that_rests_and_is_measured_in_steps_is_left_at_rest(tmp_path):
+    """Persistence is exactly right of most ticks: the absolute error must not be above its own."""
+    columns = rig(34, 100, 50, idle=0.6)
+    columns = columns | {"v": 0.02 * np.round(columns["v"] / 0.02)}
+    source = write(tmp_path, Oddity(lambda: [columns], 50, []))
+    settings = ["task.targets=['v']", "task.horizons=[1]", *QUICK[:1], *QUICK[2:], "auto.candidates=['linear']"]
+    train_auto(source, load_auto(None, settings), tmp_path / "run")
+    evaluate(tmp_path / "run")
+    models = read_json(tmp_path / "run" / "scores.json")["models"]
+    errors = {name: models[name]["overall"]["1"]["v"] for name in ("network", *RIVALS)}
+    assert errors["network"]["mae"] < 0.9 * errors["ridge_arx"]["mae"]
+    assert errors["network"]["mae"] < 1.05 * errors["persistence"]["mae"]
+    assert errors["network"]["rmse"] < 1.05 * errors["ridge_arx"]["rmse"]
 
 
 SMALLER = {"UNITS": 16, "LEAST_STEPS": 100, "CENTRES": 100}

@@ -150,10 +150,12 @@ class ByTime:
     Attributes:
         validation_share: share of each recording.
         test_share: share of each recording.
+        whole_short: recordings of which a part would be no longer than the gap train as a whole, in place of an error.
     """
 
     validation_share: float = 0.15
     test_share: float = 0.2
+    whole_short: bool = False
 
     def __post_init__(self) -> None:
         check_bounds("split", self, validation_share=PART, test_share=PART)
@@ -171,6 +173,9 @@ class ByTime:
             # The end tests: a model is used later than it was trained.
             test = n - round(n * self.test_share)
             validation = test - round(n * self.validation_share)
+            if self.whole_short and min(validation - gap, test - gap - validation, n - test) <= gap:
+                parts["train"].append(Stretch(i, 0, n))
+                continue
             parts["train"].append(Stretch(i, 0, validation - gap))
             parts["validation"].append(Stretch(i, validation, test - gap))
             parts["test"].append(Stretch(i, test, n))

@@ -22,7 +22,7 @@ WINDOW = 10
 Changes over longer spans say less and less about the present: ten ticks after a reset their error was no larger than
 later on measured recordings. A longer gap would throw away what lies nearest to the test."""
 STRETCH_SHARE = 8
-"""The longest change is at most an eighth of the shortest stretch, so that most of its rows are full."""
+"""The longest change is at most an eighth of the usual stretch, so that most of its rows are full."""
 OPERATIONS_PER_S = 1.6e10
 """Floating-point operations that training is taken to do in a second of one core: measured, rounded down.
 
@@ -85,6 +85,7 @@ class Amount:
     Attributes:
         rows: ticks of the training and validation parts.
         shortest: ticks of their shortest stretch.
+        usual: ticks of most of their stretches; 0 for those of the shortest one.
         features: features of a tick.
         outputs: horizons times targets.
         horizon: the largest one, in ticks.
@@ -105,13 +106,14 @@ class Amount:
     threads: int = 1
     foundation: Foundation | None = None
     changes: bool = True
+    usual: int = 0
 
     @property
     def span(self) -> int:
         """Ticks that changes reach back: a power of two, at least twice the horizon where the data allow it."""
         least = max(LEAST_SPAN, 2 * self.horizon)
         span = 1
-        while span < least and 2 * span <= max(1, self.shortest // STRETCH_SHARE):
+        while span < least and 2 * span <= max(1, (self.usual or self.shortest) // STRETCH_SHARE):
             span *= 2
         return span
 

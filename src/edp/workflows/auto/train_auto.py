@@ -43,6 +43,12 @@ from edp.workflows.train_evaluate import keep_fitted, prepare_data
 
 USUAL = "FG2"
 """The feature set that is taken without a word where the recordings have its channels."""
+LEAST_OF_SHARE = 0.25
+"""Of the ticks that the share of a part stands for: of 300 s and 4 s a draw of whole recordings let the 4 s train."""
+LEAST_DIVIDED = 14
+"""Gaps that a recording is long of which 15 % are two of them."""
+MOST_TICKS = 0.9
+"""Share of the ticks whose stretches settle how far changes reach back: a short log among long ones shortens none."""
 MOST_LISTED = 20
 """Channels that a message lists."""
 
@@ -92,7 +98,7 @@ def train_auto(
     foundation = read_foundation(settings.auto.foundation)
     if foundation is not None:
         foundation.check_recordings(once.read())
-    settings = _of_one_recording(once, _of_these_channels(once, settings))
+    settings = _divided(once, _of_these_channels(once, settings))
     data, amount = _prepare(once, settings, foundation)
     if foundation is not None:
         foundation.check_task(data)
@@ -181,12 +187,35 @@ def _of_these_channels(source: _ReadOnce, settings: AutoSettings) -> AutoSetting
     return replace(settings, task=task)
 
 
-def _of_one_recording(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
-    """Settings that divide a single recording by time: it cannot train, validate and test as a whole."""
-    split = settings.split
-    if len(source.read()) != 1 or not isinstance(split, ByRecording) or split.validation or split.test:
+def _divided(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
+    """Settings that divide recordings by time where whole ones cannot train, validate and test.
+
+    These are a single recording, and recordings of such different lengths that a part would have next to nothing.
+    """
+    split, recordings = settings.split, source.read()
+    if not isinstance(split, ByRecording) or split.validation or split.test:
         return settings
-    return replace(settings, split=ByTime(validation_share=split.validation_share, test_share=split.test_share))
+    by_time = ByTime(validation_share=split.validation_share, test_share=split.test_share)
+    if len(recordings) == 1:
+        return replace(settings, split=by_time)
+    gap = LEAST_SPAN + max(settings.task.horizons)
+    # Of equal recordings that are too short to be divided nothing would be left to validate.
+    if _even(split, recordings, gap) or all(recording.samples < LEAST_DIVIDED * gap for recording in recordings):
+        return settings
+    return replace(settings, split=replace(by_time, whole_short=True))
+
+
+def _even(split: ByRecording, recordings: Sequence[Recording], gap: int) -> bool:
+    """Whether each part has at least `LEAST_OF_SHARE` of the ticks that its share of the recordings stands for."""
+    try:
+        parts = split.split(recordings, gap)
+    except DataError:
+        return False
+    total = sum(recording.samples for recording in recordings)
+    shares = {"validation": split.validation_share, "test": split.test_share}
+    shares["train"] = 1.0 - sum(shares.values())
+    ticks = {part: sum(one.stop - one.start for one in getattr(parts, part)) for part in shares}
+    return all(ticks[part] >= LEAST_OF_SHARE * share * total for part, share in shares.items())
 
 
 def _prepare(source: _ReadOnce, settings: AutoSettings, foundation: Foundation | None) -> tuple[Prepared, Amount]:
@@ -211,6 +240,7 @@ def _prepare(source: _ReadOnce, settings: AutoSettings, foundation: Foundation |
         return data, Amount(
             rows=sum(part.samples for part in parts),
             shortest=min(part.samples for part in parts),
+            usual=_usual([part.samples for part in parts]),
             features=len(data.task.features.features),
             outputs=len(data.task.horizons) * len(data.task.targets),
             horizon=data.task.max_horizon,
@@ -229,6 +259,12 @@ def _prepare(source: _ReadOnce, settings: AutoSettings, foundation: Foundation |
         data, final = cut(amount.window)
         amount = replace(amount, rows=final.rows)
     return data, amount
+
+
+def _usual(lengths: Sequence[int]) -> int:
+    """The length that stretches with `MOST_TICKS` of all ticks have at least."""
+    falling = np.sort(np.asarray(lengths))[::-1]
+    return int(falling[np.searchsorted(falling.cumsum(), MOST_TICKS * falling.sum())])
 
 
 def _check_moving(data: Prepared) -> None:
