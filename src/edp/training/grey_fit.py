@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.networks.twin.greybox import GreyTwin, RunTarget
+from edp.training.blas import one_blas_thread
 from edp.training.free_run import FreeRunProgress, FreeRunValidation
 
 Doubles = NDArray[np.float64]
@@ -172,6 +173,7 @@ def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple
     return matrix, gradient
 
 
+@one_blas_thread()
 def fit_grey_box(
     twin: GreyTwin,
     train: Sequence[Series],

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -143,3 +144,25 @@ def test_no_file_is_written_over(edp, logs, tmp_path, there):
     assert ended.code == 1
     assert "is there already and is not written over" in " ".join(ended.err.split())
     assert (tmp_path / there).read_text() == "what a tape measure told"
+
+
+def test_a_twin_with_a_linkage_is_another_one_once_its_machine_file_changes(edp, logs, tmp_path):
+    file, run = tmp_path / "front.toml", tmp_path / "run"
+    text = (resources.files("edp.sim") / "machines" / "m22.toml").read_text()
+    file.write_text(text)
+    kind = ("--set", "twin.kind=greybox", "--set", f"twin.linkage={file}")
+    words = ("twin", logs, "--out", run, *kind, *LINKED)
+    ended = edp(*words)
+    assert ended.code == 0, ended.err
+    assert "boom_body.mass" in (run / "datasheet.txt").read_text()
+    longer = text.replace("rod_radius = 2.484", "rod_radius = 2.494")
+    assert longer != text
+    file.write_text(longer)
+    assert edp(*words).code == 1
+    # Lengths of one machine and bodies of another are no machine.
+    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", run, "--machine", file)
+    assert ended.code == 1
+    assert "which is not that of --machine (M22): give the same machine" in " ".join(ended.err.split())
+    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", run)
+    assert ended.code == 0, ended.err
+    assert load_machine(str(tmp_path / "mine.toml")).bodies != load_machine("M22").bodies

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.networks.twin.greybox import GreyTwin
+from edp.training.blas import one_blas_thread
 from edp.training.grey_fit import GreyProblem, Tie
 
 Doubles = NDArray[np.float64]
@@ -33,6 +34,7 @@ TICKS = 3000
 """Of the free runs of a block and a length, about; a third of a second of a desktop core."""
 
 
+@one_blas_thread()
 def covariance(twin: GreyTwin, tie: Tie, theta: Doubles, train: Sequence[Series], seed: int) -> Doubles:
     """Covariance of the coordinates of a fit; that of the guess where the logs are too short to be divided.
 
