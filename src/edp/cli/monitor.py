@@ -35,7 +35,7 @@ def fit(
     hours: Annotated[
         float | None, typer.Option("--hours-per-false-alarm", help="Operating hours to one false alarm; default: 8.")
     ] = None,
-    minutes: Annotated[float | None, typer.Option(help="Processor time of its networks, about; default: 6.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Processor time of its networks, about; default: 5.")] = None,
     machine: Annotated[
         str | None,
         typer.Option(
