@@ -1,6 +1,7 @@
 """From residuals and raw channels at every tick to statistics at every block: sums, conditioning, views, detectors.
 
-All arithmetic is + - * / sqrt and comparisons in double precision in a fixed order, so that C gives the same bits.
+All arithmetic is + - * / sqrt and comparisons in a fixed order, so that C gives the same bits: in double precision, but
+for the long sums of conditioning and views, which are in single precision.
 """
 
 from __future__ import annotations
