@@ -188,15 +188,15 @@ def state_bytes(parts: MonitorParts) -> int:
 
 
 def _source_bytes(part: SourcePart) -> int:
-    held = 4 * len(part.reads)
+    buffers = 4 * len(part.reads)
     if isinstance(part, BalancePart):
-        return held + 17 * len(part.levels) + 7
+        return buffers + 17 * len(part.levels) + 7
     task = part.bundle.task
     # Counters and the last inputs, which the state of every network has beside what its layers remember.
     network = 4 * (8 + len(part.bundle.inputs))
     if isinstance(part, TwinPart):
-        return held + len(part.groups) * network + 4 * sum(map(len, part.groups)) + 4
+        return buffers + len(part.groups) * network + 4 * sum(map(len, part.groups)) + 4
     coverages = len(part.bundle.predictor.output.coverages)
     out = len(task.targets) * len(task.horizons) * (1 + 2 * coverages)
     rings = 0 if max(part.delays) == 0 else (max(part.delays) + 1) * len(part.judged) * (2 if part.scaled else 1)
-    return held + network + 4 * (out + rings)
+    return buffers + network + 4 * (out + rings)

@@ -120,13 +120,13 @@ class MonitorFiles:
 
     def _enter_watches(self, tables: MonitorTables) -> None:
         rows = []
-        for place, watch in enumerate(self.parts.chain.watches):
-            tables.singles(f"mean_{place}", watch.mean)
-            tables.singles(f"matrix_{place}", np.ascontiguousarray(watch.matrix.T))
+        for index, watch in enumerate(self.parts.chain.watches):
+            tables.singles(f"mean_{index}", watch.mean)
+            tables.singles(f"matrix_{index}", np.ascontiguousarray(watch.matrix.T))
             weight = watch.option if watch.detector == "ewma" else 1.0
             sizes = f"{self.parts.summaries}u, {watch.matrix.shape[1]}u, {_window(watch)}u"
             options = ", ".join(map(double_number, (watch.option, (2.0 - weight) / weight, watch.scale)))
-            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{place}, matrix_{place}}}")
+            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{index}, matrix_{index}}}")
         body = ",\n".join(rows)
         tables.text(f"static const edp_watch watches[{len(rows)}] = {{\n{body}\n}};")
         memories = np.cumsum([0, *map(_memory, self.parts.chain.watches)]).tolist()
@@ -307,7 +307,7 @@ def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
     _check_detectors(parts.chain.watches)
     memory = sum(map(_memory, parts.chain.watches))
     check_sizes({"bytes of the detectors' memory": 8 * memory, "ticks of a block": parts.chain.block}, MOST_MEMORY)
-    sources = tuple(source_code(part, place, name) for place, part in enumerate(parts.sources))
+    sources = tuple(source_code(part, index, name) for index, part in enumerate(parts.sources))
     files = MonitorFiles(name, parts, sources)
     return files
 
