@@ -35,7 +35,7 @@ def fit(
     hours: Annotated[
         float | None, typer.Option("--hours-per-false-alarm", help="Operating hours to one false alarm; default: 8.")
     ] = None,
-    minutes: Annotated[float | None, typer.Option(help="Processor time of its networks, about; default: 6.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Processor time of its networks, about; default: 5.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example chain.block_s=2.")] = [],  # noqa: B006
     signal_map: MapOption = None,
