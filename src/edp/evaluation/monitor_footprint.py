@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate
 from edp.evaluation.footprint import Footprint, footprint
-from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePart, TwinPart, monitor_files
+from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePart, TwinPart, WatchPart, monitor_files
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
@@ -18,9 +17,10 @@ CORE_COSTS = {"residual": 1_650.0, "driver": 490.0, "input": 155.0, "product": 1
 Of a residual, of a driver of it and of an input at a tick, of a product with its sum, of a summary of a residual at the
 end of a block, and of a tick besides. Fitted to counted code of chains of several sizes
 (``benchmarks/monitor_cycles.py --fit``)."""
-CENTRE, CUSUM, EWMA, GLR, VERDICT, POINT = 0.5, 2.0, 2.5, 2.0, 0.6, 4.0
-"""Products that take as long as a summary centred for a watch, a direction in a detector, a summary in a verdict, and
-a number of the operating point."""
+DETECTOR = {"cusum": 2.0, "ewma": 2.5, "glr": 2.0, "separate_cusums": 2.5}
+"""Products that take as long as a direction in a detector; of the likelihood ratio for each length."""
+CENTRE, VERDICT, POINT = 0.5, 0.6, 4.0
+"""The same of a summary centred for a watch, a summary in a verdict, and a number of the operating point."""
 CHAIN_PROGRAM_BYTES = 9_000
 """Code of the chain, its runtime and the double precision of the compiler's library on a Cortex-M4F."""
 
@@ -36,7 +36,7 @@ class ChainCycles:
 def chain_work(parts: MonitorParts) -> dict[str, float]:
     """What the chain does at a tick, on average, by the names of `CORE_COSTS`."""
     chain, summaries, points = parts.chain, parts.summaries, parts.points
-    watches = sum(_watch_products(watch.detector, watch.matrix.shape, watch.option) for watch in chain.watches)
+    watches = sum(map(_watch_products, chain.watches))
     products = 2.0 * summaries * points + watches + VERDICT * summaries
     return {
         "residual": float(len(chain.scale)),
@@ -48,10 +48,10 @@ def chain_work(parts: MonitorParts) -> dict[str, float]:
     }
 
 
-def _watch_products(detector: str, shape: Sequence[int], option: float) -> float:
-    summaries, directions = shape
-    each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR * option}[detector]
-    return summaries * directions + CENTRE * summaries + each * directions
+def _watch_products(watch: WatchPart) -> float:
+    summaries, directions = watch.matrix.shape
+    each = DETECTOR[watch.detector] * (watch.rows if watch.detector == "glr" else 1)
+    return float(summaries * directions + CENTRE * summaries + each * directions)
 
 
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
@@ -74,8 +74,7 @@ def _slices(parts: MonitorParts) -> list[float]:
     ]
     for watch in parts.chain.watches:
         directions = int(watch.matrix.shape[1])
-        each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR}[watch.detector]
-        steps = int(watch.option) if watch.detector == "glr" else 1
+        each, steps = DETECTOR[watch.detector], watch.rows if watch.detector == "glr" else 1
         costs += [CENTRE * product * summaries, *(directions * [product * summaries])]
         costs += steps * [each * product * directions]
     return [*costs, VERDICT * product * summaries]
@@ -178,7 +177,7 @@ def state_bytes(parts: MonitorParts) -> int:
     """
     chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
     sums = (8 + 2 * len(chain.drivers)) * residuals + len(chain.level) + len(chain.moving)
-    detectors = sum(int(w.matrix.shape[1]) * (int(w.option) if w.detector == "glr" else 1) for w in chain.watches)
+    detectors = sum(int(w.matrix.shape[1]) * w.rows for w in chain.watches)
     widest = max(int(w.matrix.shape[1]) for w in chain.watches)
     doubles = (
         2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 3 * len(chain.watches) + parts.each

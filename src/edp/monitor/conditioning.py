@@ -48,12 +48,14 @@ class Conditioning:
         Each sum goes from the first operating number to the last, as in C.
         """
         scaled = np.clip((points[:, 1:] - self.offset) / self.width, -POINT_LIMIT, POINT_LIMIT)
-        usual = np.repeat(self.usual[None, :, 0], len(summaries), 0)
-        width = np.repeat(self.spread[None, :, 0], len(summaries), 0)
-        for index in range(scaled.shape[1]):
-            usual = usual + scaled[:, index, None] * self.usual[:, index + 1]
-            width = width + scaled[:, index, None] * self.spread[:, index + 1]
-        z: Array = (summaries - usual) / np.maximum(width, self.floor)
+        # The lines in single precision: a controller computes them in hardware.
+        lines = self.usual.astype(np.float32), self.spread.astype(np.float32)
+        usual, width = (np.repeat(line[None, :, 0], len(summaries), 0) for line in lines)
+        part = scaled.astype(np.float32)
+        for index in range(part.shape[1]):
+            usual = usual + part[:, index, None] * lines[0][:, index + 1]
+            width = width + part[:, index, None] * lines[1][:, index + 1]
+        z: Array = (summaries - usual) / np.maximum(width.astype(np.float64), self.floor)
         return np.clip(z, -self.clip, self.clip)
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -68,14 +68,15 @@ class Watch:
     def __call__(self, rows: Array) -> Array:
         """White rows, shape (blocks, directions); a missing summary counts as healthy.
 
-        Each sum goes from the first summary to the last, as in C.
+        Each sum goes from the first summary to the last in single precision, as in C.
         """
         centred = rows - self.mean
-        centred = np.where(np.isfinite(centred), centred, 0.0)
-        white = np.zeros((len(rows), self.directions))
-        for index in range(centred.shape[1]):
-            white = white + centred[:, index, None] * self.matrix[index]
-        return white
+        # Single precision: a controller computes it in hardware, forty times as fast as doubles.
+        part = np.where(np.isfinite(centred), centred, 0.0).astype(np.float32)
+        matrix, white = self.matrix.astype(np.float32), np.zeros((len(rows), self.directions), np.float32)
+        for index in range(part.shape[1]):
+            white = white + part[:, index, None] * matrix[index]
+        return white.astype(np.float64)
 
 
 def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, settle: int) -> Watch:

@@ -257,7 +257,7 @@ def chain_part(chain: MonitorChain) -> ChainPart:
 
 def _watch(watch: Watch) -> WatchPart:
     name = REGISTERED.name_of(watch.detector)
-    options = {"cusum": "slack", "ewma": "weight", "glr": "window"}
+    options = {"cusum": "slack", "separate_cusums": "slack", "ewma": "weight", "glr": "window"}
     if name not in DETECTORS:
         raise ExportError(
             f"detector '{name}' has no form in C; these have: {', '.join(DETECTORS)}. Fit the monitor with one of them"
