@@ -11,14 +11,22 @@ from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePar
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
-CORE_COSTS = {"residual": 1_650.0, "driver": 490.0, "input": 155.0, "product": 188.0, "summary": 1_000.0, "tick": 500.0}
+CORE_COSTS = {
+    "residual": 1_650.0,
+    "driver": 490.0,
+    "input": 155.0,
+    "product": 8.0,
+    "double": 188.0,
+    "summary": 1_000.0,
+    "tick": 500.0,
+}
 """Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library.
 
-Of a residual, of a driver of it and of an input at a tick, of a product with its sum, of a summary of a residual at the
-end of a block, and of a tick besides. Fitted to counted code of chains of several sizes
-(``benchmarks/monitor_cycles.py --fit``)."""
+Of a residual, of a driver of it and of an input at a tick, of a product with its sum in single and in double precision,
+of a summary of a residual at the end of a block, and of a tick besides. Fitted to counted code of chains of several
+sizes (``benchmarks/monitor_cycles.py --fit``)."""
 DETECTOR = {"cusum": 2.0, "ewma": 2.5, "glr": 2.0, "separate_cusums": 2.5}
-"""Products that take as long as a direction in a detector; of the likelihood ratio for each length."""
+"""Products in double precision that take as long as a direction in a detector; of the likelihood ratio a length."""
 CENTRE, VERDICT, POINT = 0.5, 0.6, 4.0
 """The same of a summary centred for a watch, a summary in a verdict, and a number of the operating point."""
 CHAIN_PROGRAM_BYTES = 9_000
@@ -36,22 +44,23 @@ class ChainCycles:
 def chain_work(parts: MonitorParts) -> dict[str, float]:
     """What the chain does at a tick, on average, by the names of `CORE_COSTS`."""
     chain, summaries, points = parts.chain, parts.summaries, parts.points
-    watches = sum(map(_watch_products, chain.watches))
-    products = 2.0 * summaries * points + watches + VERDICT * summaries
+    products = 2.0 * summaries * points + sum(watch.matrix.size for watch in chain.watches)
+    doubles = sum(map(_watch_doubles, chain.watches)) + VERDICT * summaries + POINT * points
     return {
         "residual": float(len(chain.scale)),
         "driver": float(len(chain.scale) * len(chain.drivers)),
         "input": float(len(chain.centre) + len(chain.level) + len(chain.moving)),
         "product": products / chain.block,
+        "double": doubles / chain.block,
         "summary": summaries / chain.block,
         "tick": 1.0,
     }
 
 
-def _watch_products(watch: WatchPart) -> float:
+def _watch_doubles(watch: WatchPart) -> float:
     summaries, directions = watch.matrix.shape
     each = DETECTOR[watch.detector] * (watch.rows if watch.detector == "glr" else 1)
-    return float(summaries * directions + CENTRE * summaries + each * directions)
+    return float(CENTRE * summaries + each * directions)
 
 
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
@@ -66,18 +75,16 @@ def chain_cycles(parts: MonitorParts) -> ChainCycles:
 
 def _slices(parts: MonitorParts) -> list[float]:
     """Cycles of each part of the work on a block, in its order."""
-    product, summaries = CORE_COSTS["product"], parts.summaries
-    costs = [POINT * product * parts.points]
-    costs += len(parts.residuals) * [
-        parts.each * CORE_COSTS["summary"],
-        *(parts.each * [2.0 * product * (parts.points + 1)]),
-    ]
+    product, double, summaries = CORE_COSTS["product"], CORE_COSTS["double"], parts.summaries
+    costs = [POINT * double * parts.points]
+    of_summary = 2.0 * product * parts.points + 6.0 * double
+    costs += len(parts.residuals) * [parts.each * CORE_COSTS["summary"], *(parts.each * [of_summary])]
     for watch in parts.chain.watches:
         directions = int(watch.matrix.shape[1])
         each, steps = DETECTOR[watch.detector], watch.rows if watch.detector == "glr" else 1
-        costs += [CENTRE * product * summaries, *(directions * [product * summaries])]
-        costs += steps * [each * product * directions]
-    return [*costs, VERDICT * product * summaries]
+        costs += [CENTRE * double * summaries, *(directions * [product * summaries])]
+        costs += steps * [each * double * directions]
+    return [*costs, VERDICT * double * summaries]
 
 
 @dataclass(frozen=True)

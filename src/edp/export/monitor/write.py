@@ -239,7 +239,7 @@ class MonitorFiles:
         return {
             "input_enum": Code(
                 "\n".join(
-                    f"    {upper}_IN_{own} = {i}, /* {c_comment(f'{channel.unit}; {channel.description}')} */"
+                    f"    {upper}_IN_{own} = {i}, /* {c_comment('; '.join((channel.unit, channel.description)))} */"
                     for i, (own, channel) in enumerate(inputs)
                 )
             ),
