@@ -266,7 +266,9 @@ def test_names_that_c_cannot_carry_are_refused(name, rig_monitor):
 def test_what_has_no_form_in_c_is_refused(rig_monitor, tmp_path):
     watch = replace(rig_monitor.chain.watches[0], detector=EDetectorSpec())
     other = replace(rig_monitor, chain=replace(rig_monitor.chain, watches=(watch,)))
-    with pytest.raises(ExportError, match=r"'e_detector' has no form in C; these have: cusum, ewma, glr"):
+    with pytest.raises(
+        ExportError, match=r"'e_detector' has no form in C; these have: cusum, ewma, glr, separate_cusums"
+    ):
         monitor_parts(other)
     coarse = replace(rig_monitor.chain.watches[0], mean=rig_monitor.chain.watches[0].mean + 1e-12)
     fine = replace(rig_monitor, chain=replace(rig_monitor.chain, watches=(coarse,)))

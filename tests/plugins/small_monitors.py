@@ -19,7 +19,10 @@ def fitted_monitor(sessions: Sequence[Recording] = ()) -> Monitor:
     """
     watches = ",".join(
         f"{{detector={{kind={kind}}},memory_s={memory}}}"
-        for kind, memory in (('"ewma",weight=0.5', 0.2), ('"cusum",slack=0.5', 1.0), ('"glr",window=5', 0.2))
+        for kind, memory in (
+            *(('"ewma",weight=0.5', 0.2), ('"cusum",slack=0.5', 1.0)),
+            *(('"glr",window=5', 0.2), ('"separate_cusums",slack=3.0', 0.2)),
+        )
     )
     sensors = '{kind="virtual_sensors",members=2,units=4,rows=2000,lags_s=[0.05,0.1]}'
     changes = [

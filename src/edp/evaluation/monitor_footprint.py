@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate
 from edp.evaluation.footprint import Footprint, footprint
-from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePart, TwinPart, monitor_files
+from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePart, TwinPart, WatchPart, monitor_files
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
-CORE_COSTS = {"residual": 1_650.0, "driver": 490.0, "input": 155.0, "product": 188.0, "summary": 1_000.0, "tick": 500.0}
+CORE_COSTS = {
+    "residual": 1_650.0,
+    "driver": 490.0,
+    "input": 155.0,
+    "product": 8.0,
+    "double": 188.0,
+    "summary": 1_000.0,
+    "tick": 500.0,
+}
 """Cycles of a Cortex-M4F with zero-wait memory, which computes double precision by its compiler's library.
 
-Of a residual, of a driver of it and of an input at a tick, of a product with its sum, of a summary of a residual at the
-end of a block, and of a tick besides. Fitted to counted code of chains of several sizes
-(``benchmarks/monitor_cycles.py --fit``)."""
-CENTRE, CUSUM, EWMA, GLR, VERDICT, POINT = 0.5, 2.0, 2.5, 2.0, 0.6, 4.0
-"""Products that take as long as a summary centred for a watch, a direction in a detector, a summary in a verdict, and
-a number of the operating point."""
+Of a residual, of a driver of it and of an input at a tick, of a product with its sum in single and in double precision,
+of a summary of a residual at the end of a block, and of a tick besides. Fitted to counted code of chains of several
+sizes (``benchmarks/monitor_cycles.py --fit``)."""
+DETECTOR = {"cusum": 2.0, "ewma": 2.5, "glr": 2.0, "separate_cusums": 2.5}
+"""Products in double precision that take as long as a direction in a detector; of the likelihood ratio a length."""
+CENTRE, VERDICT, POINT = 0.5, 0.6, 4.0
+"""The same of a summary centred for a watch, a summary in a verdict, and a number of the operating point."""
 CHAIN_PROGRAM_BYTES = 9_000
 """Code of the chain, its runtime and the double precision of the compiler's library on a Cortex-M4F."""
 
@@ -36,22 +44,23 @@ class ChainCycles:
 def chain_work(parts: MonitorParts) -> dict[str, float]:
     """What the chain does at a tick, on average, by the names of `CORE_COSTS`."""
     chain, summaries, points = parts.chain, parts.summaries, parts.points
-    watches = sum(_watch_products(watch.detector, watch.matrix.shape, watch.option) for watch in chain.watches)
-    products = 2.0 * summaries * points + watches + VERDICT * summaries
+    products = 2.0 * summaries * points + sum(watch.matrix.size for watch in chain.watches)
+    doubles = sum(map(_watch_doubles, chain.watches)) + VERDICT * summaries + POINT * points
     return {
         "residual": float(len(chain.scale)),
         "driver": float(len(chain.scale) * len(chain.drivers)),
         "input": float(len(chain.centre) + len(chain.level) + len(chain.moving)),
         "product": products / chain.block,
+        "double": doubles / chain.block,
         "summary": summaries / chain.block,
         "tick": 1.0,
     }
 
 
-def _watch_products(detector: str, shape: Sequence[int], option: float) -> float:
-    summaries, directions = shape
-    each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR * option}[detector]
-    return summaries * directions + CENTRE * summaries + each * directions
+def _watch_doubles(watch: WatchPart) -> float:
+    summaries, directions = watch.matrix.shape
+    each = DETECTOR[watch.detector] * (watch.rows if watch.detector == "glr" else 1)
+    return float(CENTRE * summaries + each * directions)
 
 
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
@@ -66,19 +75,16 @@ def chain_cycles(parts: MonitorParts) -> ChainCycles:
 
 def _slices(parts: MonitorParts) -> list[float]:
     """Cycles of each part of the work on a block, in its order."""
-    product, summaries = CORE_COSTS["product"], parts.summaries
-    costs = [POINT * product * parts.points]
-    costs += len(parts.residuals) * [
-        parts.each * CORE_COSTS["summary"],
-        *(parts.each * [2.0 * product * (parts.points + 1)]),
-    ]
+    product, double, summaries = CORE_COSTS["product"], CORE_COSTS["double"], parts.summaries
+    costs = [POINT * double * parts.points]
+    of_summary = 2.0 * product * parts.points + 6.0 * double
+    costs += len(parts.residuals) * [parts.each * CORE_COSTS["summary"], *(parts.each * [of_summary])]
     for watch in parts.chain.watches:
         directions = int(watch.matrix.shape[1])
-        each = {"cusum": CUSUM, "ewma": EWMA, "glr": GLR}[watch.detector]
-        steps = int(watch.option) if watch.detector == "glr" else 1
-        costs += [CENTRE * product * summaries, *(directions * [product * summaries])]
-        costs += steps * [each * product * directions]
-    return [*costs, VERDICT * product * summaries]
+        each, steps = DETECTOR[watch.detector], watch.rows if watch.detector == "glr" else 1
+        costs += [CENTRE * double * summaries, *(directions * [product * summaries])]
+        costs += steps * [each * double * directions]
+    return [*costs, VERDICT * double * summaries]
 
 
 @dataclass(frozen=True)
@@ -178,7 +184,7 @@ def state_bytes(parts: MonitorParts) -> int:
     """
     chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
     sums = (8 + 2 * len(chain.drivers)) * residuals + len(chain.level) + len(chain.moving)
-    detectors = sum(int(w.matrix.shape[1]) * (int(w.option) if w.detector == "glr" else 1) for w in chain.watches)
+    detectors = sum(int(w.matrix.shape[1]) * w.rows for w in chain.watches)
     widest = max(int(w.matrix.shape[1]) for w in chain.watches)
     doubles = (
         2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 3 * len(chain.watches) + parts.each
@@ -188,15 +194,15 @@ def state_bytes(parts: MonitorParts) -> int:
 
 
 def _source_bytes(part: SourcePart) -> int:
-    held = 4 * len(part.reads)
+    buffers = 4 * len(part.reads)
     if isinstance(part, BalancePart):
-        return held + 17 * len(part.levels) + 7
+        return buffers + 17 * len(part.levels) + 7
     task = part.bundle.task
     # Counters and the last inputs, which the state of every network has beside what its layers remember.
     network = 4 * (8 + len(part.bundle.inputs))
     if isinstance(part, TwinPart):
-        return held + len(part.groups) * network + 4 * sum(map(len, part.groups)) + 4
+        return buffers + len(part.groups) * network + 4 * sum(map(len, part.groups)) + 4
     coverages = len(part.bundle.predictor.output.coverages)
     out = len(task.targets) * len(task.horizons) * (1 + 2 * coverages)
     rings = 0 if max(part.delays) == 0 else (max(part.delays) + 1) * len(part.judged) * (2 if part.scaled else 1)
-    return held + network + 4 * (out + rings)
+    return buffers + network + 4 * (out + rings)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edp.export.monitor.parts import ChainPart
 
-JUDGED_BLOCKS = 24
+JUDGED_BLOCKS = 80
 """Blocks of the self-test behind those that are not judged; in the second half residuals are shifted."""
 MOST_TICKS = 200_000
 """Of the self-test; longer blocks are fewer."""

@@ -90,7 +90,7 @@ class WatchPart:
     """A view of conditioned summaries and the detector on it.
 
     Attributes:
-        detector: ``cusum``, ``ewma`` or ``glr``.
+        detector: ``cusum``, ``ewma``, ``glr`` or ``separate_cusums``.
         option: its slack, weight or window.
         mean: shape (summaries,).
         matrix: shape (summaries, directions).
@@ -102,6 +102,11 @@ class WatchPart:
     mean: Array
     matrix: Array
     scale: float
+
+    @property
+    def rows(self) -> int:
+        """Of the detector's memory, each as wide as its view."""
+        return int(self.option) if self.detector == "glr" else 2 if self.detector == "separate_cusums" else 1
 
 
 @dataclass(frozen=True, eq=False)

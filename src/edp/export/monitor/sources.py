@@ -185,8 +185,8 @@ class NetworkCode:
 
     def reset(self) -> list[str]:
         """See `SourceCode`."""
-        held = f"edp_copy({self.own}_middle, {len(self.part.reads)}u, s->{self.own}_in);"
-        return [f"{self.prefix}_reset(&s->{self.own});", held]
+        filled_inputs = f"edp_copy({self.own}_middle, {len(self.part.reads)}u, s->{self.own}_in);"
+        return [f"{self.prefix}_reset(&s->{self.own});", filled_inputs]
 
     def forget(self) -> list[str]:
         """See `SourceCode`."""
@@ -204,8 +204,8 @@ class BalanceCode:
     def fields(self) -> list[str]:
         """See `SourceCode`."""
         sums = [f"double {self.own}_{what}[{self.residuals}];" for what in ("level", "sum")]
-        known = f"bool {self.own}_known[{self.residuals}];"
-        return [f"float {self.own}_in[{len(self.part.reads)}];", *sums, f"bool {self.own}_began;", known]
+        flags = f"bool {self.own}_known[{self.residuals}];"
+        return [f"float {self.own}_in[{len(self.part.reads)}];", *sums, f"bool {self.own}_began;", flags]
 
     def constants(self, tables: MonitorTables) -> None:
         """See `SourceCode`."""
@@ -289,20 +289,20 @@ class TwinCode:
         return [*(f"{self.prefix}_reset(&s->{self.own}[{g}]);" for g in groups), f"s->{self.own}_ticks = 0u;"]
 
 
-def source_code(part: SourcePart, place: int, name: str) -> SourceCode:
+def source_code(part: SourcePart, index: int, name: str) -> SourceCode:
     """The source at a place of the monitor `name`.
 
     Raises:
         ExportError: its network has no form in C.
     """
     if isinstance(part, NetworkPart):
-        return NetworkCode(part, f"n{place}", f"{name}_n{place}")
+        return NetworkCode(part, f"n{index}", f"{name}_n{index}")
     if isinstance(part, TwinPart):
-        return TwinCode(part, f"t{place}", f"{name}_t{place}")
-    return BalanceCode(part, f"b{place}")
+        return TwinCode(part, f"t{index}", f"{name}_t{index}")
+    return BalanceCode(part, f"b{index}")
 
 
 def reads_tables(reads: Sequence[tuple[int, ...]], tables: MonitorTables) -> None:
     """Inputs of every residual, one behind the other, and where each begins."""
-    tables.places("reads", [place for places in reads for place in places])
-    tables.places("reads_from", np.cumsum([0, *(len(places) for places in reads)]).tolist())
+    tables.places("reads", [column for columns in reads for column in columns])
+    tables.places("reads_from", np.cumsum([0, *(len(columns) for columns in reads)]).tolist())

@@ -28,7 +28,12 @@ from edp.networks.input_range import HOLD_TICKS
 OWN = ("edp_chain.h", "edp_chain.c")
 LONGEST_NAME = 20
 """Of a monitor: names of its networks and functions are made from it."""
-DETECTORS = {"cusum": "EDP_CUSUM", "ewma": "EDP_EWMA", "glr": "EDP_GLR"}
+DETECTORS = {
+    "cusum": "EDP_CUSUM",
+    "ewma": "EDP_EWMA",
+    "glr": "EDP_GLR",
+    "separate_cusums": "EDP_SEPARATE_CUSUMS",
+}
 NO_INPUT = 0xFFFF
 """Stands for a driver without a second input: `EDP_NO_INPUT`."""
 MOST_MEMORY = 2**31 - 1
@@ -120,13 +125,13 @@ class MonitorFiles:
 
     def _enter_watches(self, tables: MonitorTables) -> None:
         rows = []
-        for place, watch in enumerate(self.parts.chain.watches):
-            tables.singles(f"mean_{place}", watch.mean)
-            tables.singles(f"matrix_{place}", np.ascontiguousarray(watch.matrix.T))
+        for index, watch in enumerate(self.parts.chain.watches):
+            tables.singles(f"mean_{index}", watch.mean)
+            tables.singles(f"matrix_{index}", np.ascontiguousarray(watch.matrix.T))
             weight = watch.option if watch.detector == "ewma" else 1.0
-            sizes = f"{self.parts.summaries}u, {watch.matrix.shape[1]}u, {_window(watch)}u"
+            sizes = f"{self.parts.summaries}u, {watch.matrix.shape[1]}u, {watch.rows}u"
             options = ", ".join(map(double_number, (watch.option, (2.0 - weight) / weight, watch.scale)))
-            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{place}, matrix_{place}}}")
+            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{index}, matrix_{index}}}")
         body = ",\n".join(rows)
         tables.text(f"static const edp_watch watches[{len(rows)}] = {{\n{body}\n}};")
         memories = np.cumsum([0, *map(_memory, self.parts.chain.watches)]).tolist()
@@ -234,7 +239,7 @@ class MonitorFiles:
         return {
             "input_enum": Code(
                 "\n".join(
-                    f"    {upper}_IN_{own} = {i}, /* {c_comment(f'{channel.unit}; {channel.description}')} */"
+                    f"    {upper}_IN_{own} = {i}, /* {c_comment('; '.join((channel.unit, channel.description)))} */"
                     for i, (own, channel) in enumerate(inputs)
                 )
             ),
@@ -278,17 +283,13 @@ class MonitorFiles:
         }
 
 
-def _window(watch: WatchPart) -> int:
-    return int(watch.option) if watch.detector == "glr" else 1
-
-
 def _memory(watch: WatchPart) -> int:
-    return int(watch.matrix.shape[1]) * _window(watch)
+    return int(watch.matrix.shape[1]) * watch.rows
 
 
 def _watch_slices(watch: WatchPart) -> int:
     """Centring, each direction, and the steps of the detector."""
-    return 1 + int(watch.matrix.shape[1]) + _window(watch)
+    return 1 + int(watch.matrix.shape[1]) + (watch.rows if watch.detector == "glr" else 1)
 
 
 def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
@@ -307,7 +308,7 @@ def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
     _check_detectors(parts.chain.watches)
     memory = sum(map(_memory, parts.chain.watches))
     check_sizes({"bytes of the detectors' memory": 8 * memory, "ticks of a block": parts.chain.block}, MOST_MEMORY)
-    sources = tuple(source_code(part, place, name) for place, part in enumerate(parts.sources))
+    sources = tuple(source_code(part, index, name) for index, part in enumerate(parts.sources))
     files = MonitorFiles(name, parts, sources)
     return files
 

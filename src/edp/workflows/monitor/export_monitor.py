@@ -79,10 +79,10 @@ def export_monitor(
     """
     if to not in FORMS:
         raise ExportError(f"a monitor has no form '{to}'{closest(to, FORMS)}; it has {', '.join(FORMS)}")
-    known = FORMS[to]
+    accepted = FORMS[to]
     for option in options or {}:
-        if option not in known:
-            has = f"it has {', '.join(known)}" if known else "it has none"
+        if option not in accepted:
+            has = f"it has {', '.join(accepted)}" if accepted else "it has none"
             raise ConfigError(f"--set {option}: form '{to}' of a monitor has no such option ({has}); leave it out")
     parts = monitor_parts(load_monitor(monitor))
     if to == "fmu":
@@ -109,8 +109,8 @@ def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
     Raises:
         ExportError: a source or a detector without a form in C.
     """
-    place = _places(monitor)
-    sources = tuple(part for source in monitor.sources for part in source_parts(source, place))
+    columns = _places(monitor)
+    sources = tuple(part for source in monitor.sources for part in source_parts(source, columns))
     chain = chain_part(monitor.chain)
     parts = MonitorParts(
         title=f"monitor of {len(monitor.inputs)} channels",
@@ -119,7 +119,7 @@ def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
         inputs=monitor.channels,
         rate_hz=monitor.rate_hz,
         residuals=monitor.residual_names,
-        reads=[tuple(place[n] for n in reads) for source in monitor.sources for reads in source.reads],
+        reads=[tuple(columns[n] for n in reads) for source in monitor.sources for reads in source.reads],
         sources=sources,
         chain=chain,
         golden_chain=golden_chain(monitor.chain, chain) if golden else NO_CHAIN,
@@ -143,48 +143,48 @@ def digest_of(chain: ChainPart) -> str:
 # ---- sources ---------------------------------------------------------------------------------------------------------
 
 
-def source_parts(source: ResidualSource, place: Mapping[str, int]) -> list[SourcePart]:
+def source_parts(source: ResidualSource, columns: Mapping[str, int]) -> list[SourcePart]:
     """A source as parts whose residuals stand in its order.
 
     Raises:
         ExportError: it has no form in C.
     """
     if isinstance(source, VirtualSensors):
-        return [_virtual(source, bundle, place) for bundle in source.bundles.values()]
+        return [_virtual(source, bundle, columns) for bundle in source.bundles.values()]
     if isinstance(source, LookAhead):
-        return [_look_ahead(source, bundle, place) for bundle in source.bundles.values()]
+        return [_look_ahead(source, bundle, columns) for bundle in source.bundles.values()]
     if isinstance(source, TwinPorts):
-        return [_twin(source, place)]
+        return [_twin(source, columns)]
     if isinstance(source, Balances):
-        return [_balances(source, place)]
+        return [_balances(source, columns)]
     raise ExportError(
         f"residuals of kind '{type(source).__name__}' have no form in C; fit the monitor without them, or run it in "
         "Python"
     )
 
 
-def _virtual(source: VirtualSensors, bundle: Bundle, place: Mapping[str, int]) -> NetworkPart:
+def _virtual(source: VirtualSensors, bundle: Bundle, columns: Mapping[str, int]) -> NetworkPart:
     own = {name: i for i, name in enumerate(source.inputs)}
     reads, targets = bundle.task.inputs, bundle.task.targets
     return NetworkPart(
         bundle=bundle,
-        reads=tuple(place[name] for name in reads),
+        reads=tuple(columns[name] for name in reads),
         middle=source.middle[[own[name] for name in reads]],
-        judged=tuple(place[name] for name in targets),
+        judged=tuple(columns[name] for name in targets),
         results=tuple(range(len(targets))),
         delays=(0,) * len(targets),
     )
 
 
-def _look_ahead(source: LookAhead, bundle: Bundle, place: Mapping[str, int]) -> NetworkPart:
+def _look_ahead(source: LookAhead, bundle: Bundle, columns: Mapping[str, int]) -> NetworkPart:
     own = {name: i for i, name in enumerate(source.inputs)}
     reads, task = bundle.task.inputs, bundle.task
     logged = [i for i, target in enumerate(task.targets) if target in own]
     return NetworkPart(
         bundle=bundle,
-        reads=tuple(place[name] for name in reads),
+        reads=tuple(columns[name] for name in reads),
         middle=source.middle[[own[name] for name in reads]],
-        judged=tuple(place[task.targets[i]] for _ in task.horizons for i in logged),
+        judged=tuple(columns[task.targets[i]] for _ in task.horizons for i in logged),
         results=tuple(h * len(task.targets) + i for h in range(len(task.horizons)) for i in logged),
         delays=tuple(k for k in task.horizons for _ in logged),
         scaled=bool(bundle.predictor.output.coverages),
@@ -192,14 +192,14 @@ def _look_ahead(source: LookAhead, bundle: Bundle, place: Mapping[str, int]) -> 
     )
 
 
-def _twin(source: TwinPorts, place: Mapping[str, int]) -> TwinPart:
+def _twin(source: TwinPorts, columns: Mapping[str, int]) -> TwinPart:
     channels = source.bundle.twin.channels
     own = {name: i for i, name in enumerate(source.inputs)}
     reads = [channel.name for channel in (*channels.commands, *channels.answers)]
     answers = {channel.name: i for i, channel in enumerate(channels.answers)}
     return TwinPart(
         bundle=plant_bundle(source.bundle),
-        reads=tuple(place[name] for name in reads),
+        reads=tuple(columns[name] for name in reads),
         middle=source.middle[[own[name] for name in reads]],
         groups=tuple(tuple(answers[name] for name in group) for group in source.groups),
         prefix=source.bundle.twin.prefix_ticks,
@@ -207,9 +207,9 @@ def _twin(source: TwinPorts, place: Mapping[str, int]) -> TwinPart:
     )
 
 
-def _balances(source: Balances, place: Mapping[str, int]) -> BalancePart:
+def _balances(source: Balances, columns: Mapping[str, int]) -> BalancePart:
     return BalancePart(
-        reads=tuple(place[name] for name in source.inputs),
+        reads=tuple(columns[name] for name in source.inputs),
         middle=source.middle,
         levels=tuple(source.pairs[:, 0].tolist()),
         rates=tuple(source.pairs[:, 1].tolist()),
@@ -257,7 +257,7 @@ def chain_part(chain: MonitorChain) -> ChainPart:
 
 def _watch(watch: Watch) -> WatchPart:
     name = REGISTERED.name_of(watch.detector)
-    options = {"cusum": "slack", "ewma": "weight", "glr": "window"}
+    options = {"cusum": "slack", "separate_cusums": "slack", "ewma": "weight", "glr": "window"}
     if name not in DETECTORS:
         raise ExportError(
             f"detector '{name}' has no form in C; these have: {', '.join(DETECTORS)}. Fit the monitor with one of them"

@@ -61,10 +61,10 @@ double edp_root(double x) {
     return result;
 }
 
-double edp_dot(const double *x, const float *y, uint32_t n) {
-    double sum = 0.0;
+float edp_dot(const float *x, const float *y, uint32_t n) {
+    float sum = 0.0f;
     for (uint32_t i = 0; i < n; i++) {
-        sum += x[i] * (double)y[i];
+        sum += x[i] * y[i];
     }
     return sum;
 }
@@ -192,23 +192,25 @@ void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t resid
 }
 
 void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
-                     double *point) {
+                     float *point) {
     const double *const values = &sums[stride_of(b) * b->residuals];
     const double whole = (double)b->ticks;
     for (uint32_t i = 0; i < (b->levels + b->moving); i++) {
-        point[i] = edp_within(((values[i] / whole) - (double)offset[i]) / (double)width[i], -limit, limit);
+        point[i] = (float)edp_within(((values[i] / whole) - (double)offset[i]) / (double)width[i], -limit, limit);
     }
 }
 
-double edp_conditioned(double summary, const double *point, uint32_t n, const float *usual, const float *wide,
+double edp_conditioned(double summary, const float *point, uint32_t n, const float *usual, const float *wide,
                        double floor, double limit) {
-    double middle = (double)usual[0];
-    double width = (double)wide[0];
+    float middle = usual[0];
+    float across = wide[0];
+    double width;
     for (uint32_t i = 0; i < n; i++) {
-        middle += point[i] * (double)usual[i + 1u];
-        width += point[i] * (double)wide[i + 1u];
+        middle += point[i] * usual[i + 1u];
+        across += point[i] * wide[i + 1u];
     }
-    return edp_within((summary - middle) / ((width > floor) ? width : floor), -limit, limit);
+    width = (double)across;
+    return edp_within((summary - (double)middle) / ((width > floor) ? width : floor), -limit, limit);
 }
 
 /* ---- detectors ----------------------------------------------------------------------------------------------------- */
@@ -249,38 +251,53 @@ double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32
     return edp_squares(sums, n) / (2.0 * (double)length);
 }
 
+double edp_separate_cusums(double slack, const double *row, uint32_t n, double *sums) {
+    double largest = 0.0;
+    for (uint32_t i = 0; i < n; i++) {
+        const double up = (sums[i] + row[i]) - slack;
+        const double down = (sums[n + i] - row[i]) - slack;
+        sums[i] = (up > 0.0) ? up : 0.0;
+        sums[n + i] = (down > 0.0) ? down : 0.0;
+        largest = (sums[i] > largest) ? sums[i] : largest;
+        largest = (sums[n + i] > largest) ? sums[n + i] : largest;
+    }
+    return largest;
+}
+
 /* ---- watches ------------------------------------------------------------------------------------------------------- */
 
-void edp_watch_centre(const edp_watch *w, const double *z, double *centred) {
+void edp_watch_centre(const edp_watch *w, const double *z, float *centred) {
     for (uint32_t i = 0; i < w->summaries; i++) {
-        centred[i] = edp_known(z[i]) ? (z[i] - (double)w->mean[i]) : 0.0;
+        centred[i] = edp_known(z[i]) ? (float)(z[i] - (double)w->mean[i]) : 0.0f;
     }
 }
 
-double edp_watch_white(const edp_watch *w, const double *centred, uint32_t direction) {
-    return edp_dot(centred, &w->matrix[(size_t)direction * w->summaries], w->summaries);
+double edp_watch_white(const edp_watch *w, const float *centred, uint32_t direction) {
+    return (double)edp_dot(centred, &w->matrix[(size_t)direction * w->summaries], w->summaries);
 }
 
-uint32_t edp_watch_steps(const edp_watch *w) { return (w->detector == EDP_GLR) ? w->window : 1u; }
+uint32_t edp_watch_steps(const edp_watch *w) { return (w->detector == EDP_GLR) ? w->rows : 1u; }
 
-void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *rows,
+void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *seen,
                     double *statistic) {
     const uint32_t n = w->directions;
     if (w->detector == EDP_CUSUM) {
         *statistic = edp_cusum(w->option, white, n, memory) / w->scale;
     } else if (w->detector == EDP_EWMA) {
         *statistic = edp_ewma(w->option, w->factor, white, n, memory) / w->scale;
+    } else if (w->detector == EDP_SEPARATE_CUSUMS) {
+        *statistic = edp_separate_cusums(w->option, white, n, memory) / w->scale;
     } else {
         /* Longest first: each sum rests on the next shorter one of the row before. */
-        const uint32_t length = w->window - step;
+        const uint32_t length = w->rows - step;
         double *const sums = &memory[(size_t)(length - 1u) * n];
         const double *const before = (length > 1u) ? &memory[(size_t)(length - 2u) * n] : NULL;
         const double ratio = edp_glr_ratio(white, n, before, length, sums);
         if (step == 0u) {
-            *rows += (*rows < w->window) ? 1u : 0u;
+            *seen += (*seen < w->rows) ? 1u : 0u;
             *statistic = 0.0;
         }
-        if ((length <= *rows) && (ratio > *statistic)) {
+        if ((length <= *seen) && (ratio > *statistic)) {
             *statistic = ratio;
         }
         if (length == 1u) {
@@ -289,7 +306,7 @@ void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, doub
     }
 }
 
-void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *rows) {
-    edp_clear(EDP_WATCH_MEMORY(w->directions, (w->detector == EDP_GLR) ? w->window : 1u), memory);
-    *rows = 0u;
+void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *seen) {
+    edp_clear(w->directions * w->rows, memory);
+    *seen = 0u;
 }

@@ -1,4 +1,5 @@
-/* From residuals to alarms: what every exported monitor needs. C99, double precision, no heap, no globals, no libm.
+/* From residuals to alarms: what every exported monitor needs. C99, no heap, no globals, no libm. Sums over ticks and rows
+ * are in double precision; linear views of a block, which are most of the work, in single precision.
  *
  * Every sum is taken in the order of its index, from zero, and every operation is one of + - * / and a square root that
  * is rounded correctly: with -ffp-contract=off (GCC, Clang) the numbers are those of Python bit for bit, on every machine
@@ -16,8 +17,8 @@ double edp_root(double x);
 bool edp_known(double x);
 /* What stands for a number that is not there. */
 double edp_unknown(void);
-/* The sum of products x[i] y[i] over i < n. */
-double edp_dot(const double *x, const float *y, uint32_t n);
+/* The sum of products x[i] y[i] over i < n, in single precision. */
+float edp_dot(const float *x, const float *y, uint32_t n);
 /* The sum of squares over i < n. */
 double edp_squares(const double *x, uint32_t n);
 /* Whether a measurement is one: finite, and at most `limit` usual widths from its usual value. */
@@ -64,10 +65,10 @@ void edp_block_tick(const edp_blocks *b, bool first, const float *in, const floa
 void edp_block_summaries(const edp_blocks *b, const double *sums, uint32_t residual, double *summaries);
 /* The operating point (levels + moving), scaled and limited. */
 void edp_block_point(const edp_blocks *b, const double *sums, const float *offset, const float *width, double limit,
-                     double *point);
+                     float *point);
 /* A summary at an operating point of n numbers: less what is usual there, over how widely it scatters there. `usual` and
    `wide` have 1 + n numbers. */
-double edp_conditioned(double summary, const double *point, uint32_t n, const float *usual, const float *wide,
+double edp_conditioned(double summary, const float *point, uint32_t n, const float *usual, const float *wide,
                        double floor, double limit);
 /* A number within limits; NaN stays. */
 double edp_within(double x, double low, double high);
@@ -82,17 +83,19 @@ double edp_ewma(double weight, double factor, const double *row, uint32_t n, dou
    next shorter one before this row, and the row: lengths are taken from the longest down, `before` is that of length - 1,
    NULL for length 1. */
 double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32_t length, double *sums);
+/* A CUSUM up and one down for each residual, the largest counts; `sums` (2 n) is its memory, those up first. */
+double edp_separate_cusums(double slack, const double *row, uint32_t n, double *sums);
 void edp_clear(uint32_t n, double *values);
 
 /* ---- watches: a view of the conditioned summaries, and a detector on it --------------------------------------------- */
 
-typedef enum { EDP_CUSUM = 0, EDP_EWMA = 1, EDP_GLR = 2 } edp_detector;
+typedef enum { EDP_CUSUM = 0, EDP_EWMA = 1, EDP_GLR = 2, EDP_SEPARATE_CUSUMS = 3 } edp_detector;
 
 typedef struct {
     edp_detector detector;
     uint32_t summaries;
     uint32_t directions;
-    uint32_t window;  /* of the likelihood ratio: lengths that are tried */
+    uint32_t rows;    /* of its memory, of `directions` each: of the likelihood ratio the lengths that are tried */
     double option;    /* slack or weight */
     double factor;    /* of the weighted means */
     double scale;     /* over which statistics of all watches are compared with one limit */
@@ -100,18 +103,15 @@ typedef struct {
     const float *matrix; /* (directions, summaries) */
 } edp_watch;
 
-/* Doubles in the memory of a detector. */
-#define EDP_WATCH_MEMORY(directions, window) ((directions) * (((window) > 1u) ? (window) : 1u))
-
 /* Summaries less their mean; a missing one counts as healthy. */
-void edp_watch_centre(const edp_watch *w, const double *z, double *centred);
+void edp_watch_centre(const edp_watch *w, const double *z, float *centred);
 /* One number of the white row. */
-double edp_watch_white(const edp_watch *w, const double *centred, uint32_t direction);
+double edp_watch_white(const edp_watch *w, const float *centred, uint32_t direction);
 /* Steps that a detector takes for one row. */
 uint32_t edp_watch_steps(const edp_watch *w);
-/* One of them; `rows` counts rows since a reset up to the window. The statistic stands in `statistic` behind the last. */
-void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *rows,
+/* One of them; `seen` counts rows since a reset up to `rows`. The statistic stands in `statistic` behind the last. */
+void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *seen,
                     double *statistic);
-void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *rows);
+void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *seen);
 
 #endif

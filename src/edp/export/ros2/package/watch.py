@@ -42,7 +42,7 @@ class MonitorCore(Core):
 
 
 @dataclass
-class Watch:
+class MonitorReport:
     """What is reported of a monitor.
 
     Attributes:

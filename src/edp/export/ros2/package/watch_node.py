@@ -12,7 +12,7 @@ from sensor_msgs.msg import FluidPressure, JointState
 from std_msgs.msg import Bool
 
 from .core import Assembler, Tick, read_sources
-from .watch import ERROR, OK, STALE, WARN, MonitorCore, Watch
+from .watch import ERROR, OK, STALE, WARN, MonitorCore, MonitorReport
 
 LEVELS = {OK: "OK", WARN: "WARN", ERROR: "ERROR", STALE: "STALE"}
 
@@ -34,7 +34,7 @@ class MonitorNode(Node):
         if rate != core.about["rate_hz"]:
             raise ValueError(f"rate_hz is {rate}; the monitor has {core.about['rate_hz']} Hz, leave it out")
         self.ticks = Assembler(core, read_sources(core.inputs, list(self.get_parameter("sources").value)))
-        self.watch = Watch(core)
+        self.watch = MonitorReport(core)
         self.alarm = self.create_publisher(Bool, "~/alarm", qos_profile=10)
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos_profile=10)
         self.create_subscription(JointState, "joint_states", self.on_joints, qos_profile_sensor_data)
