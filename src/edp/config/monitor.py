@@ -13,6 +13,7 @@ from edp.monitor.detectors import DETECTORS
 from edp.monitor.fitting import ChainSpec
 from edp.monitor.residuals import RESIDUALS, ResidualSpec
 from edp.monitor.residuals.balances import BalancesSpec
+from edp.monitor.residuals.look_ahead import LookAheadSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
 from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
@@ -22,7 +23,7 @@ MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS},
 
 def default_residuals() -> tuple[ResidualSpec, ...]:
     """Sources that need no settings; what a machine does not offer gives none."""
-    return VirtualSensorsSpec(), BalancesSpec()
+    return VirtualSensorsSpec(), LookAheadSpec(), BalancesSpec()
 
 
 AUTOMATIC, NO_MACHINE = "", "none"
@@ -90,7 +91,7 @@ class MonitorExperiment:
     groups: tuple[tuple[str, ...], ...] = ()
     hours_per_false_alarm: float = 8.0
     train_share: float = 0.35
-    minutes: float = 6.0
+    minutes: float = 5.0
     seed: int = 0
 
     def __post_init__(self) -> None:

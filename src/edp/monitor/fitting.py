@@ -15,7 +15,7 @@ from edp.monitor.calibration import AlarmLimit, calibrated
 from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
-from edp.monitor.detectors.ewma import EwmaSpec
+from edp.monitor.detectors.separate_cusums import SeparateCusumsSpec
 from edp.monitor.residuals.base import ResidualSource, note_nothing, residuals_of, rows_of
 from edp.monitor.summaries import BlockSummaries
 from edp.monitor.watches import BankSpec, Watch, WatchSpec, fit_watch, scaled_alike
@@ -35,11 +35,10 @@ LEAST_TICKS = 10
 
 
 def default_watches() -> tuple[WatchSpec, ...]:
-    """A view of single blocks for sudden faults, one of averages for lasting ones."""
+    """One view for shifts of many summaries, one for the shift of a single one."""
     return (
-        WatchSpec(detector=EwmaSpec(weight=0.5), memory_s=2.0),
-        WatchSpec(detector=CusumSpec(slack=0.5), memory_s=10.0),
-        WatchSpec(detector=EwmaSpec(weight=0.03), memory_s=60.0),
+        WatchSpec(detector=CusumSpec(slack=0.5), memory_s=40.0),
+        WatchSpec(detector=SeparateCusumsSpec(slack=0.25), memory_s=40.0, view="adjusted"),
     )
 
 

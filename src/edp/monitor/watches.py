@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError
+from edp.errors import ConfigError, DataError
 from edp.monitor.detectors.base import Detector, DetectorSpec
 from edp.settings.bounds import check_bounds, span
 
 Array = NDArray[np.float64]
+VIEWS = ("white", "adjusted")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +26,8 @@ class WatchSpec:
             single rows. A slow fault is a shift of averages, and averages of healthy sessions scatter more widely,
             in other directions, than independent rows would.
         shrink: share of the diagonal in that covariance.
+        view: ``white``: uncorrelated directions; ``adjusted``: each summary less what the others tell of it (Hawkins,
+            Technometrics 33, 1991), the best view of a shift of one summary alone.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -33,8 +36,11 @@ class WatchSpec:
     detector: DetectorSpec
     memory_s: float = 0.0
     shrink: float = 0.1
+    view: str = "white"
 
     def __post_init__(self) -> None:
+        if self.view not in VIEWS:
+            raise ConfigError(f"watches: view = '{self.view}'; one of {', '.join(VIEWS)} must hold")
         check_bounds("watches", self, memory_s=span(0.0, 3600.0), shrink=span(0.0, 1.0))
 
 
@@ -97,9 +103,14 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
     correlation = (1.0 - spec.shrink) * correlation + spec.shrink * np.eye(int(there.sum()))
     values, vectors = np.linalg.eigh(correlation)
     fine = values > 1e-6
-    matrix = np.zeros((rows.shape[1], int(fine.sum())))
-    matrix[there] = vectors[:, fine] / np.sqrt(values[fine] * blocks) / size[there][:, None]
     # An average of `blocks` independent white rows has a variance of 1 / blocks: single rows then have about one.
+    wide = np.sqrt(values[fine] * blocks)
+    view = vectors[:, fine] / wide
+    if spec.view == "adjusted":
+        inverse = (vectors[:, fine] / values[fine]) @ vectors[:, fine].T
+        view = inverse / np.sqrt(np.diag(inverse) * blocks)
+    matrix = np.zeros((rows.shape[1], view.shape[1]))
+    matrix[there] = view / size[there][:, None]
     # Single precision: a controller stores half as much, and the bits stay the same.
     mean, matrix = (values.astype(np.float32).astype(np.float64) for values in (mean, matrix))
     return Watch(spec.detector, mean, matrix)
@@ -157,7 +168,7 @@ class BankSpec(DetectorSpec):
 
 
 def scaled_alike(watches: Sequence[Watch], sessions: Sequence[Array], settle: int) -> tuple[Watch, ...]:
-    """The watches with scales at which each is as eager: of its largest statistic of a healthy session the upper tenth.
+    """The watches with scales at which each is as eager: its third largest statistic of all healthy sessions.
 
     Args:
         watches: with a scale of one.
@@ -171,12 +182,12 @@ def scaled_alike(watches: Sequence[Watch], sessions: Sequence[Array], settle: in
             detector, white = watch.detector.build(watch.directions), watch(session[settle:])
             values = [float(detector.step(row[None])[0]) for row in white]
             peaks.append(max(values, default=0.0))
-        scale = float(np.quantile(peaks, EAGER)) if peaks else 1.0
+        scale = float(np.sort(peaks)[-min(EAGER, len(peaks))]) if peaks else 1.0
         result.append(Watch(watch.detector, watch.mean, watch.matrix, max(scale, 1e-9)))
     return tuple(result)
 
 
 LEAST_ROWS = 16
 """Of averages that a covariance is taken of; the diagonal that is mixed in stands for what they do not tell."""
-EAGER = 0.8
-"""Of the largest statistics of healthy sessions: where watches are made equal."""
+EAGER = 3
+"""Of the largest statistics of healthy sessions, which one makes watches equal: near the limit, where tails differ."""

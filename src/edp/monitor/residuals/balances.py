@@ -143,7 +143,7 @@ class BalancesSpec(ResidualSpec):
     """
 
     source: ClassVar[type[ResidualSource]] = Balances
-    memory_s: tuple[float, ...] = (1.0, 20.0)
+    memory_s: tuple[float, ...] = (0.5, 3.0, 30.0)
     rate_memory_s: tuple[float, ...] = (0.5,)
     match: float = 0.8
 
