@@ -36,6 +36,12 @@ def fit(
         float | None, typer.Option("--hours-per-false-alarm", help="Operating hours to one false alarm; default: 8.")
     ] = None,
     minutes: Annotated[float | None, typer.Option(help="Processor time of its networks, about; default: 5.")] = None,
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            help="Machine (name or .toml) whose faults are simulated to name causes, or none; default: the logs'."
+        ),
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example chain.block_s=2.")] = [],  # noqa: B006
     signal_map: MapOption = None,
@@ -45,7 +51,8 @@ def fit(
     """Fit a monitor: what each channel should read is learned from healthy logs, and so is when to raise an alarm.
 
     Healthy logs are divided by sessions: some train, the others say how widely a healthy machine scatters and set the
-    limit. Hours that are too few for the promise are refused, with the rate that they support.
+    limit. Hours that are too few for the promise are refused, with the rate that they support. Faults are simulated on
+    the machine that the logs name or --machine gives, about half an hour; without one, alarms have no causes.
 
     Example: `edp monitor fit runs/m22 logs/healthy --out monitors/m22`
     """
@@ -54,6 +61,7 @@ def fit(
 
     options: dict[str, Any] = {} if hours is None else {"hours_per_false_alarm": hours}
     options |= {} if minutes is None else {"minutes": minutes}
+    options |= {} if machine is None else {"dictionary": {"machine": machine}}
     experiment = load_monitor_experiment(config, changes, options)
     *runs, logs = arguments
     with progress(as_json) as shown:
@@ -88,8 +96,8 @@ def fit(
 def run(
     folder: Annotated[Path, typer.Argument(metavar="MONITOR", help="Folder that edp monitor fit wrote.")],
     logs: Annotated[Path, typer.Argument(metavar="LOGS", help="A log, a folder of logs, or a data-set file (.toml).")],
-    file: Annotated[
-        Path | None, typer.Option("--out", help="File for the alarms (JSON lines); a CSV file comes beside it.")
+    target: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the alarms (JSON lines, CSV) and what the page shows.")
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -99,13 +107,13 @@ def run(
 
     Channels that a log lacks are silent with all that reads them, which is said. A log of another machine is refused.
 
-    Example: `edp monitor run monitors/m22 logs/today --out alarms.jsonl`
+    Example: `edp monitor run monitors/m22 logs/today --out watched/today`
     """
     from edp.workflows.monitor import run_monitor
 
     with progress(as_json) as shown:
         on_recording = counted(shown, Steps(as_json), "monitor", "recordings watched")
-        watched = run_monitor(folder, source_of(logs, signal_map, repair), file, on_recording)
+        watched = run_monitor(folder, source_of(logs, signal_map, repair), target, on_recording)
 
     def show() -> None:
         for name, channels in watched.silent.items():
@@ -116,9 +124,33 @@ def run(
         if len(rows) > MOST_SHOWN:
             out.print(f"and {len(rows) - MOST_SHOWN:,} more")
         out.print(f"{len(rows):,} alarms in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
-        if file is not None:
-            out.print(f"alarms in {file} and {file.with_suffix('.csv')}")
+        if target is not None:
+            out.print(f"alarms in {target}; next: edp monitor report {target}")
 
-    emit(as_json, {"file": file and str(file), **watched.to_json()}, show)
+    emit(as_json, {"run": target and str(target), **watched.to_json()}, show)
     if watched.alarms:
         raise typer.Exit(ALARMS)
+
+
+@app.command("report")
+def report(
+    run: Annotated[Path, typer.Argument(metavar="MONITOR_RUN", help="Folder that edp monitor run --out wrote.")],
+    page: Annotated[Path | None, typer.Option("--out", help="The page; default: report.html in the folder.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the page.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write one offline page: alarms with evidence and causes, time line, and faults that cannot be told apart.
+
+    Example: `edp monitor report watched/today`
+    """
+    from edp.report.monitor.facts import headline
+    from edp.workflows.monitor import report_monitor
+
+    written, facts = report_monitor(run, page, title)
+    line = headline(facts)
+
+    def show() -> None:
+        out.print(line)
+        out.print(f"report: {written.resolve()}")
+
+    emit(as_json, {"report": str(written), "headline": line, "alarms": len(facts.alarms)}, show)
