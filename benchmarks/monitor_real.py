@@ -239,7 +239,7 @@ def injected(values: Values, column: int, kind: str, size: float, onset: int, rn
     elif kind == "noise":
         shown += (size * deviation * rng.normal(size=len(shown))).astype(np.float32)
     elif kind == "delay":
-        ticks = round(size)
+        ticks = min(round(size), onset)
         changed[onset:, column] = values[onset - ticks : len(values) - ticks, column]
     else:
         changed[onset:, column] = values[onset, column]
