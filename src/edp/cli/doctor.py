@@ -55,7 +55,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 
 
 @dataclass(frozen=True)
-class Check:
+class InstallationCheck:
     """One thing that was looked at.
 
     Attributes:
@@ -96,20 +96,26 @@ def doctor(
         raise typer.Exit(BROKEN)
 
 
-def packages() -> list[Check]:
+def packages() -> list[InstallationCheck]:
     """EDP, Python and the packages that EDP cannot do without."""
     good = (3, 11) <= sys.version_info < (3, 15)
-    python = Check("Python", "ok" if good else "broken", platform.python_version(), "3.11 to 3.14 is tested")
-    checks = [Check("edp", "ok", __version__, str(Path(sys.executable))), python]
+    python = InstallationCheck(
+        "Python", "ok" if good else "broken", platform.python_version(), "3.11 to 3.14 is tested"
+    )
+    checks = [InstallationCheck("edp", "ok", __version__, str(Path(sys.executable))), python]
     try:
         required = metadata.requires(_PACKAGE) or []
     except metadata.PackageNotFoundError:
         text = "versions of packages are unknown: install edp (pip install, make setup)"
-        return [*checks, Check("installation", "missing", "runs from source", text)]
+        return [*checks, InstallationCheck("installation", "missing", "runs from source", text)]
     names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in required if "extra ==" not in line]
     absent = [name for name in names if _version(name) is None]
-    checks += [Check(name, "broken", "-", f"pip install {name}") for name in absent]
-    checks += [Check(name, "ok", _version(name) or "", "training") for name in ("torch", "numpy") if name not in absent]
+    checks += [InstallationCheck(name, "broken", "-", f"pip install {name}") for name in absent]
+    checks += [
+        InstallationCheck(name, "ok", _version(name) or "", "training")
+        for name in ("torch", "numpy")
+        if name not in absent
+    ]
     return checks
 
 
@@ -120,7 +126,7 @@ def _version(name: str) -> str | None:
         return None
 
 
-def machine(folder: Path) -> list[Check]:
+def machine(folder: Path) -> list[InstallationCheck]:
     """System, threads, memory and disk."""
     from edp.storage.memory import free_bytes
 
@@ -128,27 +134,31 @@ def machine(folder: Path) -> list[Check]:
     limits = ", ".join(f"{name}={os.environ[name][:8]}" for name in _THREADS if name in os.environ)
     system = "ok" if sys.platform == "linux" else "broken"
     checks = [
-        Check("system", system, f"{platform.system()} {platform.machine()}", "Linux; on Windows take WSL"),
-        Check("threads", "ok", f"{cores} cores{'; ' if limits else ''}{limits}", "training.threads, --workers"),
+        InstallationCheck("system", system, f"{platform.system()} {platform.machine()}", "Linux; on Windows take WSL"),
+        InstallationCheck(
+            "threads", "ok", f"{cores} cores{'; ' if limits else ''}{limits}", "training.threads, --workers"
+        ),
         _size("memory", free_bytes(), _LEAST_MEMORY, "training; free now"),
     ]
     there = next((path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir()), Path("/"))
     try:
         checks.append(_size("disk", shutil.disk_usage(there).free, _LEAST_DISK, f"runs below {there}"))
     except OSError as error:
-        checks.append(Check("disk", "broken", error.strerror or "unreadable", f"runs below {there}"))
+        checks.append(InstallationCheck("disk", "broken", error.strerror or "unreadable", f"runs below {there}"))
     if not os.access(there, os.W_OK):
-        checks.append(Check("folder", "broken", "read-only", f"runs below {there}: choose another folder (--out)"))
+        checks.append(
+            InstallationCheck("folder", "broken", "read-only", f"runs below {there}: choose another folder (--out)")
+        )
     return checks
 
 
-def _size(what: str, size: float, least: float, needed_for: str) -> Check:
+def _size(what: str, size: float, least: float, needed_for: str) -> InstallationCheck:
     state = "ok" if size >= least else "missing"
     advice = "" if size >= least else f"; less than {least / 1e9:g} GB is little"
-    return Check(what, state, f"{size / 1e9:,.1f} GB", needed_for + advice)
+    return InstallationCheck(what, state, f"{size / 1e9:,.1f} GB", needed_for + advice)
 
 
-def reading() -> Check:
+def reading() -> InstallationCheck:
     """Whether a log can be read: readers run in processes that the system must be able to lock down."""
     try:
         from edp.logs import read_recording
@@ -158,25 +168,27 @@ def reading() -> Check:
             log.write_text("time_s,CylVels_1\n0,1\n1,2\n2,3\n", encoding="utf-8")
             samples = read_recording(log).samples
     except (EdpError, OSError, ImportError) as error:
-        return Check("reading of logs", "broken", " ".join(str(error).split())[:120], "everything that reads logs")
+        return InstallationCheck(
+            "reading of logs", "broken", " ".join(str(error).split())[:120], "everything that reads logs"
+        )
     state = "ok" if samples == 3 else "broken"
-    return Check("reading of logs", state, "a log was read apart", "everything that reads logs")
+    return InstallationCheck("reading of logs", state, "a log was read apart", "everything that reads logs")
 
 
-def extras() -> list[Check]:
+def extras() -> list[InstallationCheck]:
     """Optional parts of EDP."""
     checks = []
     for extra, (module, needed_for) in _EXTRAS.items():
         there = importlib.util.find_spec(module) is not None
         value = "installed" if there else f"pip install '{_PACKAGE}[{extra}]'"
-        checks.append(Check(f"[{extra}]", "ok" if there else "missing", value, needed_for))
+        checks.append(InstallationCheck(f"[{extra}]", "ok" if there else "missing", value, needed_for))
     return checks
 
 
-def programs() -> list[Check]:
+def programs() -> list[InstallationCheck]:
     """Programs of the system that some commands call."""
     checks = []
     for name, needed_for in _PROGRAMS.items():
         path = shutil.which(name)
-        checks.append(Check(name, "missing" if path is None else "ok", path or "-", needed_for))
+        checks.append(InstallationCheck(name, "missing" if path is None else "ok", path or "-", needed_for))
     return checks
