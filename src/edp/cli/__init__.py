@@ -16,6 +16,7 @@ from edp.cli import (
     control,
     demo,
     distil,
+    doctor,
     evaluate,
     export,
     finetune,
@@ -28,6 +29,7 @@ from edp.cli import (
     pretrain,
     quantise,
     report,
+    runs,
     screen,
     search,
     simulate,
@@ -74,6 +76,8 @@ app.command("export")(export.export)
 app.command("parity")(parity.parity)
 app.command("quantise")(quantise.quantise)
 app.command("report")(report.report)
+app.command("runs")(runs.runs)
+app.command("doctor")(doctor.doctor)
 
 
 def _version(show_version: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import threading
 import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -189,6 +190,36 @@ class Steps:
         if self.active and (force or now - self._last >= self.every_s):
             self._last = now
             err.print(text)
+
+
+@contextmanager
+def waiting(text: str, quiet: bool = False, every_s: float = 15.0) -> Iterator[None]:
+    """Say on standard error what takes long and cannot tell how far it is, and ever more seldom that it still does.
+
+    Args:
+        text: what is being done.
+        quiet: say nothing.
+        every_s: until it is said again; twice as long each time.
+    """
+    if quiet:
+        yield
+        return
+    began, ended = time.monotonic(), threading.Event()
+
+    def repeat() -> None:
+        pause = every_s
+        while not ended.wait(pause):
+            err.print(f"{text}: {duration(time.monotonic() - began)} so far")
+            pause *= 2.0
+
+    err.print(text)
+    teller = threading.Thread(target=repeat, daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        teller.join()
 
 
 def counted(shown: Progress, steps: Steps, command: str, verb: str) -> Callable[[str, int, int], None]:

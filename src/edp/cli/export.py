@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out
+from edp.cli.console import JsonFlag, emit, out, waiting
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.errors import ConfigError, closest
 
@@ -27,6 +27,10 @@ def _list_forms(listing_asked: bool) -> None:
             f"{CONTROLLER}: C99, float32: the controller of a run of edp control, with model and solver", soft_wrap=True
         )
         raise typer.Exit
+
+
+FMU = "fmu"
+COMPILING = "compiling the FMU's libraries; for the first one of a system the compiler builds its C runtime: minutes"
 
 
 def export(
@@ -76,7 +80,10 @@ def export(
         files = export_controller(bundle, folder, name, options)
     else:
         source = None if w8a16 is None else source_of(w8a16, signal_map, repair)
-        files = export_bundle(bundle, to, folder, name, options, source)
+        # Other forms are written in a moment, or run no compiler.
+        slow = to == FMU and options.get("binaries") != "none"
+        with waiting(COMPILING, quiet=as_json or not slow):
+            files = export_bundle(bundle, to, folder, name, options, source)
 
     def show() -> None:
         for file in files:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -91,6 +91,9 @@ def _train_auto(
     from edp.workflows.auto import load_auto, train_auto
 
     settings = load_auto(config, changes)
+    if not quiet:
+        limit = f"{settings.auto.minutes:g} min"
+        err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
     with progress(quiet) as shown:
         display = TrainingDisplay(shown, Steps(quiet))
         result = train_auto(source, settings, folder, display.on_event, display.on_candidate, workers)

@@ -1,6 +1,7 @@
 """`edp inspect` of logs that nobody described, and of many logs: a line each first."""
 
 import csv
+import time
 
 import numpy as np
 import pytest
@@ -89,3 +90,20 @@ def test_wide_tables_are_parted_into_blocks(capsys, monkeypatch):
     assert any(line.endswith("1,234,567") for line in lines)
     console.table("", ["name"], [["x" * 90]])
     assert capsys.readouterr().out.replace("\n", "").count("x") == 90
+
+
+def test_what_takes_long_says_so_again_until_it_ends(capsys):
+    with console.waiting("compiling", every_s=0.01):
+        for _ in range(500):
+            if "so far" in capsys.readouterr().err:
+                break
+            time.sleep(0.01)
+        else:
+            pytest.fail("nothing was said while it ran")
+    capsys.readouterr()
+    with console.waiting("compiling", quiet=True, every_s=0.01):
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+    with pytest.raises(ValueError, match="stop"), console.waiting("compiling"):
+        raise ValueError("stop")
+    assert capsys.readouterr().err.count("compiling") == 1

@@ -150,6 +150,14 @@ def test_kinds(tmp_path, header, values, expected):
     assert [guess[1:] for name, guess in guesses(proposal).items() if name != "t"] == [expected]
 
 
+def test_a_slow_signal_of_a_coarse_sensor_is_no_command(tmp_path):
+    rows = machine(60.0)
+    drift = 40 + np.linspace(0, 5, len(rows["Zeit"])) + 0.5 * np.sin(np.arange(len(rows["Zeit"])) / 900)
+    rows |= {"Öltemperatur [°C]": drift.round(1), "s3": (drift * 3).round(1), "w": np.sign(rows["Hebel [%]"])}
+    roles = {g.column: g.role for g in propose(write(tmp_path / "x.csv", rows)).proposal.columns}
+    assert (roles["Öltemperatur"], roles["s3"], roles["w"]) == ("measured", "measured", "command")
+
+
 @pytest.mark.parametrize(
     ("stamps", "unit", "rate"),
     [

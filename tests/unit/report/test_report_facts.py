@@ -103,7 +103,7 @@ def test_outputs_that_lose_stand_first(run_folder):
     edit_scores(run_folder, change)
     facts = read_facts(run_folder)
     name = facts.targets[1].name
-    start = f"The network loses to a baseline on 1 of 3 outputs: {name} (Persistence: 50 % less error)."
+    start = f"The network loses to a baseline on 1 of 3 outputs: {name} (Persistence: 50 % less RMSE)."
     assert headline(facts).startswith(start)
 
 

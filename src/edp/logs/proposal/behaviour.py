@@ -43,6 +43,7 @@ class Behaviour:
         step: median of the steps that are not zero, 0 where there are none.
         even: nearly all steps have one size.
         restarts: rows at which an even rise begins anew.
+        coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
     """
 
     filled: float
@@ -57,6 +58,7 @@ class Behaviour:
     step: float
     even: bool
     restarts: int
+    coarse: bool = False
 
     @property
     def counts(self) -> bool:
@@ -75,8 +77,8 @@ class Behaviour:
 
     @property
     def steps(self) -> bool:
-        """Moves in steps and holds its value between them."""
-        return self.holds >= _HOLDS and not self.constant
+        """Moves in steps of its own and holds its value between them."""
+        return self.holds >= _HOLDS and not self.constant and not self.coarse
 
 
 def behaviour_of(column: LogColumn) -> Behaviour:
@@ -97,19 +99,22 @@ def behaviour_of(column: LogColumn) -> Behaviour:
     near = np.abs(moving - step) <= 0.1 * abs(step)
     falls = int(np.count_nonzero(steps < 0))
     constant = bool(finite.min() == finite.max())
+    sizes, levels = np.abs(moving), len(np.unique(finite))
+    least = float(np.median(sizes)) if len(sizes) else 0.0
     return Behaviour(
         filled=len(finite) / len(values),
         low=float(finite.min()),
         high=float(finite.max()),
         constant=constant,
         whole=bool(np.all(finite == np.rint(finite))),
-        levels=len(np.unique(finite)),
+        levels=levels,
         holds=float(np.mean(steps == 0)) if len(steps) else 1.0,
         rises=falls == 0,
         climbs=bool(len(steps)) and bool(np.all(steps > 0)),
         step=step,
         even=bool(len(moving)) and float(near.mean()) > 0.9,
         restarts=falls if step > 0 and falls and float(near.mean()) > 0.9 else 0,
+        coarse=levels > 4 and len(sizes) > 0 and float(np.mean(sizes <= 1.1 * least)) > 0.9,
     )
 
 

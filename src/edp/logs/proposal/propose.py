@@ -19,7 +19,8 @@ SURE = 0.85
 MAPPED_ROLES = ("reference", "command", "measured", "label")
 """Roles of columns that become channels; time, counters, constants and text do not."""
 _COMMANDS = (Kind.PILOT_PRESSURE, Kind.CURRENT, Kind.VOLTAGE, Kind.RATIO)
-_MOTIONS = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.POSITION, Kind.ANGLE, Kind.ACCELERATION, Kind.FORCE)
+_MEASURED = tuple(kind for kind in Kind if kind not in (*_COMMANDS, Kind.GENERIC))
+"""Kinds that show what a machine does, however they move; names and what follows them tell their references."""
 _PLAIN_NAME = re.compile(r"\w[\w .\-/()%]{0,63}")
 _MOST_CHANNELS = 200
 _SWITCHED_HZ = {"command": 0.01, "": 0.05, "label": 1.0}
@@ -193,12 +194,12 @@ def _role(
         return word, 0.7 if by_letter else 0.85, "its name"
     if kind.kind in _COMMANDS and kind.confidence >= BOUND:
         return "command", 0.65, f"a {kind.kind.replace('_', ' ')}"
+    if kind.kind in _MEASURED and kind.confidence >= BOUND:
+        return "measured", 0.85, f"a {kind.kind.replace('_', ' ')}"
     if behaviour.steps:
         return "command", 0.65, "moves in steps"
     if relation is not None and relation.how == "change":
         return "measured", 0.7, f"the change of {relation.other[:24]}"
-    if kind.kind in _MOTIONS and kind.confidence >= BOUND:
-        return "measured", 0.85, f"a {kind.kind.replace('_', ' ')}"
     return "measured", 0.65, "moves by itself"
 
 

@@ -287,7 +287,7 @@ def headline(facts: Facts) -> str:
         return f"{first} {by_output(facts.scores, samples, targets, horizon_text(facts, samples))}".strip()
     unit = facts.unit
     values = {row["model"]: score(facts.models[row["model"]], samples) for row in rows}
-    places = min(max(decimals_for(values.values(), significant=2), 1), 4)
+    places = min(max(decimals_for(values.values(), significant=2), 1), 4 if unit else 8)
     parts = [f"{row['label']} {number(values[row['model']], places)}" for row in rows if not row["is_network"]]
     shown = parts if len(parts) <= 4 else [*parts[:3], f"{len(parts) - 3} more above that"]
     start = f"At {horizon_text(facts, samples)} ahead the network is off by {number(values[NETWORK], places)} {unit}"

@@ -21,7 +21,7 @@ def losses_line(scores: Mapping[str, Any]) -> str:
     losses = lost_outputs(scores)
     if not losses:
         return ""
-    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less error)" for loss in losses[:SHOWN]]
+    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less RMSE)" for loss in losses[:SHOWN]]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
     return (
         f"The network loses to a baseline on {len(losses)} of {len(scores['targets'])} outputs: {listed(parts)}{more}."

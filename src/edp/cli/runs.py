@@ -1,0 +1,58 @@
+"""``edp runs``: what trainings, twins and searches lie on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, emit, listing, out
+
+
+def runs(
+    folder: Annotated[Path, typer.Argument(help="Folder to look below.")] = Path(),
+    most: Annotated[int, typer.Option(min=1, max=10_000, help="Runs to show, the latest first.")] = 40,
+    as_json: JsonFlag = False,
+) -> None:
+    """List the runs below a folder: kind, data, error on test logs, when, finished or not.
+
+    Example: `edp runs runs/`
+    """
+    from edp.storage.run_listing import list_runs
+
+    listed, whole = list_runs(folder)
+
+    def show() -> None:
+        rows = [
+            (str(_below(run.folder, folder)), run.kind, run.state, run.when[:16].replace("T", " "), run.score or "-")
+            for run in listed[:most]
+        ]
+        if not rows:
+            out.print(f"no runs below '{folder}'; edp train writes one")
+            return
+        listing("", ["run", "kind", "state", "when", "error on test logs"], rows)
+        for source in dict.fromkeys(run.data for run in listed[:most] if run.data):
+            names = [str(_below(run.folder, folder)) for run in listed[:most] if run.data == source]
+            out.print(f"  data {source}: {', '.join(names[:4])}{', ...' if len(names) > 4 else ''}")
+        if len(listed) > most:
+            out.print(f"and {len(listed) - most} older ones (--most)")
+        if not whole:
+            out.print("there are more folders than were looked into; give one nearer to the runs")
+
+    facts = [
+        {
+            "folder": str(run.folder),
+            "kind": run.kind,
+            "state": run.state,
+            "when": run.when,
+            "data": run.data,
+            "score": run.score,
+        }
+        for run in listed
+    ]
+    emit(as_json, {"runs": facts, "complete": whole}, show)
+
+
+def _below(path: Path, top: Path) -> Path:
+    return path.relative_to(top) if path != top else path

@@ -1,0 +1,153 @@
+"""What runs lie below a folder, as far as their files say: read within bounds, whatever is in them."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+from edp.storage.locks import held_by
+from edp.storage.reading import parse_json, read_text
+
+MOST_FOLDERS = 20_000
+"""Folders that are looked into: more is a whole disk."""
+DEEPEST = 6
+"""Levels below the folder."""
+_BYTES = 8 * 2**20
+"""Of a file of a run; scores of hundreds of recordings take one."""
+_LONGEST = 200
+"""Characters of a text that is listed."""
+_STUDY = "study.json"
+_MARKS: Mapping[str, str] = {
+    "twin/twin.json": "twin",
+    "controller/controller.json": "control",
+    "tuning.json": "tuning",
+    _STUDY: "search",
+    "auto.json": "auto",
+    "foundation.json": "pretraining",
+    "adaptation.json": "adaptation",
+}
+"""What only one kind of run has, in the order in which it decides."""
+_RUN = ("run.json", "status.json", "provenance.json", _STUDY, "auto.json")
+"""One of these makes a folder a run."""
+
+
+@dataclass(frozen=True)
+class ListedRun:
+    """A run on disk.
+
+    Attributes:
+        folder: where it is.
+        kind: ``network`` or what `_MARKS` says.
+        state: ``finished``, ``running``, ``stopped``, ``diverged``, or ``damaged`` where a file cannot be read.
+        when: of its last state, as its files say; else of its files.
+        data: where its recordings were.
+        score: its error on test logs in words; empty where it was not judged.
+    """
+
+    folder: Path
+    kind: str
+    state: str
+    when: str
+    data: str
+    score: str
+
+
+def list_runs(folder: str | Path) -> tuple[list[ListedRun], bool]:
+    """The runs below a folder, the latest first, and whether all folders were looked into.
+
+    Links are not followed. Files of a run that cannot be read make it ``damaged``, not the list.
+
+    Raises:
+        StorageError: there is no such folder.
+    """
+    top = Path(folder)
+    if not top.is_dir():
+        raise StorageError(f"no folder at '{top}'; give one that holds runs")
+    runs, whole = [], True
+    for number, path in enumerate(_folders(top)):
+        if number >= MOST_FOLDERS:
+            whole = False
+            break
+        if any((path / name).is_file() for name in _RUN):
+            runs.append(_run(path))
+    return sorted(runs, key=lambda run: run.when, reverse=True), whole
+
+
+def _folders(top: Path) -> Iterator[Path]:
+    """A folder and those below it, but none within a run: its parts are not runs of their own."""
+    waiting = [(top, 0)]
+    while waiting:
+        path, depth = waiting.pop()
+        yield path
+        if depth == DEEPEST or (path / "run.json").is_file():
+            continue
+        try:
+            with os.scandir(path) as entries:
+                below = sorted(e.name for e in entries if e.is_dir(follow_symlinks=False) and e.name[:1] != ".")
+        except OSError:  # not ours to read
+            continue
+        waiting += [(path / name, depth + 1) for name in reversed(below)]
+
+
+def _run(path: Path) -> ListedRun:
+    kind = next((kind for mark, kind in _MARKS.items() if (path / mark).is_file()), "network")
+    damaged: list[str] = []
+    status, provenance, scores = (_part(path / f"{name}.json", damaged) for name in ("status", "provenance", "scores"))
+    state = str(status.get("status", ""))
+    if state not in ("finished", "diverged"):
+        state = "running" if held_by(path / ".lock") else "finished" if kind in ("search", "control") else "stopped"
+    data = provenance.get("data")
+    source = str(data.get("source", "")) if isinstance(data, dict) else ""
+    when = str(status.get("time") or provenance.get("created") or _touched(path))
+    score = ""
+    try:
+        score = _score(scores)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        damaged.append("scores.json")
+    return ListedRun(path, kind, "damaged" if damaged else state, when[:_LONGEST], source[:_LONGEST], score[:_LONGEST])
+
+
+def _part(file: Path, damaged: list[str]) -> Mapping[str, Any]:
+    """A JSON file of a run; empty where there is none or it is damaged."""
+    if not file.is_file():
+        return {}
+    try:
+        content = parse_json(read_text(file, _BYTES), f"'{file}'", finite=False)
+    except StorageError:
+        content = None
+    if not isinstance(content, dict):
+        damaged.append(file.name)
+        return {}
+    return content
+
+
+def _touched(path: Path) -> str:
+    """When a folder was last written, in the form of the files."""
+    try:
+        return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(path.stat().st_mtime))
+    except (OSError, OverflowError, ValueError):
+        return ""
+
+
+def _score(scores: Mapping[str, Any]) -> str:
+    """The network's mean absolute error at the longest horizon, of the first output where they have no one unit."""
+    if not scores:
+        return ""
+    horizon = max(int(one) for one in scores["task"]["horizons"])
+    targets = scores["targets"]
+    units = {str(target["unit"]) for target in targets}
+    shared = len(targets) == 1 or (len(units) == 1 and units != {"1"})
+    name = "mean" if shared else str(targets[0]["name"])
+    error = float(scores["models"]["network"]["overall"][str(horizon)][name]["mae"])
+    if not math.isfinite(error):
+        return ""
+    unit = str(targets[0]["unit"])
+    of_unit = "" if unit == "1" else f" {unit}"
+    more = "" if shared else f" ({name}; {len(targets)} outputs)"
+    return f"{error:.4g}{of_unit} at k = {horizon}{more}"
