@@ -11,6 +11,7 @@ from edp.sim.environment import ExcavatorEnv, VectorExcavatorEnv
 from edp.sim.environment.spec import EnvironmentSpec
 from edp.sim.faults import FAULTS, FaultSpec, MachineFault, SensorFault, at_site, fault_text, ladder, parse_fault
 from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at
+from edp.sim.faults.shown import falsified_channels
 from edp.sim.machine import layout as at
 from edp.sim.sensors import chain, draws, sensors
 from edp.sim.start import seeds_of
@@ -276,3 +277,16 @@ def test_noise_grows_by_its_factor():
     np.testing.assert_allclose(ratio, [1, 1, 1, 1, 10, 1])
     np.testing.assert_array_equal(drawn[:1000, chain.RATE_ERROR], healthy[:1000, chain.RATE_ERROR])
     np.testing.assert_allclose(drawn[1000:, chain.RATE_ERROR], 3.0 * healthy[1000:, chain.RATE_ERROR])
+
+
+def test_channels_of_a_sensor_fault_are_those_that_change():
+    """What a fault is said to falsify differs from a sound recording, and no other sensor's value does."""
+    sound = simulate(Scenario(duration_s=2.0, seed=3))
+    for kind, site, size in (("pressure_bias", "arm_rod", "10bar"), ("velocity_noise", "bucket", "10x")):
+        faulty = simulate(Scenario(duration_s=2.0, seed=3, faults=[f"{kind}:{site}:{size}@0s"]))
+        names = [name for name in sound.channel_names if not name.startswith("CylAcc")]
+        changed = {name for name in names if not np.array_equal(sound.column(name), faulty.column(name))}
+        assert changed == set(falsified_channels(kind, site))
+    assert falsified_channels("head_rod_swapped", "boom") == ("CylPressures_1", "CylPressures_5")
+    assert falsified_channels("temperature_offset", "") == ("OilTemperature",)
+    assert falsified_channels("internal_leak", "boom") == ()

@@ -1,7 +1,6 @@
 """A monitor beside a loop on the simulator: a sensor that fails, and what the controller does about it."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from edp.monitor.calibration import AlarmLimit
 from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning
 from edp.monitor.detectors import CusumSpec
+from edp.monitor.diagnosis.causes import Cause
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals import BalancesSpec, FitMaterial
 from edp.monitor.residuals.base import residuals_of
@@ -139,9 +139,9 @@ def test_with_the_monitor_a_faulty_sensor_harms_the_loop_less(env, models, monit
     assert sum(guarded.score.violations.values()) <= sum(alone.score.violations.values())
 
 
-def blamed(kind, site, probability, place):
+def blamed(kind, site, probability, at_fault):
     """A cause as a diagnosis names it."""
-    return SimpleNamespace(kind=kind, site=site, probability=probability, place=place)
+    return Cause(kind=kind, site=site, probability=probability, at_fault=at_fault)
 
 
 def alarm(*evidence, cause=None):
@@ -151,13 +151,13 @@ def alarm(*evidence, cause=None):
 def test_a_diagnosed_sensor_is_taken_away_and_the_plan_goes_on(env, monitor):
     guard = MonitorGuard(monitor)
     guard.reset(interface_of(env))
-    found = guard.verdict_of(alarm(("balance:x.mean", 5.0), cause=blamed("bias", FAULTY, 0.9, "sensor")))
+    found = guard.verdict_of(alarm(("balance:x.mean", 5.0), cause=blamed("velocity_bias", "arm", 0.9, "sensor")))
     assert (found.untrusted, found.fall_back) == (frozenset({FAULTY}), False)
-    machine = guard.verdict_of(alarm(("balance:x.mean", 5.0), cause=blamed("leak", "boom", 0.9, "machine")))
+    machine = guard.verdict_of(alarm(("balance:x.mean", 5.0), cause=blamed("internal_leak", "boom", 0.9, "machine")))
     assert (machine.untrusted, machine.fall_back) == (frozenset(), True)
-    stroke = guard.verdict_of(alarm(cause=blamed("bias", STROKES[0], 0.9, "sensor")))
+    stroke = guard.verdict_of(alarm(cause=blamed("stroke_bias", "boom", 0.9, "sensor")))
     assert (stroke.untrusted, stroke.fall_back) == (frozenset({STROKES[0]}), True)
-    unsure = guard.verdict_of(alarm(("balance:x.mean", 5.0), cause=blamed("bias", FAULTY, 0.3, "sensor")))
+    unsure = guard.verdict_of(alarm(("balance:x.mean", 5.0), cause=blamed("velocity_bias", "arm", 0.3, "sensor")))
     # The evidence names a residual that this monitor does not have: nothing to take away.
     assert (unsure.untrusted, unsure.fall_back) == (frozenset(), True)
 

@@ -14,6 +14,7 @@ from edp.errors import ConfigError
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.monitor import Monitor, MonitorStream
 from edp.monitor.monitor_file import load_monitor
+from edp.sim.faults.shown import falsified_channels
 
 Array = NDArray[np.float64]
 HOLD_S = 60.0
@@ -86,10 +87,12 @@ class MonitorGuard:
         """What an alarm means for a loop."""
         cause = alarm.causes[0] if alarm.causes else None
         sure = cause is not None and cause.probability >= SURE
-        if cause is not None and sure and cause.place == "sensor" and cause.site in self._names:
-            reason = f"sensor fault, {cause.kind}, probability {cause.probability:.2f}"
-            return GuardVerdict(frozenset({cause.site}), cause.site in STROKES, reason)
-        if cause is not None and sure and cause.place == "machine":
+        if cause is not None and sure and cause.at_fault == "sensor":
+            falsified = frozenset(falsified_channels(cause.kind, cause.site)) & self._names
+            if falsified:
+                reason = f"sensor fault, {cause.kind}, probability {cause.probability:.2f}"
+                return GuardVerdict(falsified, bool(falsified & {*STROKES}), reason)
+        if cause is not None and sure and cause.at_fault == "machine":
             # Sensors tell the truth, and the model is of another machine.
             return GuardVerdict(frozenset(), True, f"fault of the machine, {cause.kind}")
         names, share = suspected(alarm, judged_by(self.monitor))
