@@ -29,7 +29,8 @@ def test_rooms_are_few_and_imports_go_down(house):
     assert len(house.siblings) <= 23, house.siblings
     # 130 before the rooms of closed loops, which imports eight and is imported by three, and of monitoring, which
     # imports three.
-    assert house.arrows <= 141
+    # 141 before the monitor read networks, twins and recordings (seven more rooms), and settings and testing read it.
+    assert house.arrows <= 150
     assert house.circles == []
 
 

@@ -52,7 +52,7 @@ def fit(
 
     Healthy logs are divided by sessions: some train, the others say how widely a healthy machine scatters and set the
     limit. Hours that are too few for the promise are refused, with the rate that they support. Faults are simulated on
-    the machine that the logs name or --machine gives, about half an hour; without one, alarms have no causes.
+    the machine that the logs name or --machine gives, some minutes; without one, alarms have no causes.
 
     Example: `edp monitor fit runs/m22 logs/healthy --out monitors/m22`
     """

@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edp.config.monitor import load_monitor_experiment
 from edp.logs import write_recording
+from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY
 from edp.testing.monitor import rig_sessions
+from edp.workflows.monitor import fit_monitor
 
 pytestmark = pytest.mark.training
 NAMES = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
@@ -39,17 +42,19 @@ def healthy(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def fitted(edp, healthy, tmp_path_factory):
+def fitted(healthy, tmp_path_factory):
     folder = tmp_path_factory.mktemp("monitors") / "rig"
-    ended = edp(
-        *("monitor", "fit", healthy, "--out", folder, "--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--json")
-    )
+    experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": 0.06, "minutes": 0.05})
+    fit_monitor([], DataSource.of(healthy), experiment, folder)
+    return folder
+
+
+def test_fit_says_what_is_watched_and_what_is_promised(edp, healthy, tmp_path):
+    folder = tmp_path / "monitor"
+    options = ("--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--json")
+    ended = edp("monitor", "fit", healthy, "--out", folder, *options)
     assert ended.code == 0, ended.err
-    return folder, json.loads(ended.out)
-
-
-def test_fit_says_what_is_watched_and_what_is_promised(fitted):
-    folder, facts = fitted
+    facts = ended.json
     assert (folder / "monitor.json").is_file()
     assert (folder / "settings.toml").is_file()
     assert "virtual:CylVels_1" in facts["residuals"]
@@ -58,7 +63,7 @@ def test_fit_says_what_is_watched_and_what_is_promised(fitted):
 
 
 def test_alarms_are_logged_and_end_with_exit_code_5(edp, fitted, tmp_path):
-    folder, _ = fitted
+    folder = fitted
     faulty = logs(1, first=40)[0]
     values = faulty.values.copy()
     values[800:, 3] += np.float32(4e6)
@@ -84,7 +89,7 @@ def test_alarms_are_logged_and_end_with_exit_code_5(edp, fitted, tmp_path):
 
 
 def test_a_log_that_lacks_a_channel_is_watched_with_the_rest(edp, fitted, tmp_path):
-    folder, _ = fitted
+    folder = fitted
     part = logs(1, first=41)[0]
     part = Recording(part.name, part.channels[:4], part.values[:, :4].copy(), part.rate_hz)
     ended = edp("monitor", "run", folder, write([part], tmp_path / "part"))
@@ -100,7 +105,7 @@ def test_too_few_hours_are_one_message_before_anything_is_written(edp, healthy, 
 
 
 def test_bad_input_is_one_message(edp, fitted, healthy, tmp_path):
-    folder, _ = fitted
+    folder = fitted
     for arguments in (
         ("monitor", "run", tmp_path, healthy),
         ("monitor", "run", folder, tmp_path / "nothing"),

@@ -140,6 +140,15 @@ def test_scatter_tells_what_passes_from_what_lasts():
         Scatter.fit([np.zeros((10, 3))])
 
 
+def test_a_summary_that_stands_still_says_nothing():
+    still = [np.concatenate([rows, np.full((len(rows), 1), 0.5)], axis=1) for rows in healthy()]
+    scatter = Scatter.fit(still)
+    assert (scatter.variance(10) > 0.0).all()
+    moved = np.zeros(14)
+    moved[6] = 100.0
+    assert np.abs(scatter.directions(scatter.mean + moved)).max() == 0.0
+
+
 def test_a_fault_without_a_session_is_refused():
     with pytest.raises(DataError, match="has no session"):
         fit_dictionary(SUMMARIES, CLASSES, [s for s in sessions() if s.owner], healthy(), {})

@@ -20,7 +20,16 @@ BIAS, MINUS = fault_classes(["pressure_bias"])[:2]
 def cause(fault, size, probability, grade=0.5):
     words = cause_words(fault, size)
     return Cause(
-        fault.kind, fault.site, fault.component, fault.place, size, fault.unit, probability, words, grade, fault.grave
+        fault.kind,
+        fault.site,
+        fault.component,
+        fault.at_fault,
+        size,
+        fault.unit,
+        probability,
+        words,
+        grade,
+        fault.grave,
     )
 
 
@@ -84,7 +93,7 @@ def test_classes_come_back_and_others_are_refused():
     for change in (
         {"sizes": [1.0] * 99},
         {"sizes": [float("nan")]},
-        {"place": "moon"},
+        {"at_fault": "moon"},
         {"words": "x" * 999},
         {"unit": 3},
     ):
@@ -97,7 +106,7 @@ def test_classes_come_back_and_others_are_refused():
 def test_every_fault_is_a_class_at_each_site_and_of_each_sign():
     classes = fault_classes()
     assert len({fault.name for fault in classes}) == len(classes)
-    assert {fault.place for fault in classes} == {"sensor", "machine"}
+    assert {fault.at_fault for fault in classes} == {"sensor", "machine"}
     biases = [fault for fault in classes if fault.kind == "pilot_bias"]
     assert len(biases) == 24
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from edp.errors import DataError
 
-Place = Literal["sensor", "machine", "none"]
+AtFault = Literal["sensor", "machine", "none"]
 NONE_OF_THESE = "none"
 """Kind of the cause that is no fault of the dictionary."""
 LONGEST_TEXT = 300
@@ -24,7 +24,7 @@ class FaultClass:
         kind: name of the kind.
         site: where it sits; empty where a machine has one such part only.
         component: the part that a mechanic would look at.
-        place: whether the machine or a sensor is at fault.
+        at_fault: whether the machine or a sensor is at fault.
         unit: of the sizes; empty for faults that are there or not.
         sizes: for which there are signatures, in `unit`, the smallest first; of one sign. Empty without sizes.
         neutral: the size that is no fault.
@@ -35,7 +35,7 @@ class FaultClass:
     kind: str
     site: str
     component: str
-    place: Place
+    at_fault: AtFault
     unit: str
     sizes: tuple[float, ...]
     neutral: float
@@ -61,7 +61,7 @@ class Cause:
         kind: name of the kind of fault, or `NONE_OF_THESE`.
         site: where it sits.
         component: the part that a mechanic would look at; empty for `NONE_OF_THESE`.
-        place: whether the machine or a sensor is at fault.
+        at_fault: whether the machine or a sensor is at fault.
         size: estimated from the evidence, in `unit`; None for faults that are there or not.
         unit: of the size.
         probability: 0 to 1, of this cause among all.
@@ -73,7 +73,7 @@ class Cause:
     kind: str
     site: str = ""
     component: str = ""
-    place: Place = "none"
+    at_fault: AtFault = "none"
     size: float | None = None
     unit: str = ""
     probability: float = 0.0
@@ -101,8 +101,8 @@ def class_of(values: Any, where: str) -> FaultClass:
     numbers = [*sizes, neutral] if isinstance(sizes, Sequence) and not isinstance(sizes, str) else [None]
     if len(numbers) > MOST_SIZES or not all(_is_finite(number) for number in numbers):
         raise DataError(f"{where}: sizes and neutral must be at most {MOST_SIZES} finite numbers")
-    if values["place"] not in ("sensor", "machine") or not isinstance(values["grave"], bool):
-        raise DataError(f"{where}: place must be 'sensor' or 'machine', grave true or false")
+    if values["at_fault"] not in ("sensor", "machine") or not isinstance(values["grave"], bool):
+        raise DataError(f"{where}: at_fault must be 'sensor' or 'machine', grave true or false")
     return FaultClass(**{**values, "sizes": tuple(map(float, sizes)), "neutral": float(neutral)})
 
 

@@ -31,8 +31,8 @@ def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: d
         rows: conditioned rows since the onset, shape (blocks, summaries).
         start: of the recording, as a time of day.
     """
-    found = match(dictionary, rows[-MOST_ROWS:], fresh=len(rows) <= MOST_ROWS)
-    causes = causes_of(dictionary, found)
+    matched = match(dictionary, rows[-MOST_ROWS:], fresh=len(rows) <= MOST_ROWS)
+    causes = causes_of(dictionary, matched)
     sentence = alarm_sentence(causes, alarm.since_s, start)
     return replace(alarm, causes=causes, sentence=sentence, severity=severity(causes))
 

@@ -15,6 +15,8 @@ SHORT, LONG = 8, 40
 """Blocks of the windows over which the scatter of means is measured."""
 SHRUNK = 0.2
 """Share of the identity in the correlations: there are fewer healthy sessions than summaries."""
+LEAST_VARIANCE = 1e-6
+"""Of a feature in units of healthy blocks, below which it stands still."""
 LEAST_SESSIONS = 4
 ONSET = 6
 """Blocks from the onset on that are looked at apart: a step of a sensor shows in them only."""
@@ -82,13 +84,18 @@ class Scatter:
             )
         mean = windows[SHORT].mean(axis=0)
         short = np.cov(windows[SHORT], rowvar=False)
-        size = np.sqrt(np.maximum(np.diag(short), 1e-12))
-        correlation = (1.0 - SHRUNK) * short / np.outer(size, size) + SHRUNK * np.eye(len(size))
+        # What never varies on healthy sessions has no scale of its own, and is left out: its row stays zero.
+        varies = np.diag(short) > LEAST_VARIANCE
+        size = np.sqrt(np.where(varies, np.diag(short), 1.0))
+        correlation = (1.0 - SHRUNK) * short / np.outer(size, size) * np.outer(varies, varies) + SHRUNK * np.eye(
+            len(size)
+        )
         values, vectors = np.linalg.eigh(correlation)
-        matrix = vectors / np.sqrt(values) / size[:, None]
+        matrix = vectors / np.sqrt(values) * (varies / size)[:, None]
         # Two lengths tell both parts: variance = lasting + passing / length.
         over_short = ((windows[SHORT] - mean) @ matrix).var(axis=0)
         over_long = ((windows[LONG] - mean) @ matrix).var(axis=0)
+        over_short = np.where(over_short > LEAST_VARIANCE, over_short, 1.0)
         passing = np.maximum((over_short - over_long) / (1.0 / SHORT - 1.0 / LONG), 0.05 * SHORT * over_short)
         lasting = np.maximum(over_short - passing / SHORT, 0.05 * over_short)
         return Scatter(mean, lasting, passing, matrix)

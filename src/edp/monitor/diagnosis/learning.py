@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edp.monitor.diagnosis.causes import FaultClass
 from edp.monitor.diagnosis.evidence import ONSET, Scatter, mean_features
-from edp.monitor.diagnosis.matching import Match, Seen, match_directions
+from edp.monitor.diagnosis.matching import Candidates, Seen, candidates, judged, likelihoods
 from edp.monitor.diagnosis.signatures import Dictionary, signatures_of
 from edp.monitor.diagnosis.structure import confusions
 
@@ -24,7 +24,7 @@ LEAST_CHANGE = 3.0
 """Size of a signature, in healthy standard deviations of such a mean, below which it would not have been found."""
 UNUSUAL = 0.98
 """Share of left-out sessions that some fault must explain."""
-MOST_JUDGED = 400
+MOST_JUDGED = 240
 """Left-out sessions that numbers are chosen on."""
 
 
@@ -75,16 +75,16 @@ def fit_dictionary(
     draws = sorted({fault.draw for fault in faults})
     if len(draws) < 2:
         return whole
-    judged = _left_out(summaries, classes, faults, scatter, healthy, seed)
-    whole = _chosen(judged, whole)
-    return replace(whole, confusions=_confusions(judged, whole))
+    sessions = _left_out(summaries, classes, faults, scatter, healthy, seed)
+    whole = _chosen(sessions, whole)
+    return replace(whole, confusions=_confusions(sessions, whole))
 
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """A left-out session: the dictionary without its draw, and what an alarm would see of it."""
+    """A left-out session: what the dictionary without its draw compares with, and what an alarm would see of it."""
 
-    without: Dictionary
+    tried: Candidates
     fault: SimulatedFault
     seen: tuple[Seen, Seen]
 
@@ -114,12 +114,12 @@ def _left_out(
     chance = np.random.default_rng([seed, 23])
     noise = [scatter.variance(blocks) for blocks in (ONSET, WINDOW)]
     long = [session for session in healthy if len(session) >= ONSET + WINDOW]
-    judged = []
+    sessions = []
     for draw in sorted({fault.draw for fault in faults}):
         others = [fault for fault in faults if fault.draw != draw]
         if {fault.owner for fault in others} != set(range(len(classes))):
             continue
-        without = _dictionary(summaries, classes, others, scatter, {})
+        tried = candidates(_dictionary(summaries, classes, others, scatter, {}))
         for fault in faults:
             if fault.draw != draw or not _would_be_found(fault.change @ scatter.matrix, noise):
                 continue
@@ -128,9 +128,9 @@ def _left_out(
             ends = first, first + ONSET, first + ONSET + WINDOW
             means = [mean_features(session[ends[part] : ends[part + 1]]) for part in (0, 1)]
             at, after = ((scatter.directions(means[part] + fault.change[part]), noise[part]) for part in (0, 1))
-            judged.append(_Judged(without, fault, (at, after)))
-    keep = chance.permutation(len(judged))[:MOST_JUDGED]
-    return [judged[place] for place in sorted(keep.tolist())]
+            sessions.append(_Judged(tried, fault, (at, after)))
+    keep = chance.permutation(len(sessions))[:MOST_JUDGED]
+    return [sessions[row] for row in sorted(keep.tolist())]
 
 
 def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
@@ -138,41 +138,37 @@ def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
     return any(float(np.max(change[part] ** 2 / noise[part])) > LEAST_CHANGE**2 for part in (0, 1))
 
 
-def _chosen(judged: Sequence[_Judged], whole: Dictionary) -> Dictionary:
+def _chosen(judged_sessions: Sequence[_Judged], whole: Dictionary) -> Dictionary:
     """With the share of change and the temperature of the least logarithmic loss, and a misfit that few have."""
     best, least = whole, np.inf
     for changing in CHANGING:
+        found_by = [likelihoods(case.tried, case.seen, changing) for case in judged_sessions]
         for temperature in TEMPERATURES:
-            tried = replace(whole, changing=changing, temperature=temperature)
-            loss, misfits = 0.0, []
-            for case in judged:
-                found = _found(case, tried)
-                loss -= float(np.log(max(found.probabilities[case.fault.owner], 1e-6)))
-                misfits.append(found.misfit)
-            if misfits and loss < least:
-                best, least = replace(tried, strange=max(float(np.quantile(misfits, UNUSUAL)), 1.0)), loss
+            numbers = replace(whole, changing=changing, temperature=temperature, strange=np.inf)
+            matches = [judged(case.tried, *one, numbers) for case, one in zip(judged_sessions, found_by, strict=True)]
+            pairs = zip(matches, judged_sessions, strict=True)
+            loss = -sum(float(np.log(max(one.probabilities[case.fault.owner], 1e-6))) for one, case in pairs)
+            if matches and loss < least:
+                misfit = float(np.quantile([one.misfit for one in matches], UNUSUAL))
+                best, least = replace(numbers, strange=max(misfit, 1.0)), loss
     return best
 
 
-def _found(case: _Judged, numbers: Dictionary) -> Match:
-    """What the dictionary without the session's draw makes of it, with the numbers of another one."""
-    without = replace(case.without, changing=numbers.changing, temperature=numbers.temperature, strange=np.inf)
-    return match_directions(without, case.seen)
-
-
-def _confusions(judged: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]:
+def _confusions(judged_sessions: Sequence[_Judged], whole: Dictionary) -> tuple[Any, ...]:
     """Pairs of faults that left-out sessions confuse; both signs of a fault count as one."""
     names = sorted({_name(fault) for fault in whole.classes})
-    if not judged:
+    if not judged_sessions:
         return ()
-    place = {name: n for n, name in enumerate(names)}
-    columns = np.array([place[_name(fault)] for fault in whole.classes])
-    probabilities = np.zeros((len(judged), len(names)))
-    for row, case in enumerate(judged):
-        np.add.at(probabilities[row], columns, _found(case, whole).probabilities)
-    truth = np.array([columns[case.fault.owner] for case in judged])
-    further = sorted(judged[0].fault.sensors)
-    sensors = {name: np.array([case.fault.sensors[name] for case in judged]) for name in further}
+    columns_by_name = {name: n for n, name in enumerate(names)}
+    columns = np.array([columns_by_name[_name(fault)] for fault in whole.classes])
+    probabilities = np.zeros((len(judged_sessions), len(names)))
+    numbers = replace(whole, strange=np.inf)
+    for row, case in enumerate(judged_sessions):
+        one = judged(case.tried, *likelihoods(case.tried, case.seen, whole.changing), numbers)
+        np.add.at(probabilities[row], columns, one.probabilities)
+    truth = np.array([columns[case.fault.owner] for case in judged_sessions])
+    further = sorted(judged_sessions[0].fault.sensors)
+    sensors = {name: np.array([case.fault.sensors[name] for case in judged_sessions]) for name in further}
     return confusions(names, probabilities, truth, sensors)
 
 

@@ -67,34 +67,73 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
 
 def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
     """`match` from the directions at the onset and after it on; None where there are no rows of a part."""
-    scores, sizes, misfits = [], [], []
-    for place, fault in enumerate(dictionary.classes):
-        tried, signatures = candidates(dictionary, place, fault)
-        likelihoods, off, count = np.zeros(len(tried)), np.zeros(len(tried)), 0
-        for part, entry in enumerate(seen):
-            if entry is None:
-                continue
-            directions, noise = entry
-            variance = noise + dictionary.changing * signatures[part] ** 2
-            squares = (directions - signatures[part]) ** 2 / variance
-            likelihoods -= 0.5 * (squares + np.log(variance)).sum(axis=1) / dictionary.temperature
-            off += squares.mean(axis=1)
-            count += 1
-        best = int(likelihoods.argmax())
-        scores.append(float(logsumexp(likelihoods)) - np.log(len(likelihoods)))
-        sizes.append(tried[best])
-        misfits.append(float(off[best]) / max(count, 1))
-    logs = np.array(scores)
-    shares = np.exp(logs - logsumexp(logs))
-    misfit = misfits[int(logs.argmax())]
+    tried = candidates(dictionary)
+    return judged(tried, *likelihoods(tried, seen, dictionary.changing), dictionary)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Every fault at every size that is tried.
+
+    Attributes:
+        owner: number of the fault, ascending, shape (candidates,).
+        sizes: in the unit of the fault, NaN for faults without, shape (candidates,).
+        signatures: at the onset and after it, shape (2, candidates, features).
+        firsts: first candidate of each fault, shape (faults,).
+    """
+
+    owner: NDArray[np.int64]
+    sizes: Array
+    signatures: Array
+    firsts: NDArray[np.int64]
+
+
+def candidates(dictionary: Dictionary) -> Candidates:
+    """All that `match` compares with."""
+    parts = [_of_fault(dictionary, number, fault) for number, fault in enumerate(dictionary.classes)]
+    counts = np.array([len(sizes) for sizes, _ in parts])
+    return Candidates(
+        np.repeat(np.arange(len(parts)), counts),
+        np.concatenate([sizes for sizes, _ in parts]),
+        np.concatenate([signatures for _, signatures in parts], axis=1),
+        np.concatenate([[0], np.cumsum(counts)[:-1]]),
+    )
+
+
+def likelihoods(tried: Candidates, seen: Sequence[Seen | None], changing: float) -> tuple[Array, Array]:
+    """Logarithms of the densities of the evidence, and mean squared misfits, shape (candidates,) each."""
+    logs, misfits, count = np.zeros(len(tried.owner)), np.zeros(len(tried.owner)), 0
+    for part, entry in enumerate(seen):
+        if entry is None:
+            continue
+        directions, noise = entry
+        variance = noise + changing * tried.signatures[part] ** 2
+        squares = (directions - tried.signatures[part]) ** 2 / variance
+        logs -= 0.5 * (squares + np.log(variance)).sum(axis=1)
+        misfits += squares.mean(axis=1)
+        count += 1
+    return logs, misfits / max(count, 1)
+
+
+def judged(tried: Candidates, logs: Array, misfits: Array, dictionary: Dictionary) -> Match:
+    """Probabilities of the faults from the densities of the candidates."""
+    scaled = logs / dictionary.temperature
+    best = np.maximum.reduceat(scaled, tried.firsts)
+    sums = np.add.reduceat(np.exp(scaled - best[tried.owner]), tried.firsts)
+    counts = np.diff(np.append(tried.firsts, len(scaled)))
+    of_faults = best + np.log(sums / counts)
+    shares = np.exp(of_faults - logsumexp(of_faults))
+    # The last of equals would do as well; the first is the smaller size.
+    chosen = np.array([first + int(scaled[first : first + n].argmax()) for first, n in zip(tried.firsts, counts)])
+    misfit = float(misfits[chosen[int(of_faults.argmax())]])
     # Even odds at the misfit that hardly any left-out session reached, certainty at half as much again.
     none = float(np.clip(misfit / dictionary.strange - 0.5, 0.0, 1.0))
-    return Match((1.0 - none) * shares, np.array(sizes), none, misfit)
+    return Match((1.0 - none) * shares, tried.sizes[chosen], none, misfit)
 
 
-def candidates(dictionary: Dictionary, place: int, fault: FaultClass) -> tuple[Array, Array]:
+def _of_fault(dictionary: Dictionary, number: int, fault: FaultClass) -> tuple[Array, Array]:
     """Sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
-    rows = dictionary.rows_of(place)
+    rows = dictionary.rows_of(number)
     signatures = dictionary.signatures[:, rows]
     if not fault.sizes:
         return np.array([np.nan]), signatures[:, :1]
@@ -103,29 +142,29 @@ def candidates(dictionary: Dictionary, place: int, fault: FaultClass) -> tuple[A
     ends = abs(fault.sizes[0] - fault.neutral), abs(fault.sizes[-1] - fault.neutral)
     tried = np.geomspace(LEAST_SIZE * ends[0], BEYOND * ends[1], GRID)
     # From nothing at the neutral size; beyond the largest size that was simulated it stays as it was there.
-    known = np.concatenate([[0.0], away])
+    simulated = np.concatenate([[0.0], away])
     values = np.concatenate([np.zeros((2, 1, signatures.shape[2])), signatures], axis=1)
-    upper = np.clip(np.searchsorted(known, tried), 1, len(known) - 1)
-    share = np.clip((tried - known[upper - 1]) / (known[upper] - known[upper - 1]), 0.0, 1.0)[:, None]
+    upper = np.clip(np.searchsorted(simulated, tried), 1, len(simulated) - 1)
+    share = np.clip((tried - simulated[upper - 1]) / (simulated[upper] - simulated[upper - 1]), 0.0, 1.0)[:, None]
     between = (1.0 - share) * values[:, upper - 1] + share * values[:, upper]
     return fault.neutral + sign * tried, between
 
 
-def causes_of(dictionary: Dictionary, found: Match, most: int = MOST_CAUSES) -> tuple[Cause, ...]:
+def causes_of(dictionary: Dictionary, matched: Match, most: int = MOST_CAUSES) -> tuple[Cause, ...]:
     """The most likely causes, the first of them from the most likely part.
 
     A part may have many kinds of faults that look alike: what a mechanic looks at first is the part whose faults
     together are the most likely, and of it the likeliest fault.
     """
     causes = [
-        _cause(fault, float(found.probabilities[place]), float(found.sizes[place]))
-        for place, fault in enumerate(dictionary.classes)
+        _cause(fault, float(matched.probabilities[number]), float(matched.sizes[number]))
+        for number, fault in enumerate(dictionary.classes)
     ]
     parts: dict[str, float] = {}
     for cause in causes:
         parts[cause.component] = parts.get(cause.component, 0.0) + cause.probability
-    causes.append(Cause(NONE_OF_THESE, "", "", "none", None, "", found.none, UNKNOWN))
-    parts[""] = found.none
+    causes.append(Cause(NONE_OF_THESE, "", "", "none", None, "", matched.none, UNKNOWN))
+    parts[""] = matched.none
     return tuple(_by_part(causes, parts)[:most])
 
 
@@ -141,11 +180,29 @@ def _by_part(causes: Sequence[Cause], parts: dict[str, float]) -> list[Cause]:
 def _cause(fault: FaultClass, probability: float, size: float) -> Cause:
     if not fault.sizes:
         return Cause(
-            fault.kind, fault.site, fault.component, fault.place, None, "", probability, fault.words, None, fault.grave
+            fault.kind,
+            fault.site,
+            fault.component,
+            fault.at_fault,
+            None,
+            "",
+            probability,
+            fault.words,
+            None,
+            fault.grave,
         )
     steps = np.abs(np.array(fault.sizes) - fault.neutral)
     grade = float(np.interp(np.log(abs(size - fault.neutral)), np.log(steps), np.linspace(0.0, 1.0, len(steps))))
+    words = cause_words(fault, size)
     return Cause(
-        fault.kind, fault.site, fault.component, fault.place, size, fault.unit, probability, cause_words(fault, size),
-        grade, fault.grave,
-    )  # fmt: skip
+        fault.kind,
+        fault.site,
+        fault.component,
+        fault.at_fault,
+        size,
+        fault.unit,
+        probability,
+        words,
+        grade,
+        fault.grave,
+    )

@@ -32,7 +32,7 @@ class Dictionary:
         scatter: of healthy sessions.
         signatures: mean change of the directions by a fault of a size, at its onset and after it, shape
             (2, signatures, features).
-        owner: place of the fault of each signature in `classes`, shape (signatures,).
+        owner: number of the fault of each signature in `classes`, shape (signatures,).
         sizes: of each signature in the unit of its class, shape (signatures,).
         changing: share of a signature by which it differs from session to session, as a variance over its square.
         temperature: by which log-likelihoods are divided so that probabilities hold on left-out sessions.
@@ -53,10 +53,10 @@ class Dictionary:
     confusions: tuple[Confusion, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def rows_of(self, place: int) -> NDArray[np.int64]:
+    def rows_of(self, number: int) -> NDArray[np.int64]:
         """Signatures of a fault, the smallest size first."""
-        rows = np.flatnonzero(self.owner == place)
-        return rows[np.argsort(np.abs(self.sizes[rows] - self.classes[place].neutral), kind="stable")]
+        rows = np.flatnonzero(self.owner == number)
+        return rows[np.argsort(np.abs(self.sizes[rows] - self.classes[number].neutral), kind="stable")]
 
 
 def signatures_of(
@@ -66,7 +66,7 @@ def signatures_of(
 
     Args:
         classes: the faults.
-        owner: place of the fault of each session.
+        owner: number of the fault of each session.
         sizes: of each session.
         changes: directions of each session less those of its sound twin, at the onset and after it, shape
             (sessions, 2, features).
@@ -75,9 +75,9 @@ def signatures_of(
         Signatures, owner and size of each.
     """
     keys = sorted(set(zip(owner, sizes, strict=True)))
-    places, of_session = np.asarray(owner), np.asarray(sizes, dtype=np.float64)
-    means = [changes[(places == place) & (of_session == size)].mean(axis=0) for place, size in keys]
-    if {place for place, _ in keys} != set(range(len(classes))):
+    numbers_of_sessions, of_session = np.asarray(owner), np.asarray(sizes, dtype=np.float64)
+    means = [changes[(numbers_of_sessions == number) & (of_session == size)].mean(axis=0) for number, size in keys]
+    if {number for number, _ in keys} != set(range(len(classes))):
         raise DataError("a fault of the dictionary has no session; simulate all of one draw")
     return np.array(means).swapaxes(0, 1), np.array([k for k, _ in keys]), np.array([s for _, s in keys])
 

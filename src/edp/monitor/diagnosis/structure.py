@@ -17,7 +17,7 @@ APART = 0.25
 """Largest share of wrong answers of a test between two faults that can be told apart; a coin has 0.5."""
 MOST_PAIRS = 400
 LONGEST_NAME = 300
-LEAST_SESSIONS = 2
+LEAST_SESSIONS = 3
 """Of each of two faults, without which nothing is said about them."""
 
 

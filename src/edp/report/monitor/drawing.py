@@ -19,7 +19,7 @@ from edp.report.monitor.facts import AlarmFacts, MonitorFacts, start_time
 
 FloatArray = NDArray[np.float32]
 WIDTH = 960
-LEFT, RIGHT = 190, 12
+LEFT, RIGHT = 200, 34
 """Pixels beside the drawing: names of groups, and half of the last tick's text."""
 POINTS, CELLS, OVERVIEW_CELLS = 640, 320, 160
 """Most points of a line, and cells of a row: finer ones are pooled by their largest value; a page stays small."""
@@ -58,7 +58,7 @@ class Patch:
 
 
 @dataclass(frozen=True)
-class Line:
+class Polyline:
     """A line through points, as SVG has them."""
 
     points: str
@@ -86,7 +86,7 @@ class Drawing:
     title: str
     boxes: tuple[Box, ...] = ()
     patches: tuple[Patch, ...] = ()
-    lines: tuple[Line, ...] = ()
+    lines: tuple[Polyline, ...] = ()
     labels: tuple[Label, ...] = ()
     legend: tuple[tuple[str, str], ...] = ()
     width: int = field(default=WIDTH)
@@ -97,12 +97,12 @@ def timeline(trace: RecordingTrace, facts: MonitorFacts) -> Drawing:
     alarms = [alarm for alarm in facts.alarms if alarm.recording == trace.name]
     seconds = max(len(trace.ratios) * facts.traces.block_s, 1e-9)
     across = _across(seconds)
-    lines = [Line(_path([(LEFT, _height(1.0)), (WIDTH - RIGHT, _height(1.0))]), "#b3261e", 1.0, "5 4")]
+    lines = [Polyline(_path([(LEFT, _height(1.0)), (WIDTH - RIGHT, _height(1.0))]), "#b3261e", 1.0, "5 4")]
     ratios, factor = pooled(trace.ratios, POINTS)
     step = factor * facts.traces.block_s
     for n in range(len(facts.traces.detectors)):
         points = [(across(min((k + 0.5) * step, seconds)), _height(value)) for k, value in enumerate(ratios[:, n])]
-        lines.append(Line(_path(points), (BLUE, *SHADES)[n % (1 + len(SHADES))]))
+        lines.append(Polyline(_path(points), (BLUE, *SHADES)[n % (1 + len(SHADES))]))
     boxes, labels = [], [Label(LEFT - 6, _height(1.0) + 4, "limit", "end", "#b3261e")]
     labels += [Label(LEFT - 6, _height(value) + 4, number(value, 0), "end") for value in (0.0, 2.0, 3.0)]
     for alarm in alarms:
@@ -132,7 +132,7 @@ def overview(facts: MonitorFacts) -> Drawing:
     for n, trace in enumerate(traces):
         top = 4 + ROW * n
         worst = trace.ratios.max(axis=1, initial=0.0)[:, None]
-        row = Row(top, facts.traces.block_s, across, trace.name, OVERVIEW_CELLS)
+        row = CellRow(top, facts.traces.block_s, across, trace.name, OVERVIEW_CELLS)
         patches += _cells(worst * LEVELS[2], row, NEARNESS)
         for alarm in facts.alarms:
             if alarm.recording == trace.name:
@@ -166,14 +166,14 @@ def _group_rows(trace: RecordingTrace, facts: MonitorFacts, across: Across) -> t
     labels: list[Label] = []
     for n, name in enumerate(facts.traces.groups):
         top = PLOT_HEIGHT + 8 + ROW * n
-        row = Row(top, facts.traces.block_s, across, name, CELLS)
+        row = CellRow(top, facts.traces.block_s, across, name, CELLS)
         patches += _cells(trace.groups[:, n : n + 1], row, LEVEL_TEXTS)
         labels.append(Label(LEFT - 6, top + ROW - 6, short_label(name), "end", "#26303a"))
     return patches, labels
 
 
 @dataclass(frozen=True)
-class Row:
+class CellRow:
     """Where a row of shades lies, what it is called, and how many cells it has at most."""
 
     top: float
@@ -183,7 +183,7 @@ class Row:
     most: int
 
 
-def _cells(values: FloatArray, row: Row, texts: Sequence[str]) -> list[Patch]:
+def _cells(values: FloatArray, row: CellRow, texts: Sequence[str]) -> list[Patch]:
     """A row of shades, a patch a shade; equal neighbours are one rectangle."""
     levels, factor = pooled(values, row.most)
     steps = np.where(np.isnan(levels[:, 0]), -1, np.searchsorted(LEVELS, levels[:, 0], side="right"))
@@ -193,7 +193,7 @@ def _cells(values: FloatArray, row: Row, texts: Sequence[str]) -> list[Patch]:
     total = len(values) * row.block_s
     paths: dict[int, list[str]] = {}
     for first, behind in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        left, right = (row.across(min(place * factor * row.block_s, total)) for place in (first, behind))
+        left, right = (row.across(min(edge * factor * row.block_s, total)) for edge in (first, behind))
         rectangle = f"M{left:g} {row.top:g}h{max(right - left, 0.5):.4g}v{ROW - 3}h{-max(right - left, 0.5):.4g}z"
         paths.setdefault(int(steps[first]), []).append(rectangle)
     return [

@@ -95,9 +95,9 @@ def headline(facts: MonitorFacts) -> str:
     if not facts.alarms:
         return f"No alarm in {hours}"
     count = f"{len(facts.alarms)} alarm{'s' * (len(facts.alarms) > 1)} in {hours}"
-    said = Counter(_subject(alarm) for alarm in facts.alarms)
-    parts = [text if times == 1 else f"{text} ({times} times)" for text, times in said.most_common(2)]
-    more = f"; {len(said) - 2} more" if len(said) > 2 else ""
+    subjects = Counter(_subject(alarm) for alarm in facts.alarms)
+    parts = [text if times == 1 else f"{text} ({times} times)" for text, times in subjects.most_common(2)]
+    more = f"; {len(subjects) - 2} more" if len(subjects) > 2 else ""
     return f"{count}: {'; '.join(parts)}{more}"
 
 
@@ -156,13 +156,13 @@ def alarm_sheet(facts: MonitorFacts) -> Sheet:
         first = alarm.causes[0] if alarm.causes else None
         rows.append((
             short_label(alarm.recording), clock(alarm.since_s, start), clock(alarm.raised_s, start), alarm.severity,
-            first.words if first else MISSING, first.probability if first else None, alarm.detector,
+            first.words if first else MISSING, first.probability if first else None,
             alarm.statistic / alarm.limit if alarm.limit > 0.0 else None,
         ))  # fmt: skip
     share = figures([], decimals=2)
     heads = (
         Column("Recording"), Column("Since"), Column("Raised"), Column("Severity"), Column("Most likely"),
-        Column("Probability", "", share), Column("Detector"), Column("Statistic over limit", "", share),
+        Column("Probability", "", share), Column("Over limit", "", share),
     )  # fmt: skip
     return Sheet("alarms", "Alarms in the order in which they were raised", heads, tuple(rows))
 
@@ -170,7 +170,12 @@ def alarm_sheet(facts: MonitorFacts) -> Sheet:
 def cause_sheet(alarm: AlarmFacts) -> Sheet | None:
     """What an alarm could be, the most likely cause first; None without a dictionary."""
     rows: list[tuple[Value, ...]] = [
-        (cause.words, cause.component or MISSING, cause.place if cause.place != "none" else MISSING, cause.probability)
+        (
+            cause.words,
+            cause.component or MISSING,
+            cause.at_fault if cause.at_fault != "none" else MISSING,
+            cause.probability,
+        )
         for cause in alarm.causes[:MOST_CAUSES]
     ]
     if not rows:
@@ -190,9 +195,9 @@ def confusions_of(facts: MonitorFacts, alarm: AlarmFacts) -> list[str]:
         return []
     first = alarm.causes[0]
     mine = ":".join(filter(None, (first.kind, first.site)))
-    found = [pair for pair in facts.confusions if mine in (pair.first, pair.second)]
+    pairs = [pair for pair in facts.confusions if mine in (pair.first, pair.second)]
     lines = []
-    for pair in found[:3]:
+    for pair in pairs[:3]:
         other = pair.second if pair.first == mine else pair.first
         helps = f"; {pair.sensor} would separate them" if pair.sensor else ""
         lines.append(f"With the present sensors {mine} is hard to tell from {other}{helps}.")

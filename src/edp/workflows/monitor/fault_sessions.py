@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edp.monitor.diagnosis.causes import FaultClass, Place
+from edp.monitor.diagnosis.causes import AtFault, FaultClass
 from edp.recording import Recording
 from edp.sim import Scenario, Simulation
 from edp.sim.excitation import EXCITATIONS
@@ -50,13 +50,15 @@ def fault_classes(kinds: Sequence[str] | None = None) -> tuple[FaultClass, ...]:
     classes = []
     for name in FAULTS if kinds is None else kinds:
         kind = FAULTS[name]
-        place: Place = "machine" if isinstance(kind, MachineFault) else "sensor"
+        at_fault: AtFault = "machine" if isinstance(kind, MachineFault) else "sensor"
         for site in kind.sites or ("",):
             words = at_site(kind.words, site)
             for sign in (1.0, -1.0) if kind.signed else (1.0,):
                 sizes = tuple(sign * size for size in kind.ladder)
                 part = kind.component(site)
-                classes.append(FaultClass(name, site, part, place, kind.unit, sizes, kind.neutral, kind.grave, words))
+                classes.append(
+                    FaultClass(name, site, part, at_fault, kind.unit, sizes, kind.neutral, kind.grave, words)
+                )
     return tuple(classes)
 
 
@@ -75,8 +77,8 @@ def cases_of(classes: Sequence[FaultClass]) -> list[tuple[int, float]]:
 
 def mirrors(classes: Sequence[FaultClass]) -> dict[int, int]:
     """Place of the class of negative sizes by that of positive ones."""
-    places = {(fault.kind, fault.site): n for n, fault in enumerate(classes) if not _is_negative(fault)}
-    return {places[fault.kind, fault.site]: n for n, fault in enumerate(classes) if _is_negative(fault)}
+    numbers = {(fault.kind, fault.site): n for n, fault in enumerate(classes) if not _is_negative(fault)}
+    return {numbers[fault.kind, fault.site]: n for n, fault in enumerate(classes) if _is_negative(fault)}
 
 
 def _is_negative(fault: FaultClass) -> bool:
@@ -99,11 +101,11 @@ def simulated(
     cases = cases_of(classes)
     for base in range(max(1, min(BASES, len(cases)))):
         yield FaultSession(base, -1, 0.0, _session(_scenario(machine, base, before + after, seed, rate_hz), base, seed))
-    for n, (place, size) in enumerate(cases):
-        fault, base = classes[place], (n + seed[1] * 5) % min(BASES, len(cases))
+    for n, (number, size) in enumerate(cases):
+        fault, base = classes[number], (n + seed[1] * 5) % min(BASES, len(cases))
         spec = FaultSpec(fault.kind, fault.site, size if fault.sizes else None, fault.unit, onset_s=before)
         scenario = replace(_scenario(machine, base, before + after, seed, rate_hz), faults=(spec,))
-        yield FaultSession(base, place, size, _session(scenario, base, seed))
+        yield FaultSession(base, number, size, _session(scenario, base, seed))
 
 
 def _scenario(machine: str, base: int, seconds: float, seed: tuple[int, int], rate_hz: float) -> Scenario:

@@ -108,14 +108,14 @@ def _alarm(value: Any, where: str) -> AlarmFacts:
 def _cause(value: Any, where: str) -> Cause:
     names = [entry.name for entry in fields(Cause)]
     entry: Mapping[str, Any] = object_with(value, names, where)
-    if entry["place"] not in ("sensor", "machine", "none") or not isinstance(entry["grave"], bool):
+    if entry["at_fault"] not in ("sensor", "machine", "none") or not isinstance(entry["grave"], bool):
         raise StorageError(f"{where}: a cause is damaged; run the monitor again")
     kind, site, component, unit, words = (
         _text(entry[name], where) for name in ("kind", "site", "component", "unit", "words")
     )
     size, grade = (None if entry[name] is None else _number(entry[name], where) for name in ("size", "grade"))
     probability = _number(entry["probability"], where)
-    return Cause(kind, site, component, entry["place"], size, unit, probability, words, grade, entry["grave"])
+    return Cause(kind, site, component, entry["at_fault"], size, unit, probability, words, grade, entry["grave"])
 
 
 def _text(value: Any, where: str) -> str:

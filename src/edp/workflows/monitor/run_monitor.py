@@ -29,7 +29,7 @@ START = "start"
 
 COLUMNS = (
     *("recording", "raised_s", "since_s", "severity", "sentence", "detector", "statistic", "limit"),
-    *("kind", "site", "size", "unit", "probability", "index", "evidence"),
+    *("component", "kind", "site", "size", "unit", "at_fault", "probability", "evidence"),
 )
 """Of the CSV file; of the causes the most probable one."""
 
@@ -120,11 +120,11 @@ def groups_of(monitor: Monitor) -> dict[str, list[int]]:
     """Groups of residuals, by source and kind of the channels that they judge, with the places of their summaries."""
     kinds = {channel.name: str(channel.kind).replace("_", " ") for channel in monitor.channels}
     groups: dict[str, list[int]] = {}
-    for place, name in enumerate(monitor.summary_names):
+    for column, name in enumerate(monitor.summary_names):
         residual = name.rpartition(".")[0]
         source, _, judged = residual.partition(":")
         group = f"{source}: {kinds.get(judged, judged)}"
-        groups.setdefault(group, []).append(place)
+        groups.setdefault(group, []).append(column)
     return groups
 
 
@@ -147,7 +147,7 @@ def trace_of(
 
 def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
     """Alarms, traces, and where they come from."""
-    known = run.monitor.diagnosis
+    dictionary = run.monitor.diagnosis
     write_alarms(run.alarms, folder / ALARM_LOG)
     write_traces(folder, run.traces)
     facts = {
@@ -157,8 +157,8 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
         "edp_version": __version__,
         "recordings": len(run.recordings),
         "silent": {name: list(channels) for name, channels in run.silent.items()},
-        "classes": 0 if known is None else len(known.classes),
-        "confusions": [] if known is None else [asdict(pair) for pair in known.confusions],
+        "classes": 0 if dictionary is None else len(dictionary.classes),
+        "confusions": [] if dictionary is None else [asdict(pair) for pair in dictionary.confusions],
     }
     write_json(folder / RUN, facts)
 
