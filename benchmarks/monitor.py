@@ -275,7 +275,7 @@ def naming(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> dict[str, float]
         hits["component"].append(parts[:1] == [right])
         hits["top_three"].append(right in parts[:3])
         hits["kind_and_site"].append([(c.kind, c.site) for c in causes[:1]] == [(fault.kind, fault.site)])
-        hits["place"].append([cause.place for cause in causes[:1]] == [place_of(fault.kind)])
+        hits["place"].append([cause.at_fault for cause in causes[:1]] == [place_of(fault.kind)])
     diagnosed = any(alarm.causes for alarms in found.values() for alarm in alarms)
     return {key: float(np.mean(values)) for key, values in hits.items()} if diagnosed else {}
 
