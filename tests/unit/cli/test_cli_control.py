@@ -67,7 +67,7 @@ def test_a_controller_that_was_run_is_exported(edp, tmp_path, twin_run):
     assert any(file.endswith("grader_control.c") for file in named.json["files"])
     assert "controller: C99" in edp("export", run, "--to", "c", "--out", run, "--forms").out
     for words, text in (
-        ((run, "--w8a16", run), "single precision"),
+        ((run, "--w8a16", run), "only twins are brought into W8A16"),
         ((run, "--set", "tangent=true"), "no such option"),
         ((twin_run,), "run edp control again"),
     ):
