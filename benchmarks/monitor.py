@@ -79,8 +79,12 @@ QUICK_COUNTS = {"training": (16, 0), "test": (6, 1)}
 """Healthy sessions, and those of each nuisance set."""
 QUICK_SECONDS, QUICK_HOURS = 60.0, 0.1
 QUICK_FAULTS = 12
-QUICK_SETTINGS = ('chain.watches=[{detector={kind="cusum"}, memory_s=4.0}]',)
-"""Averages over a minute need more than minutes."""
+QUICK_SETTINGS = (
+    'chain.watches=[{detector={kind="cusum"}, memory_s=4.0}]',
+    'dictionary.machine="none"',
+    'residuals=[{kind="virtual_sensors", units=16, lags_s=[0.04, 0.16]}, {kind="balances"}]',
+)
+"""Averages over a minute need more than minutes, and faults that are simulated half an hour."""
 NEVER_H = 1e9
 """In place of infinity, which JSON lacks."""
 
