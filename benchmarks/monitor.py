@@ -3,7 +3,7 @@
 A monitor is fitted by `edp.workflows.monitor` to healthy sessions (`benchmarks/monitor_sessions.py`) and watches
 sessions of unseen seeds: healthy ones, every kind and size of fault at drawn sites, and healthy ones that must stay
 silent. Its rivals are fitted to the same sessions and get their limits from the same ones, for the same rate. PyOD's
-two were the best of ten on the validation part (`--choose`).
+two were the best of seven on the validation part (`--choose`).
 
 A fault is found by an alarm after its onset; an alarm before it is a false one. Delays are seconds in which the machine
 moved. The promise: 20 fits of conditioning, whitening and limit to other healthy sessions each, with the same residuals
