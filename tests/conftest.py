@@ -127,7 +127,7 @@ def _physical() -> dict[str, Structure]:
 
 
 STRUCTURES = _structures() | _physical()
-ALONE = ("tcn+squeeze_excitation", "hybrid+multi_scale_tcn")
+ALONE = ("tcn+squeeze_excitation", "hybrid+multi_scale_tcn", "gru+linear")
 """The only ones in which some layer reads the output of some other."""
 
 

@@ -242,7 +242,7 @@ def rig_fault(rig_monitor):
     """Rows of a session of the rig whose head pressure sensor reads too high from its middle on."""
     from edp.testing.monitor import rig_sessions
 
-    (session,) = rig_sessions(1, 2000, seed=1, first=20)
+    (session,) = rig_sessions(1, 3000, seed=1, first=20)
     rows = session.select(rig_monitor.inputs).copy()
     rows[1000:, rig_monitor.inputs.index("pressure_a")] += 2e6
     return rows

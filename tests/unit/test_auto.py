@@ -158,7 +158,7 @@ def test_a_network_with_a_validation_part_of_its_own_is_compared_on_that_part(tm
 
 @pytest.mark.parametrize(
     ("lengths", "kind"),
-    [((900,), "time"), ((900, 900, 900), "recordings"), ((4000, 200), "time"), ((150,) * 9, "recordings")],
+    [((900,), "time"), ((900, 900, 900), "names"), ((4000, 200), "time"), ((150,) * 9, "names")],
 )
 def test_recordings_are_divided_by_time_where_whole_ones_are_no_parts(tmp_path, lengths, kind):
     for number, ticks in enumerate(lengths):

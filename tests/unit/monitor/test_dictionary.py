@@ -100,11 +100,10 @@ def test_a_monitor_of_a_known_machine_has_a_dictionary_that_comes_back(monitor, 
 
 @pytest.mark.training
 def test_an_alarm_is_named_in_batch_and_in_a_stream(monitor):
-    recording = simulate(Scenario(duration_s=60.0, seed=300, faults=["velocity_bias:boom:60mm/s@30s"]))
+    recording = simulate(Scenario(duration_s=60.0, seed=300, faults=["velocity_bias:boom:10mm/s@30s"]))
     alarms = [alarm for alarm in monitor.watch(recording).alarms if alarm.raised_s > 30.0]
     assert alarms
-    # Six times the largest size of the ladder: none of these may come first, the part is known all the same.
-    assert "sensor of boom velocity" in [cause.component for cause in alarms[0].causes[:2]]
+    assert alarms[0].causes[0].component == "sensor of boom velocity"
     assert f"since 0:00:{round(alarms[0].since_s):02d}" in alarms[0].sentence
     assert sum(cause.probability for cause in alarms[0].causes) <= 1.0 + 1e-9
     stream = monitor.stream()

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from edp.training.twin_bundle import STROKES
-from edp.workflows.twin.train_twin import _machine
+from edp.workflows.twin.train_twin import _full_strokes
 
 M22, C14 = [1.26, 1.504, 1.104], [1.0, 1.0, 0.915]
 
@@ -25,4 +25,4 @@ M22, C14 = [1.26, 1.504, 1.104], [1.0, 1.0, 0.915]
 )
 def test_strokes_are_those_that_all_recordings_state_which_state_any(stated, expected):
     recordings = [SimpleNamespace(meta={} if value is None else {STROKES: value}) for value in stated]
-    assert _machine(recordings) == expected
+    assert _full_strokes(recordings) == expected
