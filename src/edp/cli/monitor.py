@@ -13,7 +13,8 @@ from edp.cli.train import MapOption, RepairOption, source_of
 # Scripts can tell alarms by the exit code.
 ALARMS = 5
 MOST_SHOWN = 50
-"""Alarms that are printed; the file has all."""
+"""Changes that are printed; the files have all alarms."""
+ALARM_HEADS = ["", "raised, s", "since, s", "severity", "alarms", ""]
 
 app = typer.Typer(
     name="monitor",
@@ -126,14 +127,25 @@ def run(
     def show() -> None:
         for name, channels in watched.silent.items():
             out.print(f"'{name}' lacks {', '.join(channels)}: what judges or reads these channels is silent")
-        rows = [[a.recording, f"{a.raised_s:g}", f"{a.since_s:g}", a.severity, a.sentence] for a in watched.alarms]
+        # A fault that stays alarms again and again: one row tells it.
+        rows = [
+            [
+                first.recording,
+                f"{first.raised_s:g}",
+                f"{first.since_s:g}",
+                first.severity,
+                1 + len(again),
+                first.sentence,
+            ]
+            for first, *again in watched.changes
+        ]
         if rows:
-            table("alarms", ["", "raised, s", "since, s", "severity", ""], rows[:MOST_SHOWN])
+            table("changes, and how often each raised an alarm", ALARM_HEADS, rows[:MOST_SHOWN])
         if mdf is not None:
             out.print(f"logs with their alarms as events in {mdf}")
         if len(rows) > MOST_SHOWN:
             out.print(f"and {len(rows) - MOST_SHOWN:,} more")
-        out.print(f"{len(rows):,} alarms in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
+        out.print(f"{len(watched.alarms):,} alarms in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
         if target is not None:
             out.print(f"alarms in {target}; next: edp monitor report {target}")
 

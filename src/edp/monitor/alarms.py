@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
-from edp.monitor.diagnosis.causes import Cause
+from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 
 SEVERITIES = ("note", "warning", "stop")
 
@@ -44,3 +45,43 @@ class MonitorAlarm:
         plain = asdict(self)
         plain["evidence"] = [[name, value] for name, value in self.evidence]
         return plain
+
+
+class Raised(Protocol):
+    """What alarms and their facts on a page have in common."""
+
+    @property
+    def recording(self) -> str: ...
+    @property
+    def raised_s(self) -> float: ...
+    @property
+    def evidence(self) -> tuple[tuple[str, float], ...]: ...
+    @property
+    def causes(self) -> tuple[Cause, ...]: ...
+
+
+AnyAlarm = TypeVar("AnyAlarm", bound=Raised)
+
+
+def episodes(alarms: Iterable[AnyAlarm]) -> list[list[AnyAlarm]]:
+    """Alarms of one recording that say the same, together: detectors are reset at an alarm, and a fault that stays
+    alarms again.
+
+    Alarms say the same where their most probable causes sit in one component; without such a cause, where the same
+    residual deviates most.
+
+    Args:
+        alarms: in any order.
+
+    Returns:
+        Lists in order of time, by their first alarms.
+    """
+    together: dict[tuple[str, str, str], list[AnyAlarm]] = {}
+    for alarm in sorted(alarms, key=lambda one: (one.recording, one.raised_s)):
+        cause = alarm.causes[0] if alarm.causes else None
+        named = cause is not None and cause.kind != NONE_OF_THESE
+        component = cause.component if cause is not None and named else ""
+        # A summary's name is that of its residual and, behind the last point, what is taken of it.
+        residual = "" if named or not alarm.evidence else alarm.evidence[0][0].rpartition(".")[0]
+        together.setdefault((alarm.recording, component, residual), []).append(alarm)
+    return list(together.values())

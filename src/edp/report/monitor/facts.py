@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from edp.monitor.alarms import episodes
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.diagnosis.structure import Confusion
@@ -16,7 +17,7 @@ from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import MISSING, count_text, listed, number, short_label
 
 MOST_ALARMS = 40
-"""With evidence each on a page; all of them stand in the log."""
+"""With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
 MOST_CAUSES = 5
 MOST_SILENT = 6
 
@@ -95,7 +96,10 @@ def headline(facts: MonitorFacts) -> str:
     if not facts.alarms:
         return f"No alarm in {hours}"
     count = f"{len(facts.alarms)} alarm{'s' * (len(facts.alarms) > 1)} in {hours}"
-    subjects = Counter(_subject(alarm) for alarm in facts.alarms)
+    # A fault that stays alarms again and again: it is named once.
+    subjects: Counter[str] = Counter()
+    for first, *again in episodes(facts.alarms):
+        subjects[_subject(first)] += 1 + len(again)
     parts = [text if times == 1 else f"{text} ({times} times)" for text, times in subjects.most_common(2)]
     more = f"; {len(subjects) - 2} more" if len(subjects) > 2 else ""
     return f"{count}: {'; '.join(parts)}{more}"
@@ -109,6 +113,14 @@ def _subject(alarm: AlarmFacts) -> str:
     if first.kind == NONE_OF_THESE:
         return "changes that no fault of the dictionary explains"
     return first.words if first.probability >= 0.5 else f"perhaps {first.words}"
+
+
+def again_text(facts: MonitorFacts, again: Sequence[AlarmFacts]) -> str:
+    """How often a change was raised again, and when for the last time; empty where it was not."""
+    if not again:
+        return ""
+    last = clock(again[-1].raised_s, facts.start_of(again[-1].recording))
+    return f"raised again at {last}" if len(again) == 1 else f"raised again {len(again)} times, the last at {last}"
 
 
 def hours_text(hours: float) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
+from edp.monitor.alarms import episodes
 from edp.monitor.diagnosis.sentences import clock
 from edp.report.common.templates import template
 from edp.report.common.wording import unbroken
@@ -35,13 +37,14 @@ def render(facts: MonitorFacts) -> str:
     traces = [trace for trace in facts.traces.recordings if trace.name in with_alarms]
     # A page without alarms still shows one time line: how far below the limits all stayed.
     shown = traces[:MOST_TIMELINES] or list(facts.traces.recordings[:1])
+    changes = episodes(facts.alarms)
     context: dict[str, Any] = {
         "title": facts.title,
         "headline": unbroken(words.headline(facts)),
         "verdict": words.verdict(facts),
         "tiles": words.tiles(facts),
-        "alarms": [_alarm(facts, alarm) for alarm in facts.alarms[:MOST_ALARMS]],
-        "left_out": max(0, len(facts.alarms) - MOST_ALARMS),
+        "alarms": [_alarm(facts, first, again) for first, *again in changes[:MOST_ALARMS]],
+        "left_out": max(0, len(changes) - MOST_ALARMS),
         "log": words.alarm_sheet(facts).table() if facts.alarms else None,
         "overview": overview(facts),
         "timelines": [(trace.name, timeline(trace, facts)) for trace in shown],
@@ -56,8 +59,8 @@ def render(facts: MonitorFacts) -> str:
     return template("monitor.html.jinja").render(**context)
 
 
-def _alarm(facts: MonitorFacts, alarm: words.AlarmFacts) -> dict[str, Any]:
-    """What the page says of one alarm."""
+def _alarm(facts: MonitorFacts, alarm: words.AlarmFacts, again: Sequence[words.AlarmFacts]) -> dict[str, Any]:
+    """What the page says of one alarm and of those after it that say the same."""
     sheet = words.cause_sheet(alarm)
     return {
         "sentence": unbroken(alarm.sentence),
@@ -66,6 +69,7 @@ def _alarm(facts: MonitorFacts, alarm: words.AlarmFacts) -> dict[str, Any]:
         "raised": clock(alarm.raised_s, facts.start_of(alarm.recording)),
         "since": clock(alarm.since_s, facts.start_of(alarm.recording)),
         "detector": alarm.detector,
+        "again": words.again_text(facts, again),
         "evidence": evidence(alarm) if alarm.evidence else None,
         "causes": sheet.table() if sheet is not None else None,
         "confusions": words.confusions_of(facts, alarm),

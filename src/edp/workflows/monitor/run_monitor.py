@@ -15,7 +15,7 @@ import numpy as np
 
 from edp import __version__
 from edp.logs.source import DataSource
-from edp.monitor.alarms import MonitorAlarm
+from edp.monitor.alarms import MonitorAlarm, episodes
 from edp.monitor.monitor import Monitor, Watched
 from edp.monitor.monitor_file import load_monitor
 from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
@@ -53,6 +53,11 @@ class MonitorRun:
     recordings: tuple[str, ...]
     silent: dict[str, tuple[str, ...]]
     traces: RunTraces
+
+    @property
+    def changes(self) -> list[list[MonitorAlarm]]:
+        """Alarms that say the same, together; see `episodes`."""
+        return episodes(self.alarms)
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values."""
