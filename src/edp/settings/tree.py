@@ -7,7 +7,7 @@ registries by the names of these fields; `build` and `plain_tree` are those of a
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -159,6 +159,31 @@ class SettingsTree:
             count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
             raise ConfigError(f"{self.what} {where}: {count}\n  - {listed}")
         return typing.cast(T, spec)
+
+    def load(
+        self,
+        cls: type[T],
+        path: str | Path | None,
+        changes: Sequence[Mapping[str, Any] | str] = (),
+        of: str = "of the defaults",
+    ) -> T:
+        """A spec tree from a settings file that changes are laid over, in their order.
+
+        Args:
+            cls: dataclass of the tree's root.
+            path: settings file; None takes the defaults.
+            changes: each ``key.path=value``, or a table of plain values.
+            of: how messages call the settings where there is no file.
+
+        Raises:
+            ConfigError: names every unknown key, wrong type and impossible value at once.
+        """
+        table: Table = {} if path is None else read_toml(path)
+        for change in changes:
+            table = merged(table, override(change))
+        where = of if path is None else f"'{path}'"
+        said = any(isinstance(change, str) for change in changes)
+        return self.build(cls, table, where + (" with --set" if said else ""))
 
     def _build(
         self, cls: type, table: Any, path: str, problems: list[str], beside: Mapping[str, type] | None = None
