@@ -276,7 +276,8 @@ def node_of(package_of, monkeypatch):
         modules, sent, logged = stand_in({"sources": SOURCES, **parameters})
         for name, module in modules.items():
             monkeypatch.setitem(sys.modules, name, module)
-        monkeypatch.delitem(sys.modules, "edp.export.ros2.package.node", raising=False)
+        for name in ("node", "tick_node"):
+            monkeypatch.delitem(sys.modules, f"edp.export.ros2.package.{name}", raising=False)
         node = importlib.import_module("edp.export.ros2.package.node")
         folder = package_of("hybrid+all")
         monkeypatch.setattr(node, "Core", lambda: core.Core(folder))
@@ -387,7 +388,8 @@ def watching(watch_package, monkeypatch):
     modules, sent, logged = stand_in({"sources": sources})
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.delitem(sys.modules, "edp.export.ros2.package.watch_node", raising=False)
+    for name in ("watch_node", "tick_node"):
+        monkeypatch.delitem(sys.modules, f"edp.export.ros2.package.{name}", raising=False)
     node = importlib.import_module("edp.export.ros2.package.watch_node")
     watch = importlib.import_module("edp.export.ros2.package.watch")
     monkeypatch.setattr(node, "MonitorCore", lambda: watch.MonitorCore(watch_package))

@@ -17,7 +17,13 @@ from edp.export.monitor.write import monitor_files
 from edp.export.ros2.target import message_names, source_guess
 
 NODE = "monitor"
-MODULES = {"core.py": "core.py", "build.py": "build.py", "watch.py": "watch.py", "watch_node.py": "node.py"}
+MODULES = {
+    "core.py": "core.py",
+    "tick_node.py": "tick_node.py",
+    "build.py": "build.py",
+    "watch.py": "watch.py",
+    "watch_node.py": "node.py",
+}
 """Modules of the package, by their names here."""
 EVIDENCE = """
 void {name}_evidence(const {name}_state *s, double *out);

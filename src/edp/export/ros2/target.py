@@ -19,7 +19,7 @@ from edp.export.hashes import model_hash
 from edp.signals import Kind
 from edp.training.bundle import Bundle
 
-MODULES = ("core.py", "node.py", "replay.py", "build.py")
+MODULES = ("core.py", "node.py", "tick_node.py", "replay.py", "build.py")
 JOINTS = {
     Kind.VELOCITY: "velocity",
     Kind.ANGULAR_VELOCITY: "velocity",

@@ -5,36 +5,23 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import FluidPressure, JointState
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64
 
-from .core import Assembler, Core, Tick, read_sources
+from .core import Core
+from .tick_node import TickNode, run
 
 FIELDS = {"velocity": "velocity", "angular_velocity": "velocity", "position": "position", "angle": "position"}
 """Where a target of a kind goes in a JointState; any other is an effort."""
 
 
-def seconds(stamp: Any) -> float:
-    """A time of ROS in seconds."""
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
-
-
-class PredictorNode(Node):
+class PredictorNode(TickNode):
     """Predicts at each message of joints; see README.md for topics and parameters."""
 
     def __init__(self) -> None:
-        super().__init__("predictor")
         core = Core()
-        self.declare_parameter("sources", [""])
-        self.declare_parameter("rate_hz", float(core.about["rate_hz"]))
-        rate = self.get_parameter("rate_hz").value
-        if rate != core.about["rate_hz"]:
-            raise ValueError(f"rate_hz is {rate}; the network was trained at {core.about['rate_hz']} Hz, leave it out")
-        self.ticks = Assembler(core, read_sources(core.inputs, list(self.get_parameter("sources").value)))
+        super().__init__("predictor", core)
         make = partial(self.create_publisher, qos_profile=10)
         self.results = {
             (meaning, number, ahead["ticks"]): make(JointState, f"~/{meaning}{number or ''}/ahead_{ahead['ticks']}")
@@ -44,21 +31,11 @@ class PredictorNode(Node):
         }
         self.valid, self.step_us = make(Bool, "~/valid"), make(Float64, "~/step_us")
         self.diagnostics = make(DiagnosticArray, "/diagnostics")
-        self.create_subscription(JointState, "joint_states", self.on_joints, qos_profile_sensor_data)
-        self.create_subscription(FluidPressure, "pressures", self.on_pressure, qos_profile_sensor_data)
-        self.create_timer(1.0, self.report)
-        self.last: Tick | None = None
-        self.fresh = False
-
-    def on_pressure(self, message: Any) -> None:
-        """A pressure; its frame_id names the sensor."""
-        self.ticks.pressure(message.header.frame_id, message.fluid_pressure, seconds(message.header.stamp))
+        self.listen()
 
     def on_joints(self, message: Any) -> None:
         """A tick."""
-        position, velocity, effort = (list(part) for part in (message.position, message.velocity, message.effort))
-        tick = self.ticks.joints(list(message.name), position, velocity, effort, seconds(message.header.stamp))
-        self.fresh = True
+        tick = self.tick_of(message)
         if self.last is None or (tick.why and tick.why != self.last.why):
             self.get_logger().warning(tick.why or "predicting")
         self.last = tick
@@ -105,12 +82,4 @@ class PredictorNode(Node):
 
 def main(args: Any = None) -> None:
     """Run until interrupted."""
-    rclpy.init(args=args)
-    node = PredictorNode()
-    try:
-        rclpy.spin(node)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+    run(PredictorNode, args)
