@@ -19,6 +19,33 @@ MACHINE = "machine"
 """Where the meta of a recording says which machine it is of."""
 
 
+HASHED_ROWS = 65_536
+"""Of a block that is hashed at a time: samples that lie on disk do not all come into memory."""
+
+
+class Digest:
+    """The digest of a recording whose samples come in parts.
+
+    Args:
+        rate_hz: samples per second.
+        channels: the channels, in the order of the columns.
+    """
+
+    def __init__(self, rate_hz: float, channels: Sequence[Channel]) -> None:
+        self._state = hashlib.blake2b(digest_size=16)
+        self._state.update(repr((float(rate_hz), [(c.name, str(c.kind)) for c in channels])).encode())
+
+    def update(self, values: FloatArray) -> None:
+        """The next samples, float32, shape ``(time, channel)``."""
+        for start in range(0, len(values), HASHED_ROWS):
+            self._state.update(np.ascontiguousarray(values[start : start + HASHED_ROWS]).data)
+
+    @property
+    def text(self) -> str:
+        """32 hexadecimal digits."""
+        return self._state.hexdigest()
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """Uniformly sampled channels of one session, in SI units.
@@ -72,10 +99,15 @@ class Recording:
     @cached_property
     def digest(self) -> str:
         """blake2b of rate, channels and values: equal content gives an equal digest whatever the file."""
-        state = hashlib.blake2b(digest_size=16)
-        state.update(repr((float(self.rate_hz), [(c.name, str(c.kind)) for c in self.channels])).encode())
-        state.update(np.ascontiguousarray(self.values).tobytes())
-        return state.hexdigest()
+        digest = Digest(self.rate_hz, self.channels)
+        digest.update(self.values)
+        return digest.text
+
+    def with_digest(self, digest: str) -> Recording:
+        """This recording with a digest that was taken before; a change of its values makes it take a new one."""
+        same = replace(self)
+        same.__dict__["digest"] = digest
+        return same
 
     def index(self, name: str) -> int:
         """Column of the named channel.
@@ -95,8 +127,11 @@ class Recording:
         return self.values[:, self.index(name)]
 
     def select(self, names: Sequence[str]) -> FloatArray:
-        """Values of several channels, shape ``(time, len(names))``, in the order asked for."""
-        return self.values[:, [self.index(name) for name in names]]
+        """Values of several channels, shape ``(time, len(names))``, in the order asked for.
+
+        Neighbouring columns are a view, others a copy.
+        """
+        return columns(self.values, [self.index(name) for name in names])
 
     def rows(self, start: int, stop: int, name: str | None = None) -> Recording:
         """The samples ``start <= t < stop`` as a recording of their own."""
@@ -106,3 +141,11 @@ class Recording:
                 "0 <= start < stop <= samples must hold"
             )
         return replace(self, values=self.values[start:stop], name=name or f"{self.name}[{start}:{stop}]")
+
+
+def columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
+    """Columns of an array ``(time, channel)``; a view where they lie side by side, so that samples stay on disk."""
+    first = places[0] if places else 0
+    if list(places) == list(range(first, first + len(places))):
+        return values[:, first : first + len(places)]
+    return values[:, list(places)]

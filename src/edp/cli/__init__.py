@@ -33,6 +33,7 @@ from edp.cli import (
     screen,
     search,
     simulate,
+    store,
     train,
     twin,
 )
@@ -54,6 +55,7 @@ app.command("demo")(demo.demo)
 app.command("simulate")(simulate.simulate)
 app.command("init")(init.init)
 app.command("inspect")(inspect.inspect)
+app.add_typer(store.app, name="store")
 app.command("screen")(screen.screen)
 app.command("animate")(animate.animate)
 app.command("train")(train.train)

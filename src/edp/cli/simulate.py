@@ -45,7 +45,7 @@ def simulate(
         list[str] | None,
         typer.Option(
             help="Fault of machine or sensors in every recording, KIND[:SITE][:SIZE][@ONSET][,ramp=TIME]"
-            "[,on=TIME,off=TIME], such as internal_leak:boom:3L/min@120s. Give it again for more faults."
+            "[,on=TIME,off=TIME], such as internal_leak:arm:3L/min@120s. Give it again for more faults."
         ),
     ] = None,
     form: Annotated[
@@ -70,7 +70,7 @@ def simulate(
 
     Example: `edp simulate data/many --family 8 --set masses=[12,30] --material clay`
 
-    Example: `edp simulate data/leak --fault internal_leak:boom:3L/min@120s --fault pressure_bias:arm_head:10bar@5min`
+    Example: `edp simulate data/leak --fault internal_leak:arm:3L/min@120s --fault pressure_bias:arm_head:10bar@5min`
 
     Example: `edp simulate data/m22 --limit --set limit.moments=60 --set limit.horizons=[1,10]`
 

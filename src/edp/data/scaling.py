@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
         train: the training stretches, nothing else.
         kinds: kind of each feature, in order.
     """
-    low, high, mean, std = _moments([feature_matrix(task, series) for series in train])
+    low, high, mean, std = _moments([partial(feature_matrix, task, series) for series in train])
     offset, scale = mean.copy(), std.copy()
     constant = []
     for i, kind in enumerate(kinds):
@@ -82,8 +83,8 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
     target_offset = np.zeros((len(task.horizons), len(task.targets)))
     target_scale = np.ones_like(target_offset)
     for row, horizon in enumerate(task.horizons):
-        encoded_targets = [_encoded(task, series, horizon) for series in train]
-        _, _, target_mean, target_std = _moments([values for values in encoded_targets if len(values)])
+        longer = [series for series in train if series.samples > horizon]
+        _, _, target_mean, target_std = _moments([partial(_encoded, task, series, horizon) for series in longer])
         if task.mode is TargetMode.ABSOLUTE:
             target_offset[row] = target_mean
         # A target that never changes keeps its unit instead of dividing by zero.
@@ -101,14 +102,22 @@ def _encoded(task: Task, series: Series, horizon: int) -> NDArray[np.float32]:
 Vector = NDArray[np.float64]
 
 
-def _moments(parts: Sequence[NDArray[np.float32]]) -> tuple[Vector, Vector, Vector, Vector]:
-    """Minimum, maximum, mean and standard deviation per column, merged over parts in double precision."""
-    count = sum(len(part) for part in parts)
-    low = np.min([part.min(axis=0) for part in parts], axis=0).astype(np.float64)
-    high = np.max([part.max(axis=0) for part in parts], axis=0).astype(np.float64)
-    mean = sum(part.sum(axis=0, dtype=np.float64) for part in parts) / count
+def _moments(parts: Sequence[Callable[[], NDArray[np.float32]]]) -> tuple[Vector, Vector, Vector, Vector]:
+    """Minimum, maximum, mean and standard deviation per column, merged over parts in double precision.
+
+    Each part is made twice instead of kept: hours of logs need not be in memory together.
+    """
+    count, lows, highs, sums = 0, [], [], []
+    for make in parts:
+        part = make()
+        count += len(part)
+        lows.append(part.min(axis=0))
+        highs.append(part.max(axis=0))
+        sums.append(part.sum(axis=0, dtype=np.float64))
+    low, high = np.min(lows, axis=0).astype(np.float64), np.max(highs, axis=0).astype(np.float64)
+    mean = sum(sums) / count
     # In two passes: the sum of squares less the squared mean would cancel for pressures of 30 MPa.
-    spread = sum(_squares(part, mean) for part in parts) / count
+    spread = sum(_squares(make(), mean) for make in parts) / count
     return low, high, np.asarray(mean), np.sqrt(spread)
 
 

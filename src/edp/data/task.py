@@ -12,7 +12,7 @@ import numpy as np
 from edp.data.features import Derived, FeatureSet, column, kind_of
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
-from edp.recording import MACHINE, Recording
+from edp.recording import MACHINE, FloatArray, Recording
 from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
 from edp.signals import Kind
 
@@ -24,6 +24,8 @@ class TargetMode(StrEnum):
     DELTA = "delta"
 
 
+CHECKED_ROWS = 65_536
+"""Of a block whose values are checked at a time: what is kept of a recording on disk does not all come into memory."""
 MOST_RATE_HZ = 1e6
 """Of any sensor of a machine; faster clocks count something else."""
 
@@ -164,16 +166,27 @@ class Task:
                 "'strokes'), or remove model.physics"
             )
         rows = slice(start, stop)
+        # Where it is all columns of a recording it stays a view: a store's samples are not copied into memory.
         inputs = np.ascontiguousarray(recording.select(self.inputs)[rows])
-        targets = np.stack([column(recording, target, self.derived) for target in self.targets], axis=1)[rows]
+        targets = np.stack([column(recording, target, self.derived)[rows] for target in self.targets], axis=1)
         for values, names in ((inputs, self.inputs), (targets, self.targets)):
-            bad = ~np.isfinite(values)
-            if bad.any():
-                row, which = (int(i) for i in np.argwhere(bad)[0])
+            place = first_not_finite(values)
+            if place is not None:
+                row, which = place
                 raise DataError(
                     f"recording '{recording.name}' ({recording.source}): channel '{names[which]}' has "
-                    f"{int(bad[:, which].sum())} missing or infinite value(s), the first at row {start + row}; "
-                    "repair the log or allow a repair (--repair nan=hold)"
+                    f"{int((~np.isfinite(values[:, which])).sum())} missing or infinite value(s), the first at row "
+                    f"{start + row}; repair the log or allow a repair (--repair nan=hold)"
                 )
         machine = str(recording.meta.get(MACHINE, "")).lower()
         return Series(name or recording.name, inputs, np.ascontiguousarray(targets), machine=machine)
+
+
+def first_not_finite(values: FloatArray) -> tuple[int, int] | None:
+    """Row and column of the first value that is NaN or infinite, None where there is none."""
+    for start in range(0, len(values), CHECKED_ROWS):
+        bad = ~np.isfinite(values[start : start + CHECKED_ROWS])
+        if bad.any():
+            row, which = (int(i) for i in np.argwhere(bad)[0])
+            return start + row, which
+    return None

@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
 from edp.logs.detect import BAG_MARK, format_for, known_suffixes, open_log
@@ -16,7 +14,7 @@ from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
 from edp.logs.resolve import ChannelSource, resolve
 from edp.logs.write import truth_path
-from edp.recording import Recording
+from edp.recording import Recording, columns
 from edp.signals import SignalMap
 
 RATE_TOLERANCE = 1e-3
@@ -167,14 +165,29 @@ def read_data_set(
     if not files:
         raise DataError("no log files given; give at least one file or folder")
     recordings = [read_recording(file, signal_map, repair=repair) for file in files]
-    if signal_map is None or not signal_map.channels:
-        recordings = _without_partial_truth(recordings)
     if signal_map is not None and signal_map.others:
         recordings = common_channels(recordings)
+    names = unique_names([recording.name for recording in recordings], files)
+    named = [replace(recording, name=name) for recording, name in zip(recordings, names)]
+    return alike(named, files, truth_asked=signal_map is not None and bool(signal_map.channels))
+
+
+def alike(recordings: list[Recording], files: Sequence[Path], truth_asked: bool = False) -> list[Recording]:
+    """Recordings of one data set: at the rate of the first, with the same channels.
+
+    Args:
+        recordings: with unique names.
+        files: their logs, for messages.
+        truth_asked: truth of a simulation that only some hold is an error instead of left out.
+
+    Raises:
+        DataError: mixed rates or channels.
+    """
+    if not truth_asked:
+        recordings = _without_partial_truth(recordings)
     _check_same(recordings, files)
     rate = recordings[0].rate_hz
-    names = unique_names([recording.name for recording in recordings], files)
-    return [replace(recording, name=name, rate_hz=rate) for recording, name in zip(recordings, names)]
+    return [recording if recording.rate_hz == rate else replace(recording, rate_hz=rate) for recording in recordings]
 
 
 def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
@@ -186,9 +199,7 @@ def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
     for recording in recordings:
         column_indices = [i for i, name in enumerate(recording.channel_names) if name in common or not is_truth(name)]
         channels = tuple(recording.channels[i] for i in column_indices)
-        reduced.append(
-            replace(recording, channels=channels, values=np.ascontiguousarray(recording.values[:, column_indices]))
-        )
+        reduced.append(replace(recording, channels=channels, values=columns(recording.values, column_indices)))
     return reduced
 
 
@@ -210,7 +221,7 @@ def common_channels(recordings: Sequence[Recording]) -> list[Recording]:
         replace(
             recording,
             channels=tuple(recording.channels[recording.index(name)] for name in names),
-            values=np.ascontiguousarray(recording.select(names)),
+            values=recording.select(names),
         )
         for recording in recordings
     ]

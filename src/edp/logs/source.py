@@ -14,8 +14,13 @@ from edp.errors import ConfigError, DataError
 from edp.logs.detect import known_suffixes
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into
+from edp.logs.quality.quality import inspect
+from edp.logs.quality.repeats import sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
+from edp.logs.store.building import StoredLog, StoreProgress, build_store
+from edp.logs.store.index import StoreIndex, is_store
+from edp.logs.store.opening import read_store
 from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
@@ -54,7 +59,7 @@ class DataSource:
     """Where recordings come from.
 
     Attributes:
-        path: a log, a folder of logs, or a data-set file (``.toml``).
+        path: a log, a folder of logs, a data-set file (``.toml``), or a store.
         signal_map: columns to channels; None takes the vocabulary's names.
         repair: what may be repaired.
     """
@@ -85,7 +90,9 @@ class DataSource:
         return DataSource(Path(plain["path"]), signal_map, repair)
 
     def logs(self) -> list[Log]:
-        """The logs of the source, unread, each with the map that belongs to it."""
+        """The logs of the source, unread, each with the map that belongs to it; a store has none."""
+        if is_store(self.path):
+            return []
         if self.path.suffix == ".toml":
             return _listed(self.path, self.signal_map, self.repair)
         return [Log(path, self.signal_map, self.repair) for path in find_recordings(self.path)]
@@ -95,7 +102,11 @@ class DataSource:
 
         Raises:
             DataError: nothing to read, or a log that cannot be used as it is.
+            ConfigError: a map or repairs for a store, whose logs were read with their own.
         """
+        if is_store(self.path):
+            self._check_store_options()
+            return read_store(self.path)
         if self.path.suffix != ".toml":
             return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
         recordings = [log.read() for log in self.logs()]
@@ -111,6 +122,8 @@ class DataSource:
         Raises:
             DataError: a file that cannot be read at all.
         """
+        if is_store(self.path):
+            return self._inspect_store(on_log)
         logs = self.logs()
         seen = []
         for i, log in enumerate(logs):
@@ -122,6 +135,37 @@ class DataSource:
         reports = [replace(report, name=name) for (report, _), name in zip(seen, names)]
         sketches = [replace(sketch, name=name) for (_, sketch), name in zip(seen, names) if sketch is not None]
         return compare(reports, sketches)
+
+    def store(
+        self, folder: str | Path, workers: int = 1, on_progress: Callable[[StoreProgress], None] | None = None
+    ) -> StoreIndex:
+        """Read the logs into a store; see `edp.logs.store.build_store`."""
+        if is_store(self.path):
+            raise ConfigError(f"'{self.path}' is a store already; give the logs that it is to be built from")
+        stored = [
+            StoredLog(log.path, log.signal_map or SignalMap(), log.repair or Repair(), log.name, log.rows, log.machine)
+            for log in self.logs()
+        ]
+        return build_store(stored, folder, workers, on_progress)
+
+    def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
+        self._check_store_options()
+        recordings = read_store(self.path)
+        reports, sketches = [], []
+        for i, recording in enumerate(recordings):
+            if on_log is not None:
+                on_log(self.path / recording.name, i + 1, len(recordings))
+            reports.append(inspect(recording))
+            sketches.append(sketch(recording))
+        return compare(reports, sketches)
+
+    def _check_store_options(self) -> None:
+        given = [name for name, value in (("--map", self.signal_map), ("--repair", self.repair)) if value is not None]
+        if given:
+            raise ConfigError(
+                f"{' and '.join(given)} came with the store '{self.path}', whose logs were mapped and repaired when "
+                "it was built; give them to `edp store build`"
+            )
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,7 @@ class TickNode(Node):
         self.declare_parameter("rate_hz", float(core.about["rate_hz"]))
         rate = self.get_parameter("rate_hz").value
         if rate != core.about["rate_hz"]:
-            raise ValueError(
-                f"rate_hz is {rate}; the network was trained at {core.about['rate_hz']} Hz, leave it out"
-            )
+            raise ValueError(f"rate_hz is {rate}; the network was trained at {core.about['rate_hz']} Hz, leave it out")
         self.ticks = Assembler(core, read_sources(core.inputs, list(self.get_parameter("sources").value)))
         self.last: Tick | None = None
         self.fresh = False

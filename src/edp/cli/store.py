@@ -1,0 +1,109 @@
+"""``edp store``: logs read once into a data-set store that every command takes in their place."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress, table
+from edp.cli.inspect import FAULTY
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from edp.logs.store import StoreIndex, StoreProgress
+
+MOST_REFUSED = 20
+"""Refused logs that are printed; the index has all of them."""
+
+app = typer.Typer(
+    name="store",
+    help="Read logs once into a data-set store, which commands take in place of the logs and do not load into memory.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+)
+
+
+@app.command("build")
+def build(
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    folder: Annotated[
+        Path, typer.Option("--out", help="Folder of the store; an existing one is continued or added to.")
+    ],
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    workers: Annotated[
+        int, typer.Option(min=0, max=256, help="Processes that read side by side; 0: one for each core.")
+    ] = 0,
+    as_json: JsonFlag = False,
+) -> None:
+    """Read logs into a store: SI units on a uniform grid, as every command would read them.
+
+    Stopped and given again it goes on. Logs that are in the store and were not changed are not read again, changed ones
+    replace what was stored of them. Logs that cannot be read are listed, and the exit code is then 3.
+
+    Example: `edp store build logs/ --map mine.toml --out store`, then `edp train store --out runs/first`
+    """
+    source = source_of(data, signal_map, repair)
+    with progress(as_json) as shown:
+        bar, steps = shown.add_task("store", total=None, note="listing logs"), Steps(as_json)
+
+        def note(reached: StoreProgress) -> None:
+            refused = f", {reached.refused} refused" if reached.refused else ""
+            shown.update(bar, total=reached.of, completed=reached.logs, note=f"{reached.logs} logs{refused}")
+            steps.say(f"store: {reached.logs} of {reached.of} logs{refused}")
+
+        index = source.store(folder, workers or os.cpu_count() or 1, note)
+    _show(index, folder, as_json)
+    if index.refused:
+        err.print(f"{len(index.refused)} log(s) are not in the store; mend them and give the same command again")
+        raise typer.Exit(FAULTY)
+
+
+@app.command("check")
+def check(
+    folder: Annotated[Path, typer.Argument(help="Folder of a store.")],
+    as_json: JsonFlag = False,
+) -> None:
+    """Compare every sample of a store with its hash.
+
+    After a store was copied, commands do that each time they open it; this notes that the copy is sound.
+
+    Example: `edp store check store`
+    """
+    from edp.logs.store import check_store
+
+    _show(check_store(folder), folder, as_json)
+
+
+def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
+    size = sum(file.bytes for file in index.files)
+    facts: dict[str, Any] = {
+        "store": str(folder),
+        "recordings": len(index.recordings),
+        "hours": index.hours(),
+        "bytes": size,
+        "files": len(index.files),
+        "channels": sorted({channel.name for channels in index.lists for channel in channels}),
+        "refused": [{"log": refused.log, "why": refused.why} for refused in index.refused],
+    }
+
+    def show() -> None:
+        rows = [
+            ("recordings", f"{len(index.recordings):,}"),
+            ("hours", f"{index.hours():.2f}"),
+            ("channels", f"{len(facts['channels'])}"),
+            ("size", f"{size / 1e6:,.1f} MB in {len(index.files)} file(s)"),
+        ]
+        table(f"store {folder}", ["", ""], rows)
+        if index.refused:
+            out.print()
+            listing("refused", ["log", "why"], [(refused.log, refused.why) for refused in index.refused[:MOST_REFUSED]])
+            if len(index.refused) > MOST_REFUSED:
+                out.print(f"and {len(index.refused) - MOST_REFUSED} more")
+        if index.recordings:
+            out.print(f"next: edp inspect {folder}; edp train {folder} --out runs/first")
+
+    emit(as_json, facts, show)

@@ -1,0 +1,337 @@
+"""Building a store: logs are read once, in batches by several processes; a build that was stopped goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edp.errors import ConfigError, DataError, EdpError, LostError
+from edp.logs.assemble import Assembly, parts, prepare
+from edp.logs.detect import open_log
+from edp.logs.formats.names import name_of_file
+from edp.logs.repair import Repair
+from edp.logs.resolve import resolve
+from edp.logs.store.index import (
+    BATCH_BYTES,
+    INDEX,
+    LOCK,
+    ROWS,
+    SCHEMA,
+    RefusedLog,
+    RowsFile,
+    StoreEntry,
+    StoreIndex,
+    index_of,
+    is_store,
+    listed,
+    plain_index,
+    read_index,
+    rows_path,
+    write_plain,
+)
+from edp.recording import MACHINE, Digest
+from edp.sandbox.helpers import Helpers
+from edp.settings.tree import plain_tree
+from edp.signals import Channel, SignalMap
+from edp.storage import (
+    check_writable,
+    hold,
+    make_folder,
+    object_with,
+    parse_json,
+    read_text,
+    release,
+    remove_unfinished,
+    replacing,
+)
+
+PART_SAMPLES = 1 << 16
+"""Of a log that are in memory at a time."""
+BATCH_LOG_BYTES = 128 * 2**20
+"""Of the logs of a batch, about: what a process that is killed loses."""
+BATCHES_A_WORKER = 4
+MOST_FILES = 400
+"""Files of rows of one build, about: each is open while the store is, and systems allow some thousand."""
+
+
+@dataclass(frozen=True)
+class StoredLog:
+    """A log to be stored, and how it is read; see `edp.logs.source.Log`."""
+
+    path: Path
+    signal_map: SignalMap = field(default_factory=SignalMap)
+    repair: Repair = field(default_factory=Repair)
+    name: str | None = None
+    rows: tuple[int, int] | None = None
+    machine: str = ""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file, or of the files of a folder."""
+        return sum(part.stat().st_size for part in self._files())
+
+    @property
+    def key(self) -> str:
+        """A hash of where it lies, of its size and time, and of how it is read."""
+        facts = [(str(part), part.stat().st_size, part.stat().st_mtime_ns) for part in self._files()]
+        how = [plain_tree(self.signal_map), asdict(self.repair), self.name, self.rows, self.machine]
+        text = json.dumps([SCHEMA, str(self.path.resolve()), facts, how], default=str)
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+    def _files(self) -> list[Path]:
+        if self.path.is_dir():
+            return sorted(part for part in self.path.rglob("*") if part.is_file())
+        # One that is gone is refused when it is read.
+        return [self.path] if self.path.exists() else []
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Logs that one process reads into one file of rows."""
+
+    folder: Path
+    key: str
+    logs: tuple[tuple[str, StoredLog], ...]
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return f"logs from '{self.logs[0][1].path}' on"
+
+
+@dataclass(frozen=True)
+class StoreProgress:
+    """How far a build is: logs that are read, of how many, and how many of them were refused."""
+
+    logs: int
+    of: int
+    refused: int
+
+
+def build_store(
+    logs: Sequence[StoredLog],
+    folder: str | Path,
+    workers: int = 1,
+    on_progress: Callable[[StoreProgress], None] | None = None,
+) -> StoreIndex:
+    """Read logs into a store; what it has already is kept, what was changed is read again.
+
+    Args:
+        logs: in any order.
+        folder: of the store; a new one, an unfinished one, or one to add logs to.
+        workers: processes that read side by side.
+        on_progress: told after each batch.
+
+    Returns:
+        the index of the store. Logs that cannot be read are listed in it as refused, and are tried again next time.
+
+    Raises:
+        ConfigError: the folder holds other things than a store.
+        StorageError: it cannot be written.
+        BusyError: another process builds it.
+    """
+    top = Path(folder)
+    if top.exists() and not is_store(top) and any(top.iterdir()):
+        raise ConfigError(f"'{top}' is no store and not empty; give --out a new folder, or one that a store lies in")
+    make_folder(top)
+    lock = hold(top / LOCK)
+    try:
+        check_writable(make_folder(top / ROWS))
+        remove_unfinished(top / ROWS)
+        remove_unfinished(top)
+        return _built(_distinct(logs), top, workers, on_progress or (lambda progress: None))
+    finally:
+        release(top / LOCK, lock) if (top / INDEX).is_file() else lock.close()
+
+
+def _built(
+    logs: dict[str, StoredLog], top: Path, workers: int, on_progress: Callable[[StoreProgress], None]
+) -> StoreIndex:
+    before = read_index(top) if (top / INDEX).is_file() else StoreIndex()
+    index = _without_replaced(before, logs)
+    for record in _records_beside(top, index):
+        index = _with_record(index, record, logs)
+    stored = {entry.log_key for entry in index.recordings}
+    index = replace(index, refused=())
+    missing = {key: log for key, log in logs.items() if key not in stored}
+    batches = _batches(missing, top, workers)
+    done = len(logs) - len(missing)
+    on_progress(StoreProgress(done, len(logs), 0))
+    with Helpers(workers, _died) as helpers:
+        for batch, record in zip(batches, helpers.ordered(store_batch, batches)):
+            index = _with_record(index, record, logs)
+            done += len(batch.logs)
+            on_progress(StoreProgress(done, len(logs), len(index.refused)))
+    order = {key: number for number, key in enumerate(logs)}
+    # As the logs are in order; those of earlier builds first.
+    recordings = sorted(index.recordings, key=lambda entry: order.get(entry.log_key, -1))
+    index = replace(index, recordings=tuple(recordings))
+    write_plain(top / INDEX, plain_index(index))
+    _remove_unused(top, index)
+    return index
+
+
+def _distinct(logs: Sequence[StoredLog]) -> dict[str, StoredLog]:
+    """Logs by key, each once."""
+    return {log.key: log for log in logs}
+
+
+def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
+    """The index less recordings whose log was changed, or is to be read in another way."""
+    given = {str(log.path.resolve()) for log in logs.values()}
+    kept = tuple(entry for entry in index.recordings if entry.log not in given or entry.log_key in logs)
+    used = {entry.rows for entry in kept}
+    return replace(index, recordings=kept, files=tuple(file for file in index.files if file.key in used))
+
+
+def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[Batch]:
+    """Logs side by side, in batches of like size."""
+    sizes = {key: log.size for key, log in logs.items()}
+    total = sum(sizes.values())
+    # Some for each worker, so that none waits for the last one for long.
+    bound = max(min(BATCH_LOG_BYTES, total // (BATCHES_A_WORKER * workers)), total // MOST_FILES)
+    groups: list[list[tuple[str, StoredLog]]] = []
+    left = 0
+    for key, log in logs.items():
+        if not groups or left < sizes[key]:
+            groups.append([])
+            left = bound
+        groups[-1].append((key, log))
+        left -= sizes[key]
+    return [Batch(folder, _batch_key([key for key, _ in group]), tuple(group)) for group in groups]
+
+
+def _batch_key(keys: Sequence[str]) -> str:
+    return hashlib.blake2b("".join(keys).encode(), digest_size=16).hexdigest()
+
+
+def store_batch(batch: Batch) -> dict[str, Any]:
+    """Read the logs of a batch into one file of rows; runs in a process of its own.
+
+    Returns:
+        the record of the batch: an index of its recordings alone, as plain values. It lies beside the rows, too, so
+        that a coordinator that is killed does not read them again.
+    """
+    path = rows_path(batch.folder, batch.key)
+    index, first = StoreIndex(), 0
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        for key, log in batch.logs:
+            at = stream.tell()
+            try:
+                entry, channels = _stored(log, key, batch.key, first, stream.write)
+            except EdpError as error:
+                # What was written of it is overwritten by the next one.
+                stream.seek(at)
+                stream.truncate()
+                index = replace(index, refused=(*index.refused, RefusedLog(log=str(log.path), why=str(error))))
+                continue
+            lists, number = listed(index.lists, channels)
+            entry = replace(entry, channels=number)
+            index = replace(index, lists=tuple(lists), recordings=(*index.recordings, entry))
+            first += entry.samples * len(channels)
+    if index.recordings:
+        status = path.stat()
+        file = RowsFile(key=batch.key, bytes=status.st_size, written_ns=status.st_mtime_ns)
+        index = replace(index, files=(file,))
+    else:
+        path.unlink()
+    record = plain_index(index)
+    if index.recordings:
+        write_plain(path.with_suffix(".json"), record)
+    return record
+
+
+def _stored(
+    log: StoredLog, key: str, rows: str, first: int, write: Callable[[Any], object]
+) -> tuple[StoreEntry, tuple[Channel, ...]]:
+    """Write the samples of a log; what the index says of it."""
+    raw = open_log(log.path, log.signal_map)
+    sources, problems = resolve(raw, log.signal_map)
+    if problems:
+        raise problems[0]
+    assembly = prepare(raw, sources, log.signal_map, log.repair, log.rows)
+    channels = tuple(entry.channel for entry in sources)
+    digest = Digest(assembly.rate_hz, channels)
+    meta: dict[str, Any] = dict(raw.meta)
+    source = str(log.path)
+    name = log.name or raw.name or name_of_file(raw.path)
+    for part in parts(assembly, PART_SAMPLES, name):
+        digest.update(part.values)
+        write(np.ascontiguousarray(part.values, dtype="<f4").data)
+        source, meta = part.source, _merged_meta(meta, part.meta)
+    _check_digest(assembly, digest.text)
+    if log.machine:
+        meta[MACHINE] = log.machine
+    entry = StoreEntry(
+        name=name,
+        log=str(log.path.resolve()),
+        log_key=key,
+        source=source,
+        rate_hz=assembly.rate_hz,
+        channels=0,
+        rows=rows,
+        first=first,
+        samples=assembly.samples,
+        digest=digest.text,
+        meta=json.dumps(meta, allow_nan=False),
+    )
+    return entry, channels
+
+
+def _merged_meta(meta: dict[str, Any], part: Any) -> dict[str, Any]:
+    """Facts of a log and of one more part of it; each repair once."""
+    repairs = list(meta.get("repairs", []))
+    repairs += [repair for repair in part.get("repairs", []) if repair not in repairs]
+    return {**meta, **part, **({"repairs": repairs} if repairs else {})}
+
+
+def _check_digest(assembly: Assembly, digest: str) -> None:
+    if assembly.untouched and assembly.raw.digest is not None and digest != assembly.raw.digest:
+        raise DataError(
+            f"'{assembly.raw.path}': the values are not the ones that EDP wrote; the file is damaged, or was changed "
+            "by another program: copy it again, or where the change is wanted, remove EDP's facts from it (edp_info)"
+        )
+
+
+def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
+    """Records of batches that an earlier build finished and no index lists."""
+    present = {file.key for file in index.files}
+    for path in sorted((top / ROWS).glob("*.json")):
+        if path.stem in present or not rows_path(top, path.stem).is_file():
+            continue
+        where = f"record of the store '{path}'"
+        table = parse_json(read_text(path, BATCH_BYTES, where, DataError), where, DataError)
+        yield object_with(table, ("files", "recordings"), where, DataError)
+
+
+def _with_record(index: StoreIndex, record: dict[str, Any], logs: dict[str, StoredLog]) -> StoreIndex:
+    """An index with the recordings of a batch that are asked for."""
+    batch = index_of(record, "record of a batch of the store")
+    lists = list(index.lists)
+    recordings = list(index.recordings)
+    there = {entry.log_key for entry in recordings}
+    added = [entry for entry in batch.recordings if entry.log_key in logs and entry.log_key not in there]
+    for entry in added:
+        lists, number = listed(lists, batch.lists[entry.channels])
+        recordings.append(replace(entry, channels=number))
+    files = (*index.files, *batch.files) if added else index.files
+    refused = (*index.refused, *batch.refused)
+    return replace(index, lists=tuple(lists), recordings=tuple(recordings), files=files, refused=refused)
+
+
+def _remove_unused(top: Path, index: StoreIndex) -> None:
+    """Files that no recording lies in, and records of batches, which the index holds now."""
+    used = {file.key for file in index.files}
+    for path in (top / ROWS).iterdir():
+        if path.suffix == ".json" or (path.suffix == ".f32" and path.stem not in used):
+            path.unlink(missing_ok=True)
+
+
+def _died(label: str) -> EdpError:
+    return LostError(f"the process that read {label} was killed; give the same command again to go on")

@@ -1,0 +1,202 @@
+"""The index of a store: which recordings it holds, where their samples lie, and what was refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from edp.errors import ConfigError, DataError
+from edp.logs.formats.base import check_names
+from edp.settings.tree import SettingsTree
+from edp.signals import Channel
+from edp.storage import object_with, parse_json, read_text, write_bytes
+
+INDEX, ROWS, LOCK = "store.json", "rows", ".lock"
+KIND, SCHEMA = "edp-store", 1
+INDEX_BYTES = 512 * 2**20
+"""Of an index; an entry of a recording takes some 500 bytes, so that a million fit."""
+BATCH_BYTES = 64 * 2**20
+"""Of the record of one batch of logs."""
+NUMBER_BYTES = 4
+KEY = re.compile(r"[0-9a-f]{32}")
+"""What names a file of rows: a key leads to no other folder."""
+_TREE = SettingsTree(what="index of the store")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoreEntry:
+    """One recording of a store.
+
+    Attributes:
+        name: as the log states it; names are made unique when the store is read.
+        log: path of the log that it was read from.
+        log_key: hash of path, size and time of that log, and of how it was read.
+        source: `Recording.source`.
+        rate_hz: samples per second.
+        channels: number of its list of channels in the index.
+        rows: key of the file that holds its samples.
+        first: number of the value in that file with which it begins.
+        samples: its ticks.
+        digest: `Recording.digest`.
+        meta: `Recording.meta` as JSON.
+    """
+
+    name: str
+    log: str
+    log_key: str
+    source: str
+    rate_hz: float
+    channels: int
+    rows: str
+    first: int
+    samples: int
+    digest: str
+    meta: str = "{}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowsFile:
+    """A file of samples: its key, its bytes, and when it was last written, in nanoseconds since 1970."""
+
+    key: str
+    bytes: int
+    written_ns: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefusedLog:
+    """A log that could not be read, and why."""
+
+    log: str
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoreIndex:
+    """What a store holds.
+
+    Attributes:
+        kind: ``edp-store``.
+        schema: version of this form.
+        lists: the lists of channels that recordings have.
+        files: files of samples.
+        recordings: in the order of their logs.
+        refused: logs that are not in it.
+    """
+
+    kind: str = KIND
+    schema: int = SCHEMA
+    lists: tuple[tuple[Channel, ...], ...] = ()
+    files: tuple[RowsFile, ...] = ()
+    recordings: tuple[StoreEntry, ...] = ()
+    refused: tuple[RefusedLog, ...] = field(default=())
+
+    def hours(self) -> float:
+        """Duration of all recordings."""
+        return sum(entry.samples / entry.rate_hz for entry in self.recordings) / 3600.0
+
+
+def is_store(path: str | Path) -> bool:
+    """Whether a folder is a store, finished or not."""
+    folder = Path(path)
+    return (folder / INDEX).is_file() or ((folder / ROWS).is_dir() and (folder / LOCK).is_file())
+
+
+def rows_path(folder: Path, key: str) -> Path:
+    """The file of samples with this key."""
+    return folder / ROWS / f"{key}.f32"
+
+
+def read_index(folder: str | Path) -> StoreIndex:
+    """The index of a store, checked: every recording lies within a file of the store.
+
+    Raises:
+        DataError: no store, one that is half built, of another schema, or damaged.
+    """
+    path = Path(folder) / INDEX
+    where = f"index of the store '{folder}'"
+    if not path.is_file():
+        raise DataError(
+            f"the store '{folder}' is half built: it has no {INDEX} yet; give the same `edp store build` again, it "
+            "goes on where it stopped"
+        )
+    table = object_with(
+        parse_json(read_text(path, INDEX_BYTES, where, DataError), where, DataError),
+        ("kind", "schema"),
+        where,
+        DataError,
+    )
+    if table["kind"] != KIND:
+        raise DataError(f"{where}: kind = {str(table['kind'])[:40]!r}, expected '{KIND}'; it is no store of EDP")
+    if table["schema"] != SCHEMA:
+        raise DataError(
+            f"{where}: schema {str(table['schema'])[:40]}, this version of EDP reads {SCHEMA}; build the store again "
+            "from its logs"
+        )
+    index = index_of(table, where)
+    _check_places(index, where)
+    return index
+
+
+def index_of(table: dict[str, Any], where: str) -> StoreIndex:
+    """An index from plain values, each of the right type.
+
+    Raises:
+        DataError: what is wrong, and where.
+    """
+    try:
+        index = _TREE.build(StoreIndex, table, where)
+    except ConfigError as error:
+        raise DataError(f"{error}; build the store again from its logs") from error
+    for channels in index.lists:
+        check_names(Path(where), [channel.name for channel in channels])
+    return index
+
+
+def plain_index(index: StoreIndex) -> dict[str, Any]:
+    """An index as plain values."""
+    plain: dict[str, Any] = _TREE.plain(index)
+    return plain
+
+
+def write_plain(path: Path, plain: dict[str, Any]) -> None:
+    """Write an index or the record of a batch, whole or not at all."""
+    write_bytes(path, json.dumps(plain, allow_nan=False, separators=(",", ":")).encode())
+
+
+def _check_places(index: StoreIndex, where: str) -> None:
+    """Refuse recordings that lie outside their files, and files outside the store."""
+    sizes = {file.key: file.bytes // NUMBER_BYTES for file in index.files}
+    for key in sizes:
+        if not KEY.fullmatch(key):
+            raise DataError(f"{where}: a file of rows is called {key[:60]!r}; 32 hexadecimal digits must hold")
+    for entry in index.recordings:
+        if not 0 <= entry.channels < len(index.lists) or not index.lists[entry.channels]:
+            raise DataError(
+                f"{where}: recording {entry.name[:80]!r} has the list of channels {entry.channels}, there are "
+                f"{len(index.lists)}, and none may be empty; build the store again from its logs"
+            )
+        if not 0.0 < entry.rate_hz < float("inf"):
+            raise DataError(
+                f"{where}: recording {entry.name[:80]!r} has {entry.rate_hz} Hz; a positive number must hold"
+            )
+        stop = entry.first + entry.samples * len(index.lists[entry.channels])
+        if entry.rows not in sizes or entry.first < 0 or entry.samples < 1 or stop > sizes[entry.rows]:
+            raise DataError(
+                f"{where}: recording {entry.name[:80]!r} lies at values {entry.first} to {stop} of file "
+                f"{entry.rows[:40]!r}, which the store does not have; build the store again from its logs"
+            )
+
+
+def listed(
+    lists: Sequence[tuple[Channel, ...]], channels: tuple[Channel, ...]
+) -> tuple[list[tuple[Channel, ...]], int]:
+    """Lists of channels with one more where it is new, and its number."""
+    known = list(lists)
+    if channels not in known:
+        known.append(channels)
+    return known, known.index(channels)
