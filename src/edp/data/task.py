@@ -170,9 +170,9 @@ class Task:
         inputs = np.ascontiguousarray(recording.select(self.inputs)[rows])
         targets = np.stack([column(recording, target, self.derived)[rows] for target in self.targets], axis=1)
         for values, names in ((inputs, self.inputs), (targets, self.targets)):
-            place = first_not_finite(values)
-            if place is not None:
-                row, which = place
+            first_bad = first_not_finite(values)
+            if first_bad is not None:
+                row, which = first_bad
                 raise DataError(
                     f"recording '{recording.name}' ({recording.source}): channel '{names[which]}' has "
                     f"{int((~np.isfinite(values[:, which])).sum())} missing or infinite value(s), the first at row "

@@ -160,10 +160,10 @@ class DataSource:
         return compare(reports, sketches)
 
     def _check_store_options(self) -> None:
-        given = [name for name, value in (("--map", self.signal_map), ("--repair", self.repair)) if value is not None]
-        if given:
+        options = [name for name, value in (("--map", self.signal_map), ("--repair", self.repair)) if value is not None]
+        if options:
             raise ConfigError(
-                f"{' and '.join(given)} came with the store '{self.path}', whose logs were mapped and repaired when "
+                f"{' and '.join(options)} came with the store '{self.path}', whose logs were mapped and repaired when "
                 "it was built; give them to `edp store build`"
             )
 

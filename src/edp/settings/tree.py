@@ -182,8 +182,8 @@ class SettingsTree:
         for change in changes:
             table = merged(table, override(change))
         where = of if path is None else f"'{path}'"
-        said = any(isinstance(change, str) for change in changes)
-        return self.build(cls, table, where + (" with --set" if said else ""))
+        overridden = any(isinstance(change, str) for change in changes)
+        return self.build(cls, table, where + (" with --set" if overridden else ""))
 
     def _build(
         self, cls: type, table: Any, path: str, problems: list[str], beside: Mapping[str, type] | None = None

@@ -92,7 +92,7 @@ class StoredLog:
 
 
 @dataclass(frozen=True)
-class Batch:
+class LogBatch:
     """Logs that one process reads into one file of rows."""
 
     folder: Path
@@ -184,13 +184,13 @@ def _distinct(logs: Sequence[StoredLog]) -> dict[str, StoredLog]:
 
 def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
     """The index less recordings whose log was changed, or is to be read in another way."""
-    given = {str(log.path.resolve()) for log in logs.values()}
-    kept = tuple(entry for entry in index.recordings if entry.log not in given or entry.log_key in logs)
-    used = {entry.rows for entry in kept}
-    return replace(index, recordings=kept, files=tuple(file for file in index.files if file.key in used))
+    paths = {str(log.path.resolve()) for log in logs.values()}
+    unchanged = tuple(entry for entry in index.recordings if entry.log not in paths or entry.log_key in logs)
+    used = {entry.rows for entry in unchanged}
+    return replace(index, recordings=unchanged, files=tuple(file for file in index.files if file.key in used))
 
 
-def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[Batch]:
+def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[LogBatch]:
     """Logs side by side, in batches of like size."""
     sizes = {key: log.size for key, log in logs.items()}
     total = sum(sizes.values())
@@ -204,14 +204,14 @@ def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[Bat
             left = bound
         groups[-1].append((key, log))
         left -= sizes[key]
-    return [Batch(folder, _batch_key([key for key, _ in group]), tuple(group)) for group in groups]
+    return [LogBatch(folder, _batch_key([key for key, _ in group]), tuple(group)) for group in groups]
 
 
 def _batch_key(keys: Sequence[str]) -> str:
     return hashlib.blake2b("".join(keys).encode(), digest_size=16).hexdigest()
 
 
-def store_batch(batch: Batch) -> dict[str, Any]:
+def store_batch(batch: LogBatch) -> dict[str, Any]:
     """Read the logs of a batch into one file of rows; runs in a process of its own.
 
     Returns:

@@ -196,7 +196,7 @@ def listed(
     lists: Sequence[tuple[Channel, ...]], channels: tuple[Channel, ...]
 ) -> tuple[list[tuple[Channel, ...]], int]:
     """Lists of channels with one more where it is new, and its number."""
-    known = list(lists)
-    if channels not in known:
-        known.append(channels)
-    return known, known.index(channels)
+    merged_lists = list(lists)
+    if channels not in merged_lists:
+        merged_lists.append(channels)
+    return merged_lists, merged_lists.index(channels)
