@@ -103,6 +103,16 @@ class Recording:
         digest.update(self.values)
         return digest.text
 
+    @property
+    def on_disk(self) -> bool:
+        """Whether the samples lie in a file that is mapped into memory."""
+        part: Any = self.values
+        while isinstance(part, np.ndarray):
+            if isinstance(part, np.memmap):
+                return True
+            part = part.base
+        return False
+
     def with_digest(self, digest: str) -> Recording:
         """This recording with a digest that was taken before; a change of its values makes it take a new one."""
         same = replace(self)

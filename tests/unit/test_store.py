@@ -77,7 +77,15 @@ def test_samples_stay_in_the_files_of_the_store(logs, tmp_path):
         assert not one.values.flags.owndata
         task = Task(FeatureSet("all", ("u", "p", "v")), ("v",), (1,), TargetMode.ABSOLUTE, 50.0)
         assert np.shares_memory(task.series(one).inputs, one.values)
-        assert np.shares_memory(one.select(("p", "v")), one.values)
+        part = Task(FeatureSet("part", ("u", "p")), ("v",), (1,), TargetMode.ABSOLUTE, 50.0).series(one)
+        assert one.on_disk
+        assert np.shares_memory(part.inputs, one.values)
+    in_memory = read_data_set(logs)[0]
+    assert not in_memory.on_disk
+    assert not np.shares_memory(
+        Task(FeatureSet("part", ("u", "p")), ("v",), (1,), TargetMode.ABSOLUTE, 50.0).series(in_memory).inputs,
+        in_memory.values,
+    )
 
 
 def test_what_is_written_to_samples_of_a_store_does_not_reach_its_files(logs, tmp_path):

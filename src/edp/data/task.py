@@ -166,8 +166,10 @@ class Task:
                 "'strokes'), or remove model.physics"
             )
         rows = slice(start, stop)
-        # Where it is all columns of a recording it stays a view: a store's samples are not copied into memory.
-        inputs = np.ascontiguousarray(recording.select(self.inputs)[rows])
+        inputs = recording.select(self.inputs)[rows]
+        # What a store keeps on disk is not copied into memory where its columns lie side by side.
+        if not recording.on_disk:
+            inputs = np.ascontiguousarray(inputs)
         targets = np.stack([column(recording, target, self.derived)[rows] for target in self.targets], axis=1)
         for values, names in ((inputs, self.inputs), (targets, self.targets)):
             first_bad = first_not_finite(values)

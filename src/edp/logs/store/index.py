@@ -119,6 +119,8 @@ def read_index(folder: str | Path) -> StoreIndex:
     """
     path = Path(folder) / INDEX
     where = f"index of the store '{folder}'"
+    if not is_store(folder):
+        raise DataError(f"'{folder}' is no store: it has no {INDEX}; `edp store build LOGS --out {folder}` makes one")
     if not path.is_file():
         raise DataError(
             f"the store '{folder}' is half built: it has no {INDEX} yet; give the same `edp store build` again, it "
