@@ -277,3 +277,13 @@ def test_the_index_of_a_store_is_plain_json_of_its_schema(logs, tmp_path):
     rows = np.fromfile(tmp_path / "store" / "rows" / f"{table['recordings'][1]['rows']}.f32", "<f4")
     first = table["recordings"][1]["first"]
     np.testing.assert_array_equal(rows[first : first + 930].reshape(310, 3), read_data_set(logs)[1].values)
+
+
+def test_a_store_is_read_from_python_and_screened(logs, tmp_path):
+    import edp
+    from edp.workflows.feature_selection.select import _read, _taken_whole
+
+    build(logs, tmp_path / "store")
+    assert_same(list(edp.read(tmp_path / "store")), read_data_set(logs))
+    source = DataSource.of(tmp_path / "store")
+    assert_same(_read(_taken_whole(source), source.inspect())[0], read_data_set(logs))

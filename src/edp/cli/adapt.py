@@ -51,7 +51,7 @@ def adapt(
 
 def replay(
     run: Annotated[Path, typer.Argument(help="Run folder of edp adapt, or its bundle.")],
-    logs: Annotated[Path, typer.Argument(help="Logs: a log, a folder of logs, or a data-set file.")],
+    logs: Annotated[Path, typer.Argument(help="Logs: a log, a folder of logs, a data-set file, or a store.")],
     carry: Annotated[
         bool, typer.Option(help="Carry the learned coefficients from one log to the next, as on one machine.")
     ] = False,

@@ -21,7 +21,8 @@ def compress(
     bundle: Annotated[Path, typer.Argument(help="Run folder of the teacher, or its bundle.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the search; an unfinished search continues.")],
     data: Annotated[
-        Path | None, typer.Option(help="A log, a folder of logs, or a data-set file; default: those of the run.")
+        Path | None,
+        typer.Option(help="Log, folder of logs, data-set file, or store; default: those of the run."),
     ] = None,
     budget: Annotated[
         Path | None, typer.Option("--budget", help="Limits of the controller (TOML); by default those of the thesis.")

@@ -25,7 +25,8 @@ def distil(
         typer.Option(help="Width of the student (distil.units): recurrent units, or channels of the first level."),
     ] = None,
     data: Annotated[
-        Path | None, typer.Option(help="A log, a folder of logs, or a data-set file; default: those of the run.")
+        Path | None,
+        typer.Option(help="Log, folder of logs, data-set file, or store; default: those of the run."),
     ] = None,
     teachers: Annotated[list[Path], typer.Option("--teacher", help="A further teacher; may be repeated.")] = [],  # noqa: B006
     further: Annotated[

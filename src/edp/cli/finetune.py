@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def finetune(
     bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
-    logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, a folder of logs, or a data-set file.")],
+    logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, folder, data-set file, or store.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     method: Annotated[str, typer.Option(help="Method whose network becomes the run.")] = "full",
     baselines: Annotated[

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def identify(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
     file: Annotated[Path, typer.Option("--out", help="Machine file (.toml) to write; numbers beside it as .json.")],
     machine: Annotated[
         str, typer.Option(help="M22, C14, or a machine file: pins, lengths and bores, and a guess of the rest.")

@@ -21,7 +21,7 @@ FAULTY = 3
 
 
 def inspect(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
     signal_map: MapOption = None,
     details: Annotated[
         bool | None,

@@ -96,7 +96,7 @@ def fit(
 @app.command("run")
 def run(
     folder: Annotated[Path, typer.Argument(metavar="MONITOR", help="Folder that edp monitor fit wrote.")],
-    logs: Annotated[Path, typer.Argument(metavar="LOGS", help="A log, a folder of logs, or a data-set file (.toml).")],
+    logs: Annotated[Path, typer.Argument(metavar="LOGS", help="A log, a folder of logs, a data-set file, or a store.")],
     target: Annotated[
         Path | None, typer.Option("--out", help="Folder for the alarms (JSON lines, CSV) and what the page shows.")
     ] = None,

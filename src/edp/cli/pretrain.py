@@ -13,7 +13,7 @@ from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
 
 
 def pretrain(
-    data: Annotated[Path, typer.Argument(help="Recordings of many machines: a folder of logs, or a data-set file.")],
+    data: Annotated[Path, typer.Argument(help="Recordings of many machines: folder, data-set file, or store.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     method: Annotated[str, typer.Option(help="joint, fomaml, maml or reptile.")] = "joint",
     start: Annotated[

@@ -30,7 +30,7 @@ TOLD_SHARE = 0.005
 
 
 def screen(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for page, pictures, feature sets and figures.")],
     targets: Annotated[str, typer.Option(help="Channels to predict: a,b. Default: the velocities.")] = "",
     horizon: Annotated[

@@ -51,7 +51,9 @@ app = typer.Typer(
 
 @app.command(DEFAULT)
 def run(
-    data: Annotated[Path, typer.Argument(help="A folder of logs, or a data-set file (.toml); each log is a session.")],
+    data: Annotated[
+        Path, typer.Argument(help="A folder of logs, data-set file (.toml), or store; each log is a session.")
+    ],
     study: Annotated[Path, typer.Option("--study", help="Folder of the study; an unfinished study continues.")],
     preset: Annotated[str, typer.Option(help="Extent of the search: quick, standard or thesis.")] = "quick",
     config: Annotated[

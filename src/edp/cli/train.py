@@ -27,7 +27,7 @@ RepairOption = Annotated[
 
 
 def train(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
     preset: Annotated[

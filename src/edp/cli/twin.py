@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def twin(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.kind=recurrent.")] = [],  # noqa: B006

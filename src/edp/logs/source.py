@@ -73,6 +73,11 @@ class DataSource:
         """A source from paths."""
         return DataSource(Path(path), None if map_file is None else load_signal_map(map_file), repair)
 
+    @property
+    def stored(self) -> bool:
+        """Whether it is a store, whose logs were mapped and repaired when it was built."""
+        return is_store(self.path)
+
     def to_plain(self) -> dict[str, Any]:
         """What provenance keeps, to read the same data again."""
         plain: dict[str, Any] = {"path": str(self.path.resolve())}
@@ -91,7 +96,7 @@ class DataSource:
 
     def logs(self) -> list[Log]:
         """The logs of the source, unread, each with the map that belongs to it; a store has none."""
-        if is_store(self.path):
+        if self.stored:
             return []
         if self.path.suffix == ".toml":
             return _listed(self.path, self.signal_map, self.repair)
@@ -104,7 +109,7 @@ class DataSource:
             DataError: nothing to read, or a log that cannot be used as it is.
             ConfigError: a map or repairs for a store, whose logs were read with their own.
         """
-        if is_store(self.path):
+        if self.stored:
             self._check_store_options()
             return read_store(self.path)
         if self.path.suffix != ".toml":
@@ -122,7 +127,7 @@ class DataSource:
         Raises:
             DataError: a file that cannot be read at all.
         """
-        if is_store(self.path):
+        if self.stored:
             return self._inspect_store(on_log)
         logs = self.logs()
         seen = []
@@ -140,7 +145,7 @@ class DataSource:
         self, folder: str | Path, workers: int = 1, on_progress: Callable[[StoreProgress], None] | None = None
     ) -> StoreIndex:
         """Read the logs into a store; see `edp.logs.store.build_store`."""
-        if is_store(self.path):
+        if self.stored:
             raise ConfigError(f"'{self.path}' is a store already; give the logs that it is to be built from")
         stored = [
             StoredLog(log.path, log.signal_map or SignalMap(), log.repair or Repair(), log.name, log.rows, log.machine)

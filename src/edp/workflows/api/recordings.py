@@ -15,6 +15,7 @@ from edp.errors import DataError, closest
 from edp.logs.arrays import recording_of_columns
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource, load_signal_map, map_of_table
+from edp.logs.store import is_store
 from edp.recording import FloatArray, Recording
 from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, recordings_figure, text_of
@@ -280,8 +281,8 @@ def read(
     """
     location = Path(path)
     if map is None:
-        # The maps of a data-set file are in it.
-        signal_map = None if location.suffix == ".toml" else SignalMap(others=True)
+        # The maps of a data-set file are in it, and those of a store were applied when it was built.
+        signal_map = None if location.suffix == ".toml" or is_store(location) else SignalMap(others=True)
     elif isinstance(map, Mapping):
         signal_map = map_of_table(dict(map), "map")
     else:

@@ -143,7 +143,7 @@ def _lists_maps(source: DataSource) -> bool:
 
 
 def _taken_whole(source: DataSource) -> DataSource:
-    return replace(source, signal_map=SignalMap(others=True))
+    return source if source.stored else replace(source, signal_map=SignalMap(others=True))
 
 
 def _read(source: DataSource, quality: DataQuality) -> tuple[list[Recording], list[str]]:
@@ -151,7 +151,7 @@ def _read(source: DataSource, quality: DataQuality) -> tuple[list[Recording], li
     repair = source.repair or Repair()
     # Missing values of one candidate must not refuse the whole log; the candidate is left out instead.
     lenient = replace(source, repair=replace(repair, nan="keep") if repair.nan == "refuse" else repair)
-    recordings = common_channels(lenient.read())
+    recordings = common_channels((source if source.stored else lenient).read())
     common = set(recordings[0].channel_names)
     seen = {channel.name: None for report in quality.reports for channel in report.channels}
     lost = [name for name in seen if name not in common]
