@@ -44,14 +44,14 @@ class Page(HTMLParser):
 def test_the_page_is_one_file_that_loads_nothing(run_folder):
     path = build_report(run_folder)
     assert path == run_folder / "report.html"
-    assert path.stat().st_size < 8e6
+    assert path.stat().st_size < 1.5e6
     text = path.read_text()
     page = Page(text)
     assert all(load.startswith("#") for load in page.loads)
     assert not {"link", "iframe", "img", "object", "embed"} & set(page.tags)
     assert "default-src 'none'" in text
     assert "@import" not in text.split("</style>")[0]
-    assert text.count("plotly.js v") == 1
+    assert text.count("const Figure = ") == 1
     assert sorted(path.name for path in run_folder.iterdir() if path.name.startswith(".")) == []
 
 

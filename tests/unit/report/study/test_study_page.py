@@ -275,7 +275,6 @@ def test_missing_facts_name_their_phase(sound):
 def test_whatever_is_broken_gives_a_report_or_one_clear_error(request, mode, count, tmp_path, monkeypatch):
     whole = request.getfixturevalue(mode)
     rng = random.Random(7)
-    monkeypatch.setattr("plotly.offline.get_plotlyjs", str)
     messages = []
     for _ in range(count):
         study = copy.deepcopy(whole)
