@@ -164,7 +164,50 @@ class Browser:
         return dict(json.loads(message))
 
 
-@pytest.fixture(scope="module")
+PAGE_BYTES = 3_000_000
+CHECKS = Path(__file__).with_name("page_checks.js")
+AXE = "EDP_AXE"
+"""Variable that names ``axe.min.js`` of axe-core; its rules are checked beside our own where it is set."""
+
+
+def check_page(browser: Browser, page: Path, calls: int = 0) -> None:
+    """What every page of EDP keeps: small, whole, quiet, on a phone and at a desk, for eyes, keys and screen readers.
+
+    Args:
+        browser: an open browser.
+        page: an HTML file.
+        calls: how many requests it may make; pages make none.
+    """
+    assert page.stat().st_size < PAGE_BYTES
+    for size, phone in ((DESK, False), (PHONE, True)):
+        browser.open(page, size, phone)
+        browser.run("window.dispatchEvent(new Event('beforeprint'))")
+        assert browser.complaints() == []
+        assert len(browser.requests()) == calls
+        assert browser.run("document.documentElement.scrollWidth <= document.documentElement.clientWidth"), size
+        faults = browser.run(CHECKS.read_text())
+        faults += serious_findings(browser) if os.environ.get(AXE) else []
+        assert not faults, "\n".join(faults)
+    browser.open(page)
+    links = browser.run("document.querySelectorAll('nav a').length")
+    browser.press("Tab")
+    if links:
+        assert browser.run("document.activeElement.closest('nav') !== null"), "the first key leads to the sections"
+        assert browser.run("getComputedStyle(document.activeElement).outlineStyle !== 'none'"), "focus is not seen"
+
+
+def serious_findings(browser: Browser) -> list[str]:
+    """Serious and critical findings of axe-core on the open page, a sentence each."""
+    browser.run(Path(os.environ[AXE]).read_text() + "\n;true")
+    found = browser.run("axe.run().then(result => JSON.stringify(result.violations))")
+    return [
+        f"{rule['id']} ({rule['impact']}): {rule['nodes'][0]['html'][:160]}"
+        for rule in json.loads(found)
+        if rule["impact"] in ("serious", "critical")
+    ]
+
+
+@pytest.fixture(scope="session")
 def browser(tmp_path_factory):
     """A headless Chromium; the test skips where there is none."""
     executable = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
