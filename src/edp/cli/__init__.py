@@ -12,6 +12,7 @@ from edp import __version__
 from edp.cli import (
     adapt,
     animate,
+    compare,
     compress,
     control,
     demo,
@@ -76,6 +77,7 @@ app.command("export")(export.export)
 app.command("parity")(parity.parity)
 app.command("quantise")(quantise.quantise)
 app.command("report")(report.report)
+app.command("compare")(compare.compare)
 app.command("runs")(runs.runs)
 app.command("doctor")(doctor.doctor)
 

@@ -144,7 +144,8 @@ const Figure = (function () {
         panel.row = rows.indexOf(panel.y.options.domain[0].toFixed(4));
         panel.share = [panel.x, panel.y].map((axis) => axis.options.domain[1] - axis.options.domain[0]);
       });
-      const stacked = narrow && columns.length > 1;
+      // Panels that share their rows, such as names and what is said of them, stay beside each other.
+      const stacked = narrow && columns.length > 1 && !panels.some((panel) => panel.y.options.matches);
       if (stacked) {
         panels.sort((a, b) => a.row - b.row || a.column - b.column).forEach((panel, i) => Object.assign(panel, { column: 0, row: i, share: [1, 1] }));
       }
@@ -305,7 +306,7 @@ const Figure = (function () {
       this.legend.textContent = "";
       if (!this.layout.showlegend) return;
       const seen = new Set();
-      this.data.filter((t) => t.visible !== false && t.showlegend && t.name).map((t, i) => [t.legendrank || 1000, i, t]).sort((a, b) => a[0] - b[0] || a[1] - b[1]).forEach(([, , t]) => {
+      this.data.filter((t) => t.visible !== false && t.showlegend && t.name).map((t, i) => [t.legendrank ?? 1000, i, t]).sort((a, b) => a[0] - b[0] || a[1] - b[1]).forEach(([, , t]) => {
         const group = t.legendgroup || t.name;
         if (seen.has(t.name)) return;
         seen.add(t.name);

@@ -20,9 +20,8 @@ from edp.report.run.choice import candidates_table, model_tables, promise_table,
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.storage import write_bytes
 
-
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
-"""Draw the figures of a page from plotly's descriptions of them; plotly itself has 4.8 MB and takes a second to start."""
+"""Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""
 
 
 def build_report(
