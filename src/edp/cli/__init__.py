@@ -46,7 +46,6 @@ app = typer.Typer(
     name="edp",
     help="Fast, accurate plant models of hydraulic machines, learned from recordings and run as a stream.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     # Tracebacks are for developers; users get one message.
     pretty_exceptions_enable=False,
