@@ -10,6 +10,7 @@ __version__ = "0.1.0"
 
 _API = "edp.workflows.api"
 _PUBLIC = {
+    "ComparedRuns": f"{_API}.compare",
     "EdpError": "edp.errors",
     "JudgedScores": f"{_API}.scores",
     "Monitor": "edp.monitor.monitor",
@@ -19,6 +20,7 @@ _PUBLIC = {
     "SearchStudy": f"{_API}.scores",
     "Stream": "edp.networks.stream",
     "TrainedPredictor": f"{_API}.predictor",
+    "compare": f"{_API}.compare",
     "load": f"{_API}.predictor",
     "load_monitor": "edp.monitor.monitor_file",
     "load_study": f"{_API}.scores",

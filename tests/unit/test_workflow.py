@@ -212,6 +212,20 @@ def test_the_same_judgement_is_not_made_twice(logs, tmp_path):
     assert steps[2:] == ["network", "ridge_arx"]
 
 
+def test_cheap_baselines_come_first_and_a_budget_leaves_out_the_others(logs, tmp_path):
+    train(source_of(logs), experiment(), tmp_path / "run")
+    steps = []
+    names = ["small_mlp", "ridge_arx", "persistence"]
+    evaluate(tmp_path / "run", baselines=names, on_step=steps.append, minutes=0.0)
+    scores = json.loads((tmp_path / "run" / "scores.json").read_text())
+    assert "small_mlp" in scores["left_out"]
+    assert "small_mlp" not in scores["models"]
+    steps.clear()
+    evaluate(tmp_path / "run", baselines=names, on_step=steps.append)
+    assert steps == ["network", "persistence", "ridge_arx", "small_mlp"]
+    assert "left_out" not in json.loads((tmp_path / "run" / "scores.json").read_text())
+
+
 def test_evaluation_on_other_recordings_leaves_the_run_as_it_was(logs, tmp_path):
     train(source_of(logs), experiment(), tmp_path / "run")
     header = (tmp_path / "run" / "bundle" / "bundle.json").read_bytes()

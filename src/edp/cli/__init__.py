@@ -12,6 +12,7 @@ from edp import __version__
 from edp.cli import (
     adapt,
     animate,
+    compare,
     compress,
     control,
     demo,
@@ -46,7 +47,6 @@ app = typer.Typer(
     name="edp",
     help="Fast, accurate plant models of hydraulic machines, learned from recordings and run as a stream.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     # Tracebacks are for developers; users get one message.
     pretty_exceptions_enable=False,
@@ -78,6 +78,7 @@ app.command("export")(export.export)
 app.command("parity")(parity.parity)
 app.command("quantise")(quantise.quantise)
 app.command("report")(report.report)
+app.command("compare")(compare.compare)
 app.command("runs")(runs.runs)
 app.command("doctor")(doctor.doctor)
 

@@ -32,6 +32,10 @@ def evaluate(
     channel_importance: Annotated[
         bool, typer.Option(help="Also measure channel importance: the growth of the error when a channel is removed.")
     ] = False,
+    minutes: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="After these begin no further baseline; cheap ones come first."),
+    ] = None,
     predictor: Annotated[
         Path | None, typer.Option(help="Of a twin: run folder of a look-ahead predictor to compare with.")
     ] = None,
@@ -47,9 +51,10 @@ def evaluate(
 
     source = None if data is None else source_of(data, signal_map, repair)
     if holds_twin(run):
-        if baselines is not None or channel_importance:
+        if baselines is not None or channel_importance or minutes is not None:
             raise ConfigError(
-                f"'{run}' holds a twin, which has neither --baselines nor --channel-importance; leave them out: its "
+                f"'{run}' holds a twin, which has no --baselines, --minutes or --channel-importance; leave them out: "
+                "its "
                 "floors are those of its settings, judge.floors"
             )
         evaluate_twin_run(run, source, predictor, as_json)
@@ -61,7 +66,7 @@ def evaluate(
     from edp.report.run.outputs import judged_line, losses_line
     from edp.storage.runs import read_provenance
 
-    folder, scores = run_evaluation(run, source, names, as_json)
+    folder, scores = run_evaluation(run, source, names, as_json, minutes)
     beaten = beaten_by(scores)
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
     importances = run_importance(run, source, as_json) if channel_importance else None
@@ -73,6 +78,9 @@ def evaluate(
             out.print(lost, style="bold red")
         score_table(scores)
         out.print(judged)
+        if scores.get("left_out"):
+            left = ", ".join(map(str, scores["left_out"]))
+            out.print(f"left out after --minutes {minutes:g}: {left}; give the command without it to judge them, too")
         out.print(f"scores in {folder / 'scores.json'}")
         if importances is not None:
             importance_table(importances)
@@ -131,7 +139,11 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
 
 
 def run_evaluation(
-    run: Path, source: DataSource | None = None, names: list[str] | None = None, quiet: bool = False
+    run: Path,
+    source: DataSource | None = None,
+    names: list[str] | None = None,
+    quiet: bool = False,
+    minutes: float | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Judge with a progress display; returns the folder of the scores and the scores."""
     from edp.storage import read_object
@@ -146,7 +158,7 @@ def run_evaluation(
             shown.update(bar, note=name)
             steps.say(f"evaluate: {name}, {duration(time.monotonic() - began)} so far")
 
-        folder = judge_run(run, source, names, on_step)
+        folder = judge_run(run, source, names, on_step, minutes)
     return folder, read_object(folder / "scores.json")
 
 

@@ -74,6 +74,7 @@ def judge(
     label: str,
     seconds: float = 0.0,
     on_step: Callable[[str], None] | None = None,
+    minutes: float | None = None,
 ) -> Evaluation:
     """Score the predictor and the baselines on ``data.test``.
 
@@ -84,6 +85,7 @@ def judge(
         label: how reports call the network.
         seconds: its training time.
         on_step: called with the name of each model before it runs.
+        minutes: after which no further baseline is begun, the cheapest being first; scores name those left out.
 
     Raises:
         DataError: no tick of the test series can be scored.
@@ -94,9 +96,13 @@ def judge(
     predictions = {"network": stream_predictions(predictor, data.test)}
     names, times = {"network": label}, {"network": seconds}
     on_validation: dict[str, Predictions] = {}
-    for name in spec.baselines:
-        say(name)
+    start, left_out = time.perf_counter(), []
+    for name in sorted(spec.baselines, key=lambda name: BASELINES[name].effort):
         began = time.perf_counter()
+        if minutes is not None and began - start > 60 * minutes:
+            left_out.append(name)
+            continue
+        say(name)
         predict, baseline = baseline_predictions(BASELINES[name], data, spec)
         predictions[name] = predict(data)
         on_validation[name] = predict(replace(data, test=data.validation))
@@ -116,7 +122,8 @@ def judge(
     if coverages:
         say("intervals")
         models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
-    return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
+    scores = ruler.header() | {"models": models} | ({"left_out": left_out} if left_out else {})
+    return Evaluation(scores, predictions, data.test)
 
 
 def _on_validation(predictions: dict[str, Predictions], data: Prepared, skip: int) -> dict[str, Any]:
@@ -248,7 +255,7 @@ class _Ruler:
             by_name = {}
             for series, (p, t) in zip(self.data.test, pairs, strict=True):
                 if len(t):
-                    by_name[series.name] = {str(horizon): {"mean": self._scores([p], [t])["mean"]}}
+                    by_name[series.name] = {str(horizon): self._of_recording(p, t)}
             for name, entry in by_name.items():
                 recordings.setdefault(name, {}).update(entry)
             spreads[str(horizon)] = spread([entry[str(horizon)]["mean"]["mae"] for entry in by_name.values()])
@@ -284,6 +291,11 @@ class _Ruler:
         each = [score(p[:, i], t[:, i]) for i in range(p.shape[1])]
         named: dict[str, Scores] = {"mean": mean_scores(each), **dict(zip(self.task.targets, each, strict=True))}
         return {name: values.to_json() for name, values in named.items()}
+
+    def _of_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> dict[str, Any]:
+        """All scores of the mean over outputs; of each output the error alone: runs have hundreds of recordings."""
+        scores = self._scores([predicted], [truth])
+        return {name: values if name == "mean" else {"mae": values["mae"]} for name, values in scores.items()}
 
     def _by_speed(self, pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]]) -> list[dict[str, Any]]:
         """Mean absolute error in bins of the target's magnitude, outputs pooled."""

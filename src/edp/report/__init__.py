@@ -1,5 +1,7 @@
 """The report of a run: `facts` reads, `figures` computes, `charts` describes, `page` writes one offline HTML file."""
 
+from edp.report.compare.page import write_compare_page
+from edp.report.compare.paired import Comparison, compare_runs
 from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.compression.page import write_compression_page
 from edp.report.control.facts import ControlFacts
@@ -16,6 +18,7 @@ from edp.report.twin.facts import FreeRunFacts, holds_free_runs
 from edp.report.twin.page import build_twin_report, write_twin_page
 
 __all__ = [
+    "Comparison",
     "CompressionFacts",
     "ControlFacts",
     "Facts",
@@ -26,12 +29,14 @@ __all__ = [
     "build_report",
     "build_screening_page",
     "build_twin_report",
+    "compare_runs",
     "comparison_rows",
     "headline",
     "holds_free_runs",
     "read_compression",
     "read_facts",
     "read_transfer",
+    "write_compare_page",
     "write_compression_page",
     "write_control_page",
     "write_rollout_plots",

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
-import fcntl
 import os
+import platform
 import re
 import stat
 import time
@@ -12,13 +13,15 @@ from pathlib import Path
 from typing import IO
 
 from edp.errors import BusyError, StorageError
+from edp.storage.portable import HELD, NO_LINK, QUIETLY
+from edp.storage.portable import lock as lock_file
 from edp.storage.writing import storage_error
 
 OURS = re.compile(r"\d{1,10} on [^\n]{1,255} since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d|\x00*")
 """What a lock file holds: its last holder; nothing, or the zeros of a disk that lost power, before the first one."""
 HOLDER_BYTES = 400
 """Most that it has."""
-_OPEN = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_OPEN = NO_LINK | QUIETLY
 _ADVICE = "nothing was changed: remove it, if nothing of yours needs it, and try again"
 
 
@@ -37,12 +40,12 @@ def hold(path: str | Path) -> IO[str]:
     while True:
         stream = _opened(lock)
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(stream)
         except OSError as error:
             holder = _holder(stream)
             stream.close()
-            # These two say that another process holds it, depending on the system; others are faults of the disk.
-            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+            # These say that another process holds it, depending on the system; others are faults of the disk.
+            if error.errno not in HELD:
                 raise storage_error(lock, error, "lock") from error
             raise BusyError(f"'{lock}' is held by process {holder}") from None
         # The file may have been removed between opening and locking: then the lock holds nothing.
@@ -52,7 +55,7 @@ def hold(path: str | Path) -> IO[str]:
     _check_ours(lock, stream)
     try:
         stream.truncate(0)
-        stream.write(f"{os.getpid()} on {os.uname().nodename} since {time.strftime('%Y-%m-%d %H:%M:%S')}")
+        stream.write(f"{os.getpid()} on {platform.node()} since {time.strftime('%Y-%m-%d %H:%M:%S')}")
         stream.flush()
     except OSError as error:
         stream.close()
@@ -73,9 +76,13 @@ def still_ours(path: str | Path, stream: IO[str]) -> bool:
 
 def release(path: str | Path, stream: IO[str]) -> None:
     """Free a lock and remove its file, where it is still ours; who waits for it locks a new one."""
-    if still_ours(path, stream):
+    ours = still_ours(path, stream)
+    if os.name != "nt" and ours:
         Path(path).unlink(missing_ok=True)  # first, so that nobody can lock what is about to go
     stream.close()
+    if os.name == "nt" and ours:  # Windows removes no open file; a new holder has it open, so that it stays
+        with contextlib.suppress(OSError):
+            Path(path).unlink()
 
 
 def check_held(path: str | Path, stream: IO[str]) -> None:
@@ -98,7 +105,7 @@ def held_by(path: str | Path) -> str | None:
             if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
                 return None
             try:
-                fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                lock_file(stream, shared=True)
             except OSError:
                 return _holder(stream)
     except OSError:

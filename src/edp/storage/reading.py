@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
+from edp.storage.portable import BINARY, QUIETLY
 
 JSON_BYTES = 64 * 2**20
 """Of a JSON file; larger ones are not EDP's own."""
@@ -48,7 +49,7 @@ def read_bytes(path: str | Path, limit: int, where: str = "", error: type[Except
     try:
         _check_regular(os.stat(path), limit, where, error)  # opening a device may already do something
         # Not blocking: a pipe that took the file's place since then would be waited for.
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        handle = os.open(path, os.O_RDONLY | QUIETLY | BINARY)
         with open(handle, "rb", buffering=0) as stream:
             _check_regular(os.fstat(handle), limit, where, error)
             parts, size = [], 0

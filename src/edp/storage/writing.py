@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
+from edp.storage.portable import BINARY, QUIETLY
 
 
 def storage_error(path: Path, error: OSError, doing: str) -> StorageError:
@@ -59,7 +60,7 @@ def _temporary(target: Path) -> tuple[int, str]:
         name = f"{target.parent}/.{target.name[:80]}.{secrets.token_hex(6)}.tmp"
         with contextlib.suppress(FileExistsError):
             # O_EXCL follows no link that somebody put there, and takes no other process's file.
-            return os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), name
+            return os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | QUIETLY | BINARY, 0o666), name
 
 
 @contextlib.contextmanager

@@ -254,6 +254,7 @@ def evaluate(
     source: DataSource | None = None,
     baselines: Sequence[str] | None = None,
     on_step: Callable[[str], None] | None = None,
+    minutes: float | None = None,
 ) -> Path:
     """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
 
@@ -264,6 +265,7 @@ def evaluate(
         source: other recordings; all of them are judged.
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
+        minutes: after which no further baseline is begun; what is left out is judged by a later call without it.
 
     Returns:
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
@@ -284,8 +286,9 @@ def evaluate(
     scores = _kept(target, key)
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
-        evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step)
-        scores = evaluation.scores | {"key": key}
+        evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
+        # Scores that lack a baseline are shown, but not kept for a call that asks for all.
+        scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
         write_bytes(target / "predictions.safetensors", save(_shown(evaluation)))
         write_json(target / "scores.json", scores)
     if source is None:

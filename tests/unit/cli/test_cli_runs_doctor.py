@@ -104,3 +104,14 @@ def test_doctor_names_what_is_missing_and_ends_with_3_where_edp_needs_it(edp, tm
     ended = edp("doctor", tmp_path)
     assert ended.code == 3
     assert "no processes left" in ended.out
+
+
+def test_the_shell_completes_names_of_commands(monkeypatch, capsys):
+    from edp.cli import app
+    from edp.cli.console import run_app
+
+    for name, value in {"_EDP_COMPLETE": "complete_bash", "COMP_WORDS": "edp comp", "COMP_CWORD": "1"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("sys.argv", ["edp"])
+    assert run_app(app) == 0
+    assert {"compare", "compress"} <= set(capsys.readouterr().out.split())

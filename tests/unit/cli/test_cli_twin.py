@@ -234,7 +234,7 @@ def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, l
     shown = edp("evaluate", run, "--data", other, "--predictor", tmp_path / "predictor").out
     for text in ("share of free runs in intervals", "at rest", "in motion", "told the commands", "it is flattered"):
         assert text.removeprefix("at ").removeprefix("in ") in " ".join(shown.split())
-    assert "neither --baselines" in edp("evaluate", run, "--baselines", "none").err
+    assert "no --baselines" in edp("evaluate", run, "--baselines", "none").err
 
 
 def test_a_rollout_prints_the_error_of_each_channel_by_time(edp, logs, trained):

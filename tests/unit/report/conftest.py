@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import browser as browser
 from safetensors.numpy import save_file
 
 HORIZONS = (1, 5, 10)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from browser import check_page
 
 from edp.recording import Recording
 from edp.report.animation.page import scene_of
@@ -92,3 +93,10 @@ def test_names_stay_text(facts):
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert 'id="front"' in page
     assert "http://" not in page.split("<script>")[0]
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, facts, tmp_path):
+    page = tmp_path / "control.html"
+    page.write_text(render(facts))
+    check_page(browser, page)

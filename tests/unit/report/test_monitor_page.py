@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from browser import check_page
 
 from edp.monitor.diagnosis.causes import Cause
 from edp.monitor.diagnosis.structure import Confusion
@@ -123,3 +124,10 @@ def test_times_of_day_are_shown_where_the_start_is_known(facts):
     monday = timeline(facts.traces.recordings[0], facts)
     assert any(label.text == "13:58:10" for label in monday.labels)
     assert any(label.text == "0:00:00" for label in overview(facts).labels)
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, facts, tmp_path):
+    page = tmp_path / "monitor.html"
+    page.write_text(render(facts))
+    check_page(browser, page)

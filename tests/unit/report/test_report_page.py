@@ -3,6 +3,7 @@ import re
 from html.parser import HTMLParser
 
 import pytest
+from browser import check_page
 
 from edp.errors import StorageError
 from edp.report import build_report
@@ -44,14 +45,14 @@ class Page(HTMLParser):
 def test_the_page_is_one_file_that_loads_nothing(run_folder):
     path = build_report(run_folder)
     assert path == run_folder / "report.html"
-    assert path.stat().st_size < 8e6
+    assert path.stat().st_size < 1.5e6
     text = path.read_text()
     page = Page(text)
     assert all(load.startswith("#") for load in page.loads)
     assert not {"link", "iframe", "img", "object", "embed"} & set(page.tags)
     assert "default-src 'none'" in text
     assert "@import" not in text.split("</style>")[0]
-    assert text.count("plotly.js v") == 1
+    assert text.count("const Figure = ") == 1
     assert sorted(path.name for path in run_folder.iterdir() if path.name.startswith(".")) == []
 
 
@@ -139,3 +140,62 @@ def test_the_table_marks_the_network_and_leads_with_the_longest_horizon(run_fold
 def test_a_page_that_cannot_be_written_says_so(run_folder):
     with pytest.raises(StorageError, match="cannot"):
         build_report(run_folder, output=run_folder / "config.toml" / "report.html")
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, run_folder):
+    check_page(browser, build_report(run_folder))
+
+
+@pytest.mark.processes
+def test_choices_zoom_and_legend_work(browser, run_folder):
+    browser.open(build_report(run_folder))
+    lines = "[...document.querySelectorAll('#figure-predictions path[stroke-linejoin]')].map(p => p.getAttribute('d'))"
+    first = browser.run(lines)
+    browser.run(
+        "(() => { const s = document.querySelector('select[data-key=recording]'); s.selectedIndex = 1;"
+        " s.dispatchEvent(new Event('change')); })()"
+    )
+    second = browser.run(lines)
+    assert len(first) == len(second) > 3
+    assert first != second
+    button = "document.querySelector('#figure-predictions .figure-legend button')"
+    browser.run(f"{button}.click()")
+    assert len(browser.run(lines)) < len(second)
+    assert browser.run(f"{button}.getAttribute('aria-pressed')") == "false"
+    box = browser.run(
+        "(() => { const s = document.querySelector('#figure-predictions .figure-stage svg');"
+        " s.scrollIntoView({ behavior: 'instant' });"
+        " const r = s.getBoundingClientRect(); return [r.left, r.top, r.width, r.height]; })()"
+    )
+    left, top, width, height = box
+    for kind, share in (("mousePressed", 0.4), ("mouseMoved", 0.6), ("mouseReleased", 0.6)):
+        browser.ask("Input.dispatchMouseEvent", type=kind, x=left + share * width, y=top + 0.2 * height, button="left",
+                    buttons=1, clickCount=1)  # fmt: skip
+    assert browser.run("!document.querySelector('#figure-predictions .figure-back').hidden")
+    browser.run("document.querySelector('#figure-predictions .figure-back').click()")
+    assert browser.run("document.querySelector('#figure-predictions .figure-back').hidden")
+    browser.ask("Input.dispatchMouseEvent", type="mouseMoved", x=left + 0.5 * width, y=top + 0.2 * height)
+    assert "Hybrid TCN-LSTM" in browser.run("document.querySelector('#figure-predictions .figure-tip').textContent")
+    assert browser.complaints() == []
+
+
+@pytest.mark.processes
+def test_names_stay_text_in_the_drawing(browser, run_folder):
+    evil = "</script><img src=x onerror=alert(1)><b>&"
+    scores = json.loads((run_folder / "scores.json").read_text())
+    scores["models"]["ridge_arx"]["label"] = scores["targets"][0]["description"] = evil
+    (run_folder / "scores.json").write_text(json.dumps(scores))
+    page = build_report(run_folder)
+    browser.open(page)
+    browser.run("window.dispatchEvent(new Event('beforeprint'))")
+    assert browser.run("document.querySelectorAll('img, main b').length") == 0
+    assert evil[:20] in browser.run("document.querySelector('#figure-predictions').textContent")
+    assert browser.complaints() == []
+
+
+@pytest.mark.processes
+def test_the_page_prints_every_figure(browser, run_folder, tmp_path):
+    browser.open(build_report(run_folder))
+    assert browser.printed(tmp_path / "page.pdf").stat().st_size > 20_000
+    assert browser.run("document.querySelectorAll('.figure-stage svg').length") == 6

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from browser import check_page
 
 from edp.data.screening import (
     ChannelVerdict,
@@ -198,3 +199,8 @@ def test_nothing_but_a_proposal_is_a_page_too():
     text = render_screening(bare, "bare")
     assert 'id="flags"' not in text
     assert 'id="clusters"' not in text
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, tmp_path):
+    check_page(browser, build_screening_page(screening(), tmp_path / "report.html", "data", None, TRIALS, ["A note."]))

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from browser import check_page
 from safetensors.numpy import save_file
 
 from edp.errors import StorageError
@@ -157,3 +158,8 @@ def test_what_cannot_be_read_is_refused(folder, spoil, reason):
     spoil(place)
     with pytest.raises(StorageError, match=reason):
         read_transfer(place)
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, folder):
+    check_page(browser, write_transfer_page(folder(content())))

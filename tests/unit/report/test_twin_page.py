@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from browser import check_page
 from safetensors.numpy import save
 
 from edp.data.twin_channels import TwinChannels
@@ -149,3 +150,10 @@ def test_damaged_runs_are_refused(folder):
     (folder / "free_runs.safetensors").write_bytes(b"x")
     with pytest.raises(StorageError, match="cannot read"):
         read_free_runs(folder)
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, tmp_path):
+    page = tmp_path / "twin.html"
+    page.write_text(render(facts_of()))
+    check_page(browser, page)

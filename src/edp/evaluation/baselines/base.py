@@ -35,6 +35,8 @@ class Baseline(ABC):
 
     label: ClassVar[str]
     """How tables and pictures call it."""
+    effort: ClassVar[int] = 2
+    """How long it takes to fit, beside others: 0 for nothing; the judge begins with the least."""
 
     def __init__(self, task: BaselineTask) -> None:
         self.task = task

@@ -17,6 +17,7 @@ class Persistence(Baseline):
     """Holds the present value over all horizons; a target that no input measures gets its training mean."""
 
     label = "Persistence"
+    effort = 0
 
     def _fit(self, train: Sequence[Series], validation: Sequence[Series]) -> None:
         self._means = target_means(train)

@@ -17,6 +17,7 @@ class RidgeArx(Baseline):
     """One ridge map per horizon and target; penalty and history are chosen on validation for each of them."""
 
     label = "Ridge ARX"
+    effort = 1
 
     def _fit(self, train: Sequence[Series], validation: Sequence[Series]) -> None:
         self._solution = ridge_solution(train, self.task, validation)

@@ -31,6 +31,7 @@ class SmallMlp(Baseline):
     """
 
     label = "Small MLP"
+    effort = 3
 
     def __init__(self, task: BaselineTask, row_cap: int = 60_000, epochs: int = 30, patience: int = 5) -> None:
         super().__init__(task)

@@ -1,44 +1,39 @@
 "use strict";
-// Draws every figure of the page, and shows of its traces those that the selectors above it ask for.
+// Draws the figures of the page as they come into sight, and shows of each what the selectors above it ask for.
 (function () {
-  const config = {
-    displaylogo: false,
-    plotlyServerURL: "", // nothing on this page may leave it: no "share chart" that uploads the data
-    showSendToCloud: false,
-    responsive: true,
-    modeBarButtonsToRemove: ["sendChartToCloud", "sendDataToCloud", "select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d"],
-    toImageButtonOptions: { scale: 2 },
-  };
+  const specs = JSON.parse(document.getElementById("figures").textContent);
+  const waiting = new Map();
 
-  function chosen(selectors) {
-    return Object.fromEntries(selectors.map((selector) => [selector.dataset.key, selector.value]));
+  function draw(box) {
+    const make = waiting.get(box);
+    waiting.delete(box);
+    if (make) make();
   }
 
-  function apply(box, spec, selectors, changed) {
-    const want = chosen(selectors);
-    const visible = box.data.map((trace) =>
-      Object.entries(trace.meta || {}).every(([key, value]) => !(key in want) || want[key] === value));
-    const layout = {};
-    if (!spec.controls[changed]) {
-      Object.keys(box.layout).filter((name) => /^[xy]axis\d*$/.test(name)).forEach((name) => {
-        layout[name + ".autorange"] = true;
-      });
-    }
-    Plotly.update(box, { visible: visible }, layout);
-  }
-
-  function draw(spec) {
+  function prepare(spec) {
     const box = document.getElementById("figure-" + spec.name);
     const selectors = Array.from(document.querySelectorAll('select[data-figure="' + spec.name + '"]'));
-    const drawn = Plotly.newPlot(box, spec.figure.data, spec.figure.layout, config);
-    selectors.forEach((selector) =>
-      selector.addEventListener("change", () => drawn.then(() => apply(box, spec, selectors, selector.dataset.key))));
+    const section = box.closest("section");
+    const heading = section && section.querySelector("h2");
+    const names = [...new Set(spec.figure.data.map((trace) => FigureAxes.plain(trace.name)).filter(Boolean))];
+    const label = (heading ? heading.textContent : spec.name) + (names.length ? ": " + names.slice(0, 12).join(", ") : "");
+    let figure = null;
+    waiting.set(box, () => { figure = new Figure(box, spec, label); });
+    selectors.forEach((selector) => selector.addEventListener("change", () => {
+      draw(box);
+      figure.choose(Object.fromEntries(selectors.map((one) => [one.dataset.key, one.value])), spec.controls[selector.dataset.key]);
+    }));
+    return box;
   }
 
-  JSON.parse(document.getElementById("figures").textContent).forEach(draw);
+  const seen = new IntersectionObserver((rows) => {
+    rows.filter((row) => row.isIntersecting).forEach((row) => { seen.unobserve(row.target); draw(row.target); });
+  }, { rootMargin: "600px" });
+  specs.map(prepare).forEach((box) => seen.observe(box));
 
-  // Paper shows what a click would: every folded part but the configuration.
+  // Paper shows what a click would: every figure, and every folded part but the configuration.
   window.addEventListener("beforeprint", () => {
     document.querySelectorAll("details:not(.long)").forEach((part) => { part.open = true; });
+    [...waiting.keys()].forEach(draw);
   });
 })();

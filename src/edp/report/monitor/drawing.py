@@ -33,7 +33,7 @@ MISSING_SHADE = "#ffffff"
 MOST_EVIDENCE = 10
 MOST_ROWS = 120
 """Recordings of the overview."""
-MARKS = {"stop": "#b3261e", "warning": "#c9892f", "note": "#5a9c8c"}
+MARKS = {"stop": "#b3261e", "warning": "#8f5c10", "note": "#2f7566"}
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from edp.signals import GROUND_POINTS
 from edp.storage.machine_code import Compiler, files_with
+from edp.storage.portable import lock as lock_file
 
 # No "nnan"/"ninf": a diverging state must stay visible as NaN.
 # No reference counts ("_nrt"): compiled functions read and write arrays of their callers and allocate none. Counting
@@ -62,7 +62,7 @@ class WarmUp:
         if complete.exists():
             return
         with (folder / "lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            lock_file(lock, wait=True)
             # Asked again under the lock: another process may have filled the cache meanwhile.
             if not complete.exists():
                 play()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import platform
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self
@@ -103,7 +103,7 @@ class ClosedAtExit:
 
 def ended(job: Job, status: TrainingStatus, message: str, **measured: Any) -> Record:
     """The record of a job that could not say itself how it ended."""
-    return Record(job.identity, status, None, message, {"host": os.uname().nodename, **measured})
+    return Record(job.identity, status, None, message, {"host": platform.node(), **measured})
 
 
 def refuse_twice(job: Job, under_way: Mapping[str, Any]) -> None:

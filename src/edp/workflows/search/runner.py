@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +22,7 @@ from edp.settings.bounds import MOST_THREADS, above, check_bounds, integer
 from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record
+from edp.storage.portable import cores
 from edp.workflows.search.context import Decision, SearchContext, set_apart
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.executor import Executor
@@ -84,8 +84,7 @@ class Resources:
             from edp.workflows.search.cluster import RayPool  # Ray takes seconds to import, and few have it
 
             return RayPool(self.cluster, self.threads, open_cluster=self.open_cluster)
-        # The cores that this process may use, which in a container are fewer than those of the machine.
-        return LocalPool(self.workers or max(1, len(os.sched_getaffinity(0)) // self.threads), self.threads)
+        return LocalPool(self.workers or max(1, cores() // self.threads), self.threads)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import platform
 import queue
-import resource
 import sys
 import threading
 import time
@@ -109,12 +109,10 @@ def _end_of(
     except (Exception, SystemExit) as error:
         status = TrainingStatus.OOM if _out_of_memory(error) else TrainingStatus.FAILED
         result, message, trace = None, f"{type(error).__name__}: {error}", traceback.format_exc()[-SHOWN_TRACE:]
-    # macOS gives bytes, Linux kilobytes.
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     measured: dict[str, Any] = {
         "seconds": time.monotonic() - started,
-        "peak_mb": peak,
-        "host": os.uname().nodename,
+        "peak_mb": peak_mb(),
+        "host": platform.node(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     record = Record(identity, status, result, message, measured | ({"trace": trace} if trace else {}))
@@ -133,6 +131,16 @@ def resolve(name: str) -> Callable[[TrainingIdentity, Mapping[str, Any]], Any]:
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"there is no job '{name}' ({error}); give it as package.module:function") from error
     return job_function  # type: ignore[no-any-return]
+
+
+def peak_mb() -> float:
+    """Most memory that this process has had, in MiB; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # not POSIX
+        return 0.0
+    # macOS gives bytes, Linux kilobytes.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _out_of_memory(error: BaseException) -> bool:

@@ -6,6 +6,7 @@ import json
 import random
 
 import pytest
+from browser import check_page
 
 from edp.errors import EdpError, StorageError
 from edp.report import write_study_page
@@ -275,7 +276,6 @@ def test_missing_facts_name_their_phase(sound):
 def test_whatever_is_broken_gives_a_report_or_one_clear_error(request, mode, count, tmp_path, monkeypatch):
     whole = request.getfixturevalue(mode)
     rng = random.Random(7)
-    monkeypatch.setattr("plotly.offline.get_plotlyjs", str)
     messages = []
     for _ in range(count):
         study = copy.deepcopy(whole)
@@ -302,3 +302,8 @@ def damage(value, rng):
         else:
             value[key] = rng.choice([None, "odd", -1, [], {}, 1e300, True])
         return
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, sound, tmp_path):
+    check_page(browser, write_study_page(sound, tmp_path, pictures=False).page)

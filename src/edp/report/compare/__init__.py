@@ -1,0 +1,1 @@
+"""Several runs beside each other: `runs` reads, `paired` compares, `charts` and `page` show."""

@@ -1,0 +1,264 @@
+"""What a comparison reads of each run: errors by quantity and recording, learning curve, size and cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, DataError
+from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
+from edp.report.twin.facts import TWIN, holds_free_runs, read_free_runs
+from edp.storage import read_object
+
+MOST_RUNS = 12
+"""Beside each other: more lines than that nobody tells apart."""
+MEAN = "mean over outputs"
+LOOK_AHEAD, FREE = "looks ahead", "runs free"
+HEADER = "twin/twin.json"
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, order=True)
+class Measure:
+    """An error by which runs are compared.
+
+    Attributes:
+        output: name of a target or channel, or `MEAN` where all targets have one unit.
+        ahead_s: seconds ahead, or after the start of a free run.
+        unit: of the error.
+        what: what is measured, in words.
+    """
+
+    output: str
+    ahead_s: float
+    unit: str
+    what: str = "mean absolute error"
+
+    def text(self) -> str:
+        """For a heading."""
+        return f"{self.output}, {self.when}"
+
+    @property
+    def when(self) -> str:
+        """What of the output, and how far ahead."""
+        return f"{1000 * self.ahead_s:g} ms ahead" if self.what == "mean absolute error" else self.what
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedRun:
+    """One run.
+
+    Attributes:
+        name: how the comparison calls it.
+        folder: where it is.
+        kind: `LOOK_AHEAD` or `FREE`.
+        label: of its model.
+        errors: by measure, of each test recording.
+        curves: by output of a free run, seconds and error.
+        history: an entry an epoch; empty where it has none.
+        costs: size and work by words; what is not known is left out.
+        digest: of its data; empty where it is not said.
+        predictions: by recording ``truth`` ``(time, target)`` and ``network`` ``(time, horizon, target)``, SI.
+        targets: outputs in the order of these arrays, with the factor to the report's unit.
+        horizons: samples ahead in the order of these arrays.
+        rate_hz: of the data; None where it is not said.
+        skip: first ticks of each recording that are not scored.
+    """
+
+    name: str
+    folder: Path
+    kind: str
+    label: str
+    errors: Mapping[Measure, Mapping[str, float]]
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+    history: tuple[Mapping[str, Any], ...] = ()
+    costs: Mapping[str, float] = field(default_factory=dict)
+    digest: str = ""
+    predictions: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+    targets: tuple[tuple[str, float], ...] = ()
+    horizons: tuple[int, ...] = ()
+    rate_hz: float | None = None
+    skip: int = 0
+
+    def target(self, name: str) -> tuple[int, float] | None:
+        """Column of a target in the arrays, and its factor to the unit of reports; None where there is no such."""
+        places = {target: (column, factor) for column, (target, factor) in enumerate(self.targets)}
+        return places.get(name)
+
+    @property
+    def recordings(self) -> set[str]:
+        """Test recordings that every measure has."""
+        sets = [set(by_name) for by_name in self.errors.values()]
+        return set.intersection(*sets) if sets else set()
+
+
+def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
+    """The runs of some folders, in that order.
+
+    Args:
+        folders: run folders, or folders in them that `edp evaluate --data` wrote.
+
+    Raises:
+        ConfigError: fewer than two, more than `MOST_RUNS`, or one twice.
+        StorageError: a folder holds no judged run, or something damaged.
+        DataError: some of them look ahead and others run free.
+    """
+    paths = [Path(folder) for folder in folders]
+    if not 2 <= len(paths) <= MOST_RUNS:
+        raise ConfigError(f"{len(paths)} run(s) came; edp compare takes 2 to {MOST_RUNS} run folders")
+    real = [path.resolve() for path in paths]
+    for place, path in enumerate(real):
+        if path in real[:place]:
+            raise ConfigError(f"'{paths[place]}' came twice; name each run once")
+    runs = [_read(path, name) for path, name in zip(paths, _names(real), strict=True)]
+    if len({run.kind for run in runs}) > 1:
+        free = [run.name for run in runs if run.kind == FREE]
+        raise DataError(
+            f"{', '.join(free)}: a twin runs free, the others look a fixed time ahead; their errors are not the same "
+            "quantity. Compare twins with twins, and networks with networks (edp evaluate TWIN --predictor RUN sets a "
+            "twin beside a network)"
+        )
+    return runs
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """The last part of each path, or as many parts as tell them apart."""
+    for parts in range(1, 6):
+        names = ["/".join(path.parts[-parts:]) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [str(path) for path in paths]
+
+
+def _read(path: Path, name: str) -> ComparedRun:
+    return _twin(path, name) if holds_free_runs(path) else _network(path, name)
+
+
+def _network(path: Path, name: str) -> ComparedRun:
+    facts = read_facts(path)
+    if facts.scores is None or NETWORK not in facts.models:
+        raise DataError(f"'{path}' was not judged; run edp evaluate {path}")
+    # What edp evaluate --data writes is a folder in the run, which has the rest.
+    whole = facts
+    if facts.provenance is None and (path.resolve().parent / "provenance.json").is_file():
+        whole = read_facts(path.resolve().parent)
+    errors: dict[Measure, dict[str, float]] = {}
+    known = {str(horizon) for horizon in facts.horizons}
+    for recording, by_horizon in facts.models[NETWORK].get("recordings", {}).items():
+        for horizon, scores in by_horizon.items():
+            for output, unit in _outputs(facts) if horizon in known else ():
+                alone = output == MEAN or len(facts.targets) == 1
+                error = scores.get("mean" if alone else output, {}).get("mae")
+                if error is not None:
+                    measure = Measure(output, round(int(horizon) / (facts.rate_hz or 1.0), 9), unit)
+                    errors.setdefault(measure, {})[recording] = float(error)
+    if not errors:
+        raise DataError(f"'{path}' has no errors by recording; remove its scores.json and run edp evaluate {path}")
+    return ComparedRun(
+        name=name,
+        folder=path,
+        kind=LOOK_AHEAD,
+        label=label_of(facts, NETWORK),
+        errors=errors,
+        history=whole.history,
+        costs=_costs(whole),
+        digest=_digest(facts.provenance),
+        predictions=facts.predictions,
+        targets=tuple((target.name, target.factor) for target in facts.targets),
+        horizons=facts.horizons,
+        rate_hz=facts.rate_hz,
+        skip=int((facts.scores or {}).get("task", {}).get("skip", 0)),
+    )
+
+
+def _outputs(facts: Facts) -> list[tuple[str, str]]:
+    """Name and unit of what has errors of its own: the mean first, where it means something."""
+    outputs = [(target.name, "" if target.unit == "1" else target.unit) for target in facts.targets]
+    if len(outputs) == 1:
+        return outputs
+    return [(MEAN, facts.unit), *outputs] if facts.averaged else outputs
+
+
+def _digest(provenance: Mapping[str, Any] | None) -> str:
+    data = (provenance or {}).get("data", {})
+    return str(data.get("digest") or "") if isinstance(data, Mapping) else ""
+
+
+def _costs(facts: Facts) -> dict[str, float]:
+    """What a network takes, of what its footprint says; anything of another form is not known."""
+    footprint = facts.footprint or {}
+    costs = {"Parameters": footprint.get("parameters"), "Multiply-accumulates per tick": footprint.get("macs_tick")}
+    core = str(_table(footprint.get("budget")).get("core", "cortex_m4f"))
+    estimates = footprint.get("estimates")
+    for row in map(_table, estimates if isinstance(estimates, list) else ()):
+        cycles, name = _table(row.get("cycles")).get(core), str(row.get("number_format"))[:20]
+        if isinstance(cycles, list) and len(cycles) == 3:
+            costs[f"Cycles per tick, {name}"] = cycles[1]  # low, typical, high
+        costs[f"Flash, {name} [B]"] = row.get("flash_bytes")
+    return _positive(costs)
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _positive(values: Mapping[str, Any]) -> dict[str, float]:
+    known = {name: value for name, value in values.items() if isinstance(value, int | float) and value is not True}
+    return {name: float(value) for name, value in known.items() if 0 < value < math.inf}
+
+
+def _twin(path: Path, name: str) -> ComparedRun:
+    facts = read_free_runs(path)
+    twin = facts.twin
+    errors: dict[Measure, dict[str, float]] = {}
+    for recording, scores in twin["by_recording"].items():
+        for end in scores["stroke_error"]:
+            _add(errors, end, recording, f"stroke error after {end['at_s']:g} s", float(end["at_s"]))
+        _add(errors, scores["velocity_mae"], recording, "velocity error over the run", float(twin["seconds"]))
+    strokes = twin["by_horizon"]["strokes"]["by_channel"]
+    curves = {output: (twin["by_horizon"]["seconds"], values) for output, values in strokes.items()}
+    history = path / "history.jsonl"
+    return ComparedRun(
+        name=name,
+        folder=path,
+        kind=FREE,
+        label=str(_table(read_object(path / HEADER).get("twin")).get("kind", TWIN)) if _has_header(path) else TWIN,
+        errors=errors,
+        curves=curves,
+        history=read_history(history) if history.is_file() else (),
+        costs=_positive({"Parameters": facts.provenance.get("parameters")}),
+        digest=_digest(facts.provenance),
+    )
+
+
+def _has_header(path: Path) -> bool:
+    return (path / HEADER).is_file()
+
+
+def _add(errors: dict[Measure, dict[str, float]], row: Mapping[str, Any], recording: str, what: str, at: float) -> None:
+    """The errors of one recording: their mean, where the channels share a unit, and each channel's own."""
+    shared = str(row["unit"] or "")
+    values = ({MEAN: row["mean"]} if shared and len(row["by_channel"]) > 1 else {}) | dict(row["by_channel"])
+    for output, value in values.items():
+        if value is not None:
+            unit = str(row.get("units", {}).get(output) or shared)
+            errors.setdefault(Measure(output, at, unit, what), {})[recording] = float(value)
+
+
+def recording_that_differs(first: ComparedRun, second: ComparedRun, names: set[str]) -> str:
+    """A recording of one name that is not the same in two runs, as far as both kept it; empty where there is none."""
+    for name in sorted(names & first.predictions.keys() & second.predictions.keys()):
+        shared = [target for target, _ in first.targets if second.target(target) is not None]
+        parts = []
+        for run in (first, second):
+            columns = [column for target in shared if (place := run.target(target)) for column in place[:1]]
+            parts.append(run.predictions[name][TRUTH][:, columns])
+        if parts[0].shape != parts[1].shape or not np.allclose(parts[0], parts[1], atol=1e-7, equal_nan=True):
+            return name
+    return ""

@@ -1,0 +1,68 @@
+"""What systems do differently when files are opened and locked: POSIX by `fcntl`, Windows by `msvcrt`."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from typing import IO
+
+BINARY = getattr(os, "O_BINARY", 0)
+"""Windows would turn line ends and stop at a Ctrl-Z without it."""
+QUIETLY = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_CLOEXEC", 0)
+"""Opening waits for nothing, becomes nobody's terminal, and is not inherited; Windows has none of these."""
+NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+HELD = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
+"""With what a system says that another process holds a lock; EDEADLK is what Windows gives up with."""
+_FAR = 1 << 30
+"""The byte that Windows locks: its locks also forbid reading, and the holder's name at the start is to be read."""
+
+if sys.platform == "win32":  # pragma: no cover - see tests/security/test_portable.py for the same calls
+    import msvcrt
+
+    def lock(stream: IO[str], wait: bool = False, shared: bool = False) -> None:
+        """Lock an open file for this process; closing it, or the end of the process, frees it."""
+        lock_region(msvcrt, stream, wait)
+else:
+    import fcntl
+
+    def lock(stream: IO[str], wait: bool = False, shared: bool = False) -> None:
+        """Lock an open file for this process; closing it, or the end of the process, frees it.
+
+        Args:
+            stream: of a file that is open for writing, or for reading if `shared`.
+            wait: whether to wait for another holder.
+            shared: with others that ask for the same.
+
+        Raises:
+            OSError: another process holds it (`HELD`), or the file system has no locks.
+        """
+        kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+        fcntl.flock(stream, kind | (0 if wait else fcntl.LOCK_NB))
+
+
+def lock_region(msvcrt_module: object, stream: IO[str], wait: bool) -> None:
+    """The lock of Windows: one byte far behind the content, whose position the stream then leaves again.
+
+    Windows has no shared locks here, so that two processes that only ask who holds a file may meet; the second
+    is then told the last holder. `wait` tries for ten seconds at a time.
+    """
+    handle = stream.fileno()
+    place = os.lseek(handle, 0, os.SEEK_CUR)
+    try:
+        while True:
+            os.lseek(handle, _FAR, os.SEEK_SET)
+            try:
+                msvcrt_module.locking(handle, msvcrt_module.LK_LOCK if wait else msvcrt_module.LK_NBLCK, 1)  # type: ignore[attr-defined]
+            except OSError as error:
+                if wait and error.errno in HELD:
+                    continue
+                raise
+            return
+    finally:
+        os.lseek(handle, place, os.SEEK_SET)
+
+
+def cores() -> int:
+    """Processors that this process may use, which in a container are fewer than those of the machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
