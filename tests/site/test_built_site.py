@@ -50,7 +50,7 @@ def test_links_of_the_built_site_lead_somewhere_and_nothing_is_loaded_from_elsew
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scheme", "width"), [("default", 1280), ("slate", 1280), ("default", 500)])
+@pytest.mark.parametrize(("scheme", "width"), [("default", 1280), ("slate", 1280), ("default", 390)])
 def test_pages_are_accessible_load_nothing_from_elsewhere_and_fit_the_window(site, axe, scheme, width):
     visits = browser.visit(site, pages_of(site), axe, scheme, width)
     assert [visit.page for visit in visits] == pages_of(site)

@@ -6,7 +6,9 @@ The pages are served from this process, which adds a script to each; the script 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
@@ -96,18 +98,20 @@ def visit(
         TimeoutError: pages are missing then; says which is the first.
     """
     queue = _Queue(site, list(pages), axe, scheme)
-    with _served(queue) as address, tempfile.TemporaryDirectory() as profile:
+    with _served(queue) as address, tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         started = [
             str(browser()), "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--mute-audio",
             "--disable-background-networking", "--disable-component-update", "--disable-sync",
             "--disable-dev-shm-usage", f"--user-data-dir={profile}", f"--window-size={width},900",
             f"{address}/{pages[0]}",
         ]  # fmt: skip
-        process = subprocess.Popen(started, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            started, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        )
         try:
             done = queue.done.wait(timeout_s)
         finally:
-            process.terminate()
+            os.killpg(process.pid, signal.SIGTERM)  # with the processes that it started, which write into the profile
             process.wait(30)
     if not done:
         raise TimeoutError(f"the browser did not get beyond {queue.pages[len(queue.visits)]} in {timeout_s:g} s")

@@ -34,5 +34,5 @@ def write_gallery(pages: Path, demo: Path | None) -> None:
             rows.append(f"* [{shown}](gallery/{name}) ({size / 1e6:.1f} MB, `{path.name}`)")
         else:
             rows.append(f"* {shown}: {size / 1e6:.1f} MB, too large to be copied")
-    listed = "\n".join(rows) if rows else "This site was built without them: `make demo`, then `make docs`."
+    listed = "\n".join(rows) if rows else "This site was built without them."
     (pages / "gallery.md").write_text(text.replace("<!-- pages of the demo -->", listed), encoding="utf-8")

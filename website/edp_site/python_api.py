@@ -31,7 +31,7 @@ def python_page() -> str:
 
 def public_names() -> tuple[str, ...]:
     """The names of ``edp.__all__``."""
-    return tuple(edp.__all__)
+    return tuple(vars(edp)["__all__"])
 
 
 def members(cls: type) -> Iterator[tuple[str, Any]]:
@@ -52,7 +52,7 @@ def _entry(name: str, value: Any, depth: int) -> list[str]:
     lines = [f"{'#' * depth} {name}", ""]
     if isinstance(value, ModuleType):
         lines += described(value)
-        for inner in value.__all__:
+        for inner in vars(value)["__all__"]:
             lines += ["", *_entry(f"{name}.{inner}", getattr(value, inner), depth + 1)]
         return lines
     if isinstance(value, str):
@@ -70,7 +70,7 @@ def _entry(name: str, value: Any, depth: int) -> list[str]:
 def _member(name: str, member: Any, depth: int) -> list[str]:
     lines = [f"{'#' * depth} {name}", ""]
     if isinstance(member, property):
-        kind = inspect.signature(member.fget).return_annotation if member.fget else ""  # type: ignore[arg-type]
+        kind = inspect.signature(member.fget).return_annotation if member.fget else ""
         return [*lines, f"Property: `{_type(kind)}`.", "", *described(member)]
     target = member.__func__ if isinstance(member, classmethod | staticmethod) else member
     return lines + _signature(name, target, drop_first=not isinstance(member, staticmethod)) + described(target)
@@ -103,7 +103,7 @@ def _signature(name: str, value: Any, drop_first: bool = False) -> list[str]:
 
 
 def _parameter(parameter: inspect.Parameter) -> str:
-    stars = {parameter.VAR_POSITIONAL: "*", parameter.VAR_KEYWORD: "**"}.get(parameter.kind, "")
+    stars = "*" * ((parameter.kind is parameter.VAR_POSITIONAL) + 2 * (parameter.kind is parameter.VAR_KEYWORD))
     kind = "" if parameter.annotation is parameter.empty else f": {_type(parameter.annotation)}"
     default = "" if parameter.default is parameter.empty else f" = {_default(parameter.default)}"
     return f"{stars}{parameter.name}{kind}{default}"

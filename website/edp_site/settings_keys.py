@@ -78,7 +78,8 @@ def _exists(command: str, key: str) -> bool:
 
 
 def _export_options() -> set[str]:
-    return {entry.name for target in TARGETS.values() if is_dataclass(target) for entry in fields(target)}
+    targets: list[Any] = [target for target in TARGETS.values() if is_dataclass(target)]
+    return {entry.name for target in targets for entry in fields(target)}
 
 
 def _follow(cls: type, path: list[str]) -> bool:
