@@ -12,7 +12,7 @@ INSTALL := pip install --quiet --no-deps
 BENCHMARKS = $(filter-out benchmarks/common.py benchmarks/closed_loop_models.py benchmarks/closed_loop_nmpc.py benchmarks/closed_loop_tuning.py benchmarks/control_step_rival.py benchmarks/decoys.py benchmarks/m22_truth.py benchmarks/onnx_rivals.py benchmarks/score_worlds.py,$(wildcard benchmarks/*.py))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup lock demo check test test-slow lint bench system-packages clean
+.PHONY: help setup lock demo docs check test test-slow lint bench system-packages clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -39,9 +39,23 @@ $(READY): pyproject.toml constraints.txt requirements.lock
 lock: ## write requirements.lock from pyproject.toml and constraints.txt; give the result to a review
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
 		--extra dev --constraint constraints.txt --no-emit-package torch pyproject.toml --output-file requirements.lock
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
+		--group docs --output-file requirements-docs.lock
 
 demo: $(READY) ## the main job, small: simulate, train, judge, write a report page
 	$(BIN)/edp demo --out demo
+
+# The builder has an environment of its own: whoever trains models needs none of it.
+docs: $(READY) .venv-docs/.ready ## the documentation site in site/, offline; with the pages of demo/ where `make demo` made them
+	PYTHONPATH=website$(if $(PYTHONPATH),:$(PYTHONPATH)) $(BIN)/python -m edp_site build/docs --demo demo
+	cd build/docs && ../../.venv-docs/bin/zensical build --clean --strict --config-file mkdocs.yml
+	rm -rf site && mv build/docs/site site
+	PYTHONPATH=website$(if $(PYTHONPATH),:$(PYTHONPATH)) $(BIN)/python -m edp_site.built site
+
+.venv-docs/.ready: requirements-docs.lock
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/python -m $(INSTALL) --require-hashes -r requirements-docs.lock
+	@touch $@
 
 check: lint ## lint, contracts and unit tests that start no process and train for no seconds
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) --no-processes tests/contracts tests/unit
@@ -67,5 +81,5 @@ system-packages: ## packages of the system that only some checks need: chromium 
 		gcc libc6-dev clang libclang-rt-dev cmake cppcheck gcc-mingw-w64-x86-64 wine64 gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 
 clean: ## remove .venv and caches; runs, data and demo stay
-	rm -rf .venv build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-docs build dist site src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +

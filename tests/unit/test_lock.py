@@ -6,11 +6,13 @@ import re
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = SETTINGS["project"]
 BESIDE = "# Of the extra `cluster` alone"
 ADVICE = "call `make lock` and look through what changed"
 
@@ -54,8 +56,18 @@ def test_what_the_project_asks_for_is_locked_in_a_version_that_it_takes():
         assert requirement.specifier.contains(CLUSTER[name]), (name, CLUSTER[name])
 
 
-def test_every_package_of_the_lock_has_hashes():
-    blocks = re.split(r"\n(?=[A-Za-z])", LOCK.strip())
-    assert len(blocks) == len(LOCKED)
+@pytest.mark.parametrize("lock", ["requirements.lock", "requirements-docs.lock"])
+def test_every_package_of_the_lock_has_hashes(lock):
+    text = (ROOT / lock).read_text(encoding="utf-8")
+    blocks = re.split(r"\n(?=[A-Za-z])", text.strip())
+    assert {block.split("==")[0] for block in blocks} == set(pins(text))
     for block in blocks:
         assert re.fullmatch(r"[^\n]+( \\\n    --hash=sha256:[0-9a-f]{64})+", block), block[:200]
+
+
+def test_the_builder_of_the_site_is_locked_in_the_pinned_version_and_is_no_package_of_users():
+    locked = pins((ROOT / "requirements-docs.lock").read_text(encoding="utf-8"))
+    for line in SETTINGS["dependency-groups"]["docs"]:
+        requirement = Requirement(line)
+        assert str(requirement.specifier) == f"=={locked[str(canonicalize_name(requirement.name))]}", ADVICE
+        assert str(canonicalize_name(requirement.name)) not in LOCKED

@@ -1,0 +1,95 @@
+"""The built site: no broken link, nothing from elsewhere, no serious finding of axe-core, usable on a phone.
+
+Slow, and skipped where the builder (`make docs` installs it in .venv-docs) or a browser is not installed.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from edp_site import browser, built, notebooks
+from edp_site.stage import stage
+
+ROOT = Path(__file__).parents[2]
+BUILDER = ROOT / ".venv-docs" / "bin" / "zensical"
+NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
+MOST_BYTES = 100_000
+VISITED = ("index", "tutorial", "howto", "concepts", "faq", "settings", "leaderboard", "reference/commands", "gallery")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    if not BUILDER.exists():
+        pytest.skip("the builder of the site is not installed: `make docs` installs it")
+    out = tmp_path_factory.mktemp("built")
+    stage(out)
+    call = [str(BUILDER), "build", "--clean", "--strict", "--config-file", "mkdocs.yml"]
+    made = subprocess.run(call, cwd=out, capture_output=True, text=True, timeout=240)
+    assert made.returncode == 0, made.stdout + made.stderr
+    return out / "site"
+
+
+def pages_of(site: Path) -> list[str]:
+    return [f"{name}.html" for name in VISITED] + [f"notebooks/{path.stem}.html" for path in NOTEBOOKS[:1]]
+
+
+@pytest.fixture(scope="module")
+def axe() -> Path:
+    found = next((ROOT / ".venv-docs").rglob("axe.min.js"), None)
+    if found is None or browser.browser() is None:
+        pytest.skip("axe-core or Chromium is not installed: `make docs` and `make system-packages` install them")
+    return found
+
+
+@pytest.mark.slow
+def test_links_of_the_built_site_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site):
+    assert built.problems_of(site) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scheme", "width"), [("default", 1280), ("slate", 1280), ("default", 390)])
+def test_pages_are_accessible_load_nothing_from_elsewhere_and_fit_the_window(site, axe, scheme, width):
+    visits = browser.visit(site, pages_of(site), axe, scheme, width)
+    assert [visit.page for visit in visits] == pages_of(site)
+    assert [finding for visit in visits for finding in visit.serious()] == []
+    assert [(visit.page, visit.elsewhere) for visit in visits if visit.elsewhere] == []
+    assert [(visit.page, visit.wide) for visit in visits if visit.wide > 0] == []
+
+
+@pytest.mark.slow
+def test_a_page_that_is_bad_is_told(axe, tmp_path):
+    text = (
+        "<html><head><title>t</title></head><body><img src='a.png'><p style='color:#ccc;background:#fff'>pale</p>"
+        "<script src='http://127.0.0.2:9/none.js'></script><div style='width:3000px'>wide</div></body></html>"
+    )
+    (tmp_path / "bad.html").write_text(text, encoding="utf-8")
+    (visit,) = browser.visit(tmp_path, ["bad.html"], axe)
+    assert {"color-contrast", "html-has-lang", "image-alt"} <= {one["id"] for one in visit.violations}
+    assert visit.serious()
+    assert any("127.0.0.2" in name for name in visit.elsewhere)
+    assert visit.wide > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_and_what_is_kept_of_it_is_small(path, tmp_path):
+    if path.stem == "controller":
+        pytest.importorskip("gymnasium", reason="the notebook of a controller needs the extra `control`")
+    kept = notebooks.read_notebook(path)
+    ran = notebooks.run_notebook(path, tmp_path)
+    assert path.stat().st_size <= MOST_BYTES
+    for cell, again in zip(kept["cells"], ran["cells"], strict=True):
+        if cell["cell_type"] == "code":
+            kinds = [output["output_type"] for output in again["outputs"]]
+            assert [output["output_type"] for output in cell["outputs"]] == kinds
+
+
+def test_there_are_three_notebooks_and_each_was_run():
+    assert [path.stem for path in NOTEBOOKS] == ["controller", "excavator", "own_rig"]
+    for path in NOTEBOOKS:
+        cells = [cell for cell in notebooks.read_notebook(path)["cells"] if cell["cell_type"] == "code"]
+        assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+        assert path.stat().st_size <= MOST_BYTES

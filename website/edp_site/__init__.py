@@ -1,0 +1,1 @@
+"""Pages of the documentation site, from docs/ and from the code, and their checks; runs without the builder."""

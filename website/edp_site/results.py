@@ -1,0 +1,98 @@
+"""The leaderboard: every verdict of benchmarks/results, as the benchmarks left it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+_FIELDS = ("name", "ours", "rival", "ratio", "goal", "met", "unit")
+
+
+def results_page(folder: Path) -> str:
+    """A table a benchmark, with its command and date; no figure is typed by hand.
+
+    Args:
+        folder: of the JSON files that benchmarks write.
+
+    Raises:
+        ValueError: a file lacks what every result has.
+    """
+    files = sorted(folder.glob("*.json"))
+    results = [(path, _checked(path)) for path in files]
+    verdicts = [verdict for _, result in results for verdict in result["verdicts"]]
+    met = sum(verdict["met"] for verdict in verdicts)
+    lines = [
+        "# Leaderboard",
+        "",
+        "Made from the files that the benchmarks wrote (`benchmarks/results`). A row is one question: our figure, that "
+        "of a rival measured in the same run, their ratio, and the goal that the ratio was to keep. Goals that were "
+        "missed stay in the table. [Results](results.md) tell what was compared, on which data, and what it does not "
+        "show.",
+        "",
+        f"{len(files)} files, {len(verdicts)} questions, {met} goals met, {len(verdicts) - met} missed. Files of one "
+        "benchmark with other arguments repeat questions, so the count is no score.",
+        "",
+        "| Benchmark | Questions | Met | Date |",
+        "|---|---:|---:|---|",
+    ]
+    for path, result in results:
+        given = result["verdicts"]
+        lines.append(
+            f"| [{path.stem}](#{path.stem}) | {len(given)} | {sum(one['met'] for one in given)} | {result['date']} |"
+        )
+    for path, result in results:
+        lines += [
+            "",
+            f"## {path.stem}",
+            "",
+            "```sh",
+            _command(result),
+            "```",
+            "",
+            f"{result['date']}, seed {result['seed']}.",
+            "",
+        ]
+        lines += _table(result["verdicts"])
+    return "\n".join(lines) + "\n"
+
+
+def _checked(path: Path) -> Mapping[str, Any]:
+    result = json.loads(path.read_text(encoding="utf-8"))
+    for key in ("command", "date", "seed", "verdicts"):
+        if key not in result:
+            raise ValueError(f"{path.name} has no '{key}'; run its benchmark again")
+    for verdict in result["verdicts"]:
+        if missing := [key for key in _FIELDS if key not in verdict]:
+            raise ValueError(f"{path.name}: a verdict has no {missing}; run its benchmark again")
+    return result  # type: ignore[no-any-return]
+
+
+def _command(result: Mapping[str, Any]) -> str:
+    """The command without folders of the machine that ran it."""
+    words = [word if not word.startswith("/") else "DATA" for word in str(result["command"]).split()]
+    return "python benchmarks/" + " ".join(words).replace("|", "\\|")
+
+
+def _table(verdicts: list[Mapping[str, Any]]) -> list[str]:
+    if not verdicts:
+        return ["No goal was set; the file holds the figures."]
+    rows = ["| Question | Ours | Rival | Unit | Ratio | Goal | Outcome |", "|---|---:|---:|---|---:|---|---|"]
+    for one in verdicts:
+        unit = "" if one["unit"] == "1" else one["unit"]
+        name = str(one["name"]).replace("|", "\\|")
+        rows.append(
+            f"| {name} | {figure(one['ours'])} | {figure(one['rival'])} | {unit} "
+            f"| {figure(one['ratio'])} | {one['goal']} | {'met' if one['met'] else '**missed**'} |"
+        )
+    return rows
+
+
+def figure(value: float | None) -> str:
+    """A number with four digits, large ones in groups of three."""
+    if value is None:
+        return ""
+    if abs(value) >= 10_000:
+        return f"{value:,.0f}"
+    return f"{value:.4g}"
