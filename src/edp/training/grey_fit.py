@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.errors import DataError
+from edp.networks.twin.grey.fit_spec import GreyFitSpec
+from edp.networks.twin.grey.numbers import coarse_by_fine
+from edp.networks.twin.grey.plausible import STRETCHES
 from edp.networks.twin.greybox import GreyTwin, RunTarget
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FreeRunProgress, FreeRunValidation
@@ -29,6 +32,10 @@ FARTHEST = 1.5
 """Plausible deviations that one step may move a number: beyond it a linear model says nothing."""
 APART = 0.3
 """Spread of the further starts in plausible deviations: far enough for another valley, near enough to be simulated."""
+FINER_STAGES = 2
+"""Last stages that are fitted again with finer opening curves: short runs brought the coarse ones near enough."""
+LEAST_GAIN = 0.01
+"""Share of the validation error by which finer curves must be better."""
 TRIES = 4
 """Steps, each damped more, after which a round gives up and draws other stretches."""
 
@@ -54,6 +61,7 @@ class GreyFit:
         information: of the coordinates in which it was fitted: inverse covariance by the data that the last rounds
             saw, without what was thought plausible before ``(number, number)``.
         theta: where the fit ended in these coordinates, each in plausible deviations.
+        error: of the free runs of the validation part, see `FreeRunValidation.error`.
     """
 
     twin: GreyTwin
@@ -61,6 +69,7 @@ class GreyFit:
     seconds: float
     information: Doubles
     theta: Doubles
+    error: float
 
 
 class Tie(Protocol):
@@ -91,10 +100,20 @@ class GreyProblem:
         twin: the grey box.
         train: training stretches.
         tie: other coordinates than one of each number.
+        fit: settings in place of the twin's own.
+        known: information of the coordinates from fits before.
     """
 
-    def __init__(self, twin: GreyTwin, train: Sequence[Series], tie: Tie | None = None) -> None:
-        stroke_weight, delta = twin.spec.fit.stroke_weight, twin.spec.fit.delta
+    def __init__(
+        self,
+        twin: GreyTwin,
+        train: Sequence[Series],
+        tie: Tie | None = None,
+        fit: GreyFitSpec | None = None,
+        known: Doubles | None = None,
+    ) -> None:
+        self.fit = fit or twin.spec.fit
+        stroke_weight, delta = self.fit.stroke_weight, self.fit.delta
         self.twin, self.tie, self.delta = twin, tie, delta / FINEST
         # Coordinates begin at the start of the twin, which knows more than the nominal numbers.
         self.begin = twin.numbers.copy()
@@ -105,6 +124,7 @@ class GreyProblem:
         self.series = [part for part in train if part.samples > twin.prefix_ticks + 2]
         self.plausible = np.where(twin.table.positive, twin.table.width, 1.0)
         self.first = np.zeros(len(self.begin)) if tie is None else tie.begin
+        self.known = np.zeros((len(self.first),) * 2) if known is None else known
 
     def draw(self, ticks: int, lanes: int, rng: np.random.Generator) -> GreyRound:
         """Stretches with starts everywhere."""
@@ -173,6 +193,27 @@ def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple
     return matrix, gradient
 
 
+@dataclass(eq=False)
+class _Progress:
+    """Of all rounds of a fit: told after each one."""
+
+    total: int
+    on_event: Callable[[FreeRunProgress], None] | None
+    began: float = field(default_factory=time.process_time)
+    done: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Processor time so far."""
+        return time.process_time() - self.began
+
+    def tell(self, length_s: float, error: float, better: bool) -> None:
+        """A validation of the last round."""
+        if self.on_event is not None:
+            left = self.seconds * (self.total - self.done) / self.done
+            self.on_event(FreeRunProgress(self.done, self.total, length_s, left, error, better))
+
+
 @one_blas_thread()
 def fit_grey_box(
     twin: GreyTwin,
@@ -183,6 +224,9 @@ def fit_grey_box(
     tie: Tie | None = None,
 ) -> GreyFit:
     """Fit the numbers of a grey box to free runs; free runs of the validation part choose among the rounds.
+
+    Where the settings leave the stretches of opening curves open, the fewest are fitted first. Then each one is halved,
+    which changes no curve, and the last stages are fitted once more: as often as the validation part gains by it.
 
     Args:
         twin: with the numbers to start from.
@@ -195,18 +239,37 @@ def fit_grey_box(
     Raises:
         DataError: stretches that are too short.
     """
-    spec, began = twin.spec.fit, time.process_time()
-    problem = GreyProblem(twin, train, tie)
+    fit, parts, first = twin.spec.fit, (train, validation), twin.spec.fit.rounds[0]
+    finer = replace(fit, lengths_s=fit.lengths_s[-FINER_STAGES:], rounds=fit.rounds[-FINER_STAGES:], starts=1)
+    choose = tie is None and not twin.spec.stretches
+    progress = _Progress(sum(fit.rounds) + (fit.starts - 1) * first, on_event)
+    begun = twin.with_stretches(STRETCHES[0]) if choose else twin
+    best = _fitted(GreyProblem(begun, train, tie), parts, seed, progress)
+    for stretches in STRETCHES[1:] if choose else ():
+        progress.total += sum(finer.rounds)
+        begun = best.twin.with_stretches(stretches)
+        by_finer = coarse_by_fine(best.twin.table, begun.table)
+        problem = GreyProblem(begun, train, fit=finer, known=by_finer.T @ best.information @ by_finer)
+        tried = _fitted(problem, parts, seed + stretches, progress)
+        history, better = best.history + tried.history, tried.error < (1.0 - LEAST_GAIN) * best.error
+        best = replace(tried if better else best, history=history, seconds=progress.seconds)
+        if not better:
+            break
+    return best
+
+
+def _fitted(
+    problem: GreyProblem, parts: tuple[Sequence[Series], Sequence[Series]], seed: int, progress: _Progress
+) -> GreyFit:
+    """The numbers of one form; `parts` train and choose."""
+    twin, spec, (_, validation) = problem.twin, problem.fit, parts
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
     rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
-    total = len(rounds) + (spec.starts - 1) * spec.rounds[0]
     history: list[dict[str, Any]] = []
-    done = 0
 
     def advance(path: _Path, lengths: Sequence[float]) -> None:
-        nonlocal done
         for number, length_s in enumerate(lengths, 1):
-            done += 1
+            progress.done += 1
             before = path.theta
             path.step(length_s)
             # The last round of a stage is judged, whatever its number.
@@ -214,13 +277,11 @@ def fit_grey_box(
                 continue
             judge.twin = twin.with_numbers(problem.numbers(path.theta))
             better = path.judge(judge.error()) and path.least <= min(other.least for other in paths)
-            seconds = time.process_time() - began
             moved = float(np.sqrt(np.mean((path.theta - before) ** 2)))
-            row = {"update": done, "start": path.number, "length_s": length_s, "validation": path.error, "best": better}
-            history.append(row | {"moved": moved, "damping": path.damping, "seconds": round(seconds, 2)})
-            if on_event is not None:
-                left = seconds * (total - done) / done
-                on_event(FreeRunProgress(done, total, length_s, left, path.error, better))
+            row = {"update": progress.done, "start": path.number, "length_s": length_s, "validation": path.error}
+            row |= {"stretches": twin.table.stretches, "best": better, "moved": moved, "damping": path.damping}
+            history.append(row | {"seconds": round(progress.seconds, 2)})
+            progress.tell(length_s, path.error, better)
 
     paths = [_Path(problem, number, seed) for number in range(spec.starts)]
     for path in paths:
@@ -229,7 +290,7 @@ def fit_grey_box(
     chosen = min(paths, key=lambda path: path.least)
     advance(chosen, rounds[spec.rounds[0] :])
     final = twin.with_numbers(problem.numbers(chosen.best))
-    return GreyFit(final, history, time.process_time() - began, chosen.information, chosen.best)
+    return GreyFit(final, history, progress.seconds, chosen.information, chosen.best, chosen.least)
 
 
 class _Path:
@@ -249,18 +310,19 @@ class _Path:
         self.theta = problem.first + (APART * self.rng.normal(size=size) if number else 0.0)
         self.best, self.least, self.error = self.theta, np.inf, np.inf
         self.damping, self.matrix = 1.0, np.zeros((size, size))
-        self.memory, self.information = np.zeros((size, size)), np.zeros((size, size))
+        self.memory, self.information = problem.fit.memory * problem.known, np.zeros((size, size))
 
     def step(self, length_s: float) -> None:
         """One round on free runs of a length."""
-        spec = self.problem.twin.spec.fit
+        spec = self.problem.fit
         ticks = max(1, round(length_s * self.problem.twin.channels.rate_hz))
         drawn = self.problem.draw(ticks, max(8, min(spec.lanes, spec.ticks // ticks)), self.rng)
         self.theta, self.damping, self.matrix = _improve(
             self.problem, self.theta, drawn, self.damping, spec.steps, self.memory
         )
         # The first stage begins far away, where a linear model says little about the end.
-        self.memory = spec.memory * (self.memory + self.matrix) if length_s != spec.lengths_s[0] else self.memory
+        near = length_s != spec.lengths_s[0] or self.problem.known.any()
+        self.memory = spec.memory * (self.memory + self.matrix) if near else self.memory
 
     def judge(self, error: float) -> bool:
         """Take in a validation error of where it stands; whether it is the least so far."""
