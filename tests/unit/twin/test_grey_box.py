@@ -1,5 +1,6 @@
 """Grey boxes: exact tangents, physics that must hold, elements that must connect, numbers that a fit finds again."""
 
+import json
 from dataclasses import replace
 from itertools import product
 
@@ -19,7 +20,9 @@ from edp.networks.twin.grey.plausible import Travel
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators
+from edp.training.bundle import HASH, header_digest
 from edp.training.grey_fit import fit_grey_box
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 PREFIX = 30
 
@@ -202,6 +205,25 @@ def test_a_curve_that_gains_nothing_stays_coarse(bench):
     result = fit_grey_box(begun, runs[:2], runs[2:3], seed=0)
     assert result.twin.spec.stretches == 5
     assert {row["stretches"] for row in result.history} == {5, 10}
+
+
+def test_a_bundle_that_names_no_stretches_has_five(bench, tmp_path):
+    machine, _ = bench
+    save_twin(TwinBundle(BENCH, machine), tmp_path / "old")
+    path = tmp_path / "old" / "twin.json"
+    header = json.loads(path.read_text())
+    # As bundles were written before: the key is not there.
+    assert header["twin"].pop("stretches") == 5
+    del header[HASH]
+    path.write_text(json.dumps(header | {HASH: header_digest(header)}))
+    old = load_twin(tmp_path / "old").twin
+    assert old.table.stretches == 5
+    np.testing.assert_array_equal(old.numbers, machine.numbers)
+    finer = machine.with_stretches(20)
+    save_twin(TwinBundle(finer.spec, finer), tmp_path / "new")
+    again = load_twin(tmp_path / "new").twin
+    assert again.spec.stretches == again.table.stretches == 20
+    np.testing.assert_array_equal(again.numbers, finer.numbers.astype(np.float32))
 
 
 def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
