@@ -46,7 +46,16 @@ BENCH = GreyBox(
     potential_degree=2,
     stretches=5,
     prefix_ticks=PREFIX,
-    fit=GreyFitSpec(lengths_s=(0.1, 0.4), rounds=(3, 2), lanes=24, ticks=600, validation_s=2.0, validation_runs=4),
+    fit=GreyFitSpec(
+        lengths_s=(0.1, 0.4),
+        rounds=(3, 2),
+        final_rounds=6,
+        lanes=24,
+        ticks=600,
+        final_ticks=600,
+        validation_s=2.0,
+        validation_runs=4,
+    ),
 )
 
 
@@ -201,8 +210,13 @@ def test_a_curve_that_gains_nothing_stays_coarse(bench):
     arrays = {"numbers": machine.numbers.astype(np.float32), "full": machine.full}
     fit = replace(BENCH.fit, lengths_s=(0.1,), rounds=(1,), starts=1)
     begun = replace(BENCH, stretches=0, fit=fit).build(machine.channels, machine.scales, arrays)
-    # It begins at the truth, whose curves are of five stretches: nothing is left to gain.
-    result = fit_grey_box(begun, runs[:2], runs[2:3], seed=0)
+    # It begins at the truth, whose curves are of five stretches: noise of the sensors is all that is left to fit.
+    rng, width = np.random.default_rng(5), machine.scales.answer_width
+    noisy = [
+        Series(s.name, s.inputs, (s.targets + 0.05 * width * rng.normal(size=s.targets.shape)).astype(np.float32))
+        for s in runs
+    ]
+    result = fit_grey_box(begun, noisy[:2], noisy[2:3], seed=0)
     assert result.twin.spec.stretches == 5
     assert {row["stretches"] for row in result.history} == {5, 10}
 
