@@ -51,9 +51,9 @@ class GreyFitSpec:
     starts: int = 3
     steps: int = 3
     lanes: int = 512
-    ticks: int = 40_000
+    ticks: int = 12_000
     memory: float = 0.5
-    final_rounds: int = 40
+    final_rounds: int = 24
     final_ticks: int = 15_000
     final_memory: float = 0.9
     stroke_weight: float = 5.0
