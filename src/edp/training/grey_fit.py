@@ -97,11 +97,11 @@ class GreyProblem:
         twin: the grey box.
         train: training stretches, of `ticks` together.
         tie: other coordinates than one of each number.
-        known: information of the coordinates from a fit before, whose end is the start: only final rounds are left.
+        carried: information of the coordinates from a fit before, whose end is the start: only final rounds are left.
     """
 
     def __init__(
-        self, twin: GreyTwin, train: Sequence[Series], tie: Tie | None = None, known: Doubles | None = None
+        self, twin: GreyTwin, train: Sequence[Series], tie: Tie | None = None, carried: Doubles | None = None
     ) -> None:
         stroke_weight, delta = twin.spec.fit.stroke_weight, twin.spec.fit.delta
         self.twin, self.tie, self.delta = twin, tie, delta / FINEST
@@ -115,7 +115,7 @@ class GreyProblem:
         self.ticks = max(1, sum(part.samples for part in self.series))
         self.plausible = np.where(twin.table.positive, twin.table.width, 1.0)
         self.first = np.zeros(len(self.begin)) if tie is None else tie.begin
-        self.known = known
+        self.carried = carried
 
     def draw(self, ticks: int, lanes: int, rng: np.random.Generator) -> GreyRound:
         """Stretches with starts everywhere."""
@@ -239,7 +239,7 @@ def fit_grey_box(
         progress.total += fit.final_rounds
         begun = best.twin.with_stretches(stretches)
         by_finer = coarse_by_fine(best.twin.table, begun.table)
-        problem = GreyProblem(begun, train, known=by_finer.T @ best.information @ by_finer)
+        problem = GreyProblem(begun, train, carried=by_finer.T @ best.information @ by_finer)
         tried = _fitted(problem, parts, seed + stretches, progress)
         history, better = best.history + tried.history, tried.error < (1.0 - LEAST_GAIN) * best.error
         best = replace(tried if better else best, history=history, seconds=progress.seconds)
@@ -273,9 +273,9 @@ def _fitted(
             history.append(row | {"seconds": round(progress.seconds, 2)})
             progress.tell(length_s, path.error, better)
 
-    paths = [_Path(problem, number, seed) for number in range(spec.starts if problem.known is None else 1)]
+    paths = [_Path(problem, number, seed) for number in range(spec.starts if problem.carried is None else 1)]
     chosen = paths[0]
-    if problem.known is None:
+    if problem.carried is None:
         for path in paths:
             advance(path, rounds[: spec.rounds[0]])
         # Which valley a start lies in shows after short runs; long ones of every start would cost as much again.
@@ -304,7 +304,7 @@ class _Path:
         self.best, self.least, self.error = self.theta, np.inf, np.inf
         self.damping, self.matrix = 1.0, np.zeros((size, size))
         self.information = np.zeros((size, size))
-        self.memory = np.zeros((size, size)) if problem.known is None else problem.known
+        self.memory = np.zeros((size, size)) if problem.carried is None else problem.carried
 
     def step(self, length_s: float, final: bool = False) -> None:
         """One round on free runs of a length."""

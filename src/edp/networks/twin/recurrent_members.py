@@ -65,8 +65,8 @@ def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz:
     if sum(_visits(one, round(APART_S * rate_hz)) for one in there) >= VISITS:
         return True
     longest = round(PUSHED_S * rate_hz)
-    held = (one & (push[: len(one)] >= PUSHED) for one, push in zip(there, pushes, strict=False))
-    return any(_longest(one) >= longest for one in held)
+    stays = (one & (push[: len(one)] >= PUSHED) for one, push in zip(there, pushes, strict=False))
+    return any(_longest(one) >= longest for one in stays)
 
 
 def _longest(there: np.ndarray) -> int:
