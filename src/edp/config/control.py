@@ -65,7 +65,7 @@ def load_control_experiment(
     Raises:
         ConfigError: names every unknown key, wrong type and impossible value at once.
     """
-    return CONTROL_SETTINGS.load(ControlExperiment, path, [options or {}, *overrides], "of closed loops")
+    return CONTROL_SETTINGS.load(ControlExperiment, path, overrides, "of closed loops", options)
 
 
 def control_toml(experiment: ControlExperiment) -> str:

@@ -124,7 +124,7 @@ def load_monitor_experiment(
     Raises:
         ConfigError: names every unknown key, wrong type and impossible value at once.
     """
-    return MONITOR_SETTINGS.load(MonitorExperiment, path, [options or {}, *overrides], "of a monitor")
+    return MONITOR_SETTINGS.load(MonitorExperiment, path, overrides, "of a monitor", options)
 
 
 def monitor_toml(experiment: MonitorExperiment) -> str:

@@ -65,12 +65,17 @@ def parse_toml(text: str, where: str) -> Table:
 
 
 def merged(base: Table, change: Mapping[str, Any]) -> Table:
-    """`base` with `change` laid over it; a table of another kind replaces the old one whole."""
+    """`base` with `change` laid over it; a table of another kind replaces the old one whole.
+
+    A table that names no kind has options of whichever kind is named later.
+    """
     result = dict(base)
     for key, value in change.items():
         old = result.get(key)
         same = (
-            isinstance(old, dict) and isinstance(value, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and ("kind" not in old or value.get("kind", old["kind"]) == old["kind"])
         )
         result[key] = merged(old, value) if same and isinstance(old, dict) else value
     return result
@@ -94,6 +99,17 @@ def override(change: Change) -> Table:
     except ConfigError:
         # Words need no quotes on a command line, where a shell would take them away.
         return parse_toml(f'{key.strip()} = "{value.strip()}"', where)
+
+
+def combined(changes: Sequence[Table]) -> Table:
+    """All changes as one, before they are laid over settings: a kind and its options may be given in any order.
+
+    Laid one by one, a kind that came last would take the options with it that came before.
+    """
+    table: Table = {}
+    for change in changes:
+        table = merged(table, change)
+    return table
 
 
 class SettingsTree:
@@ -164,26 +180,27 @@ class SettingsTree:
         self,
         cls: type[T],
         path: str | Path | None,
-        changes: Sequence[Mapping[str, Any] | str] = (),
-        of: str = "of the defaults",
+        overrides: Sequence[str],
+        of: str,
+        options: Table | None = None,
     ) -> T:
-        """A spec tree from a settings file that changes are laid over, in their order.
+        """A spec tree from a settings file, changed by options of a command, then by overrides.
 
         Args:
             cls: dataclass of the tree's root.
             path: settings file; None takes the defaults.
-            changes: each ``key.path=value``, or a table of plain values.
+            overrides: each ``key.path=value``, in any order.
             of: how messages call the settings where there is no file.
+            options: plain values by key.
 
         Raises:
             ConfigError: names every unknown key, wrong type and impossible value at once.
         """
         table: Table = {} if path is None else read_toml(path)
-        for change in changes:
-            table = merged(table, override(change))
+        table = merged(table, options or {})
+        table = merged(table, combined([override(text) for text in overrides]))
         where = of if path is None else f"'{path}'"
-        overridden = any(isinstance(change, str) for change in changes)
-        return self.build(cls, table, where + (" with --set" if overridden else ""))
+        return self.build(cls, table, where + (" with --set" if overrides else ""))
 
     def _build(
         self, cls: type, table: Any, path: str, problems: list[str], beside: Mapping[str, type] | None = None
