@@ -175,6 +175,8 @@ def importance_table(importances: ChannelImportances) -> None:
 
 def score_table(scores: dict[str, Any]) -> None:
     """Print a table a horizon: every model's mean scores, best first."""
+    from edp.evaluation.guard import MEASURE, MEASURE_NAME
+
     rate = scores["task"]["rate_hz"]
     units = {target["unit"] for target in scores["targets"]}
     unit = units.pop() if len(units) == 1 else "mixed units"
@@ -187,11 +189,11 @@ def score_table(scores: dict[str, Any]) -> None:
         for model in scores["models"].values():
             s = model["overall"][str(horizon)]["mean"]
             r2 = "-" if s["r2"] is None else f"{s['r2']:.4f}"
-            figures = [f"{s[key]:.4g}" for key in ("mae", "rmse", "p95", "p99", "composite")]
-            rows.append((s["mae"], [model["label"], *figures, r2]))
+            figures = [f"{s[key]:.4g}" for key in (MEASURE, "mae", "p95", "p99", "composite")]
+            rows.append((s[MEASURE], [model["label"], *figures, r2]))
         rows.sort(key=lambda row: row[0])
         ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
-        heads = ["model", "MAE", "RMSE", "P95", "P99", "composite", "R2"]
+        heads = ["model", MEASURE_NAME, "MAE", "P95", "P99", "composite", "R2"]
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
     interval_rows(scores, unit)
     for name, model in scores["models"].items():
@@ -201,16 +203,18 @@ def score_table(scores: dict[str, Any]) -> None:
 
 def _tables_by_output(scores: dict[str, Any], rate: float) -> None:
     """Print a table a horizon with a column an output: numbers in different units, or in none, have no mean."""
+    from edp.evaluation.guard import MEASURE, MEASURE_NAME
+
     targets = scores["targets"]
     heads = ["model", *(f"{t['name']}{'' if t['unit'] == '1' else ', ' + t['unit']}" for t in targets)]
     for horizon in scores["task"]["horizons"]:
         errors = {
-            model["label"]: [model["overall"][str(horizon)][t["name"]]["mae"] for t in targets]
+            model["label"]: [model["overall"][str(horizon)][t["name"]][MEASURE] for t in targets]
             for model in scores["models"].values()
         }
         ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
         rows = [[label, *(f"{value:.4g}" for value in values)] for label, values in errors.items()]
-        table(f"{ahead}, MAE of each output", heads, rows)
+        table(f"{ahead}, {MEASURE_NAME} of each output", heads, rows)
     for name, model in scores["models"].items():
         for target, integral_scores in model.get("integrated", {}).items():
             out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g}")

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edp.data.splits import kind_of_name
-from edp.evaluation.guard import NETWORK, lost_outputs
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
 from edp.report.common.wording import listed, number, percent
 
 SHOWN = 4
@@ -21,7 +21,7 @@ def losses_line(scores: Mapping[str, Any]) -> str:
     losses = lost_outputs(scores)
     if not losses:
         return ""
-    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less RMSE)" for loss in losses[:SHOWN]]
+    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less {MEASURE_NAME})" for loss in losses[:SHOWN]]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
     return (
         f"The network loses to a baseline on {len(losses)} of {len(scores['targets'])} outputs: {listed(parts)}{more}."
@@ -62,11 +62,11 @@ def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[s
     parts = []
     for name, description, unit in targets[:SHOWN]:
         errors = {
-            str(model["label"]): model["overall"].get(str(horizon), {}).get(name, {}).get("mae")
+            str(model["label"]): model["overall"].get(str(horizon), {}).get(name, {}).get(MEASURE)
             for key, model in scores["models"].items()
             if key != NETWORK
         }
-        ours = scores["models"][NETWORK]["overall"].get(str(horizon), {}).get(name, {}).get("mae")
+        ours = scores["models"][NETWORK]["overall"].get(str(horizon), {}).get(name, {}).get(MEASURE)
         if ours is None:
             continue
         finite = {label: error for label, error in errors.items() if error is not None and math.isfinite(error)}
@@ -75,7 +75,7 @@ def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[s
         of_unit = "" if unit in ("", "1") else f" {unit}"
         parts.append(f"{number(ours, _places(ours))}{of_unit} in {description[:1].lower()}{description[1:]}{beside}")
     more = f"; {len(targets) - SHOWN} more outputs below" if len(targets) > SHOWN else ""
-    return f"At {ahead} ahead the network is off by {', '.join(parts)} on average{more}."
+    return f"At {ahead} ahead the network is off by ({MEASURE_NAME}) {', '.join(parts)}{more}."
 
 
 def _places(value: float) -> int:
