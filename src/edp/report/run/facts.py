@@ -350,5 +350,6 @@ def spread_text(facts: Facts) -> str:
     text = {key: number(spread[key], places) for key in ("median", "q25", "q75", "min", "max")}
     return (
         f"Over the test recordings the network's mean absolute error has a median of {text['median']} {facts.unit}; "
-        f"half of them lie between {text['q25']} and {text['q75']}, the best at {text['min']} and the worst at {text['max']}."
+        f"half of them lie between {text['q25']} and {text['q75']}, the best at {text['min']} and the worst at "
+        f"{text['max']}."
     )
