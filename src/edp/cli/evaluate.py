@@ -58,12 +58,15 @@ def evaluate(
         raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
     names = None if baselines is None else baseline_names(baselines)
     from edp.evaluation.guard import beaten_by
-    from edp.report.run.outputs import judged_line, losses_line
+    from edp.report.run.choice import promise_line, read_choice
+    from edp.report.run.outputs import judged_line, losses_line, situation_line
     from edp.storage.runs import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json)
     beaten = beaten_by(scores)
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
+    choice = read_choice(run) if source is None else None
+    beyond, promise = situation_line(scores), "" if choice is None else promise_line(choice)
     importances = run_importance(run, source, as_json) if channel_importance else None
 
     def show() -> None:
@@ -72,14 +75,16 @@ def evaluate(
         if lost:
             out.print(lost, style="bold red")
         score_table(scores)
-        out.print(judged)
+        for line in (promise, beyond, judged):
+            if line:
+                out.print(line)
         out.print(f"scores in {folder / 'scores.json'}")
         if importances is not None:
             importance_table(importances)
             out.print(f"importance of the channels in {folder / 'channel_importance.json'}")
         out.print(f"next: edp report {folder}")
 
-    sentences = {"losses": lost, "tests": judged}
+    sentences = {"losses": lost, "tests": judged, "promise": promise, "situation_line": beyond}
     facts = {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **sentences, **scores}
     importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
     emit(as_json, facts | importance_json, show)

@@ -15,6 +15,7 @@ from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
+from edp.evaluation.situation import situation_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_intervals, stream_predictions
 from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
@@ -116,7 +117,8 @@ def judge(
     if coverages:
         say("intervals")
         models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
-    return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
+    found = ruler.header() | {"models": models, "situation": situation_of(data)}
+    return Evaluation(found, predictions, data.test)
 
 
 def _on_validation(predictions: dict[str, Predictions], data: Prepared, skip: int) -> dict[str, Any]:

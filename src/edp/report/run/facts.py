@@ -15,7 +15,7 @@ from edp.errors import DataError, StorageError
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, beaten_by
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
-from edp.report.run.outputs import by_output, judged_line, losses_line
+from edp.report.run.outputs import by_output, judged_line, losses_line, situation_line
 from edp.report.run.predictability import limit_line, read_limit
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
 
@@ -311,8 +311,9 @@ def verdict_lines(facts: Facts) -> list[str]:
         if both:
             lines.append(f"It is the better of the two on {won} of {both} test recordings.")
     judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
+    beyond = situation_line(facts.scores) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))
-    lines += [line for line in (judged, limit) if line]
+    lines += [line for line in (judged, beyond, limit) if line]
     checks = (facts.footprint or {}).get("verdict", [])
     if checks:
         over = [str(check["what"]) for check in checks if not check["fits"]]

@@ -12,6 +12,8 @@ from edp.report.common.wording import listed, number, percent
 
 SHOWN = 4
 """Outputs or logs that a sentence names."""
+NOTED = 2.0
+"""Times that changes differ from those in training before the ratio is what is said of them."""
 FEW = 3
 """Test logs below which one odd log decides the figure."""
 
@@ -48,6 +50,33 @@ def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None)
     elif len(kinds) == 1 and others and "" not in kinds:
         line += f" All are of one kind; the figure says nothing of {listed(sorted(others)[:SHOWN])}."
     return line
+
+
+def situation_line(scores: Mapping[str, Any]) -> str:
+    """Where the judged recordings are another situation than the training; empty where they are not."""
+    found = scores.get("situation") or {"outside": (), "changes": ()}
+    most = sorted(found["changes"], key=lambda row: abs(math.log(row["ratio"])))
+    changes = {row["target"]: row for row in most}  # of each target the horizon that differs most
+    parts = [
+        f"{row['channel']} is outside of its range in training in {percent(row['share'])} of the ticks"
+        for row in found["outside"]
+    ]
+    parts += [_changed(row) for row in changes.values()]
+    if not parts:
+        return ""
+    more = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
+    return (
+        f"The test recordings go beyond the training: {'; '.join(parts[:SHOWN])}{more}. What left-out data of the "
+        "training promise may not hold there: record more like it, and train on it."
+    )
+
+
+def _changed(row: Mapping[str, Any]) -> str:
+    """A target that changes otherwise than in training, in words."""
+    ahead = f"{row['target']} in {row['horizon']} tick{'s' if row['horizon'] > 1 else ''}"
+    if 1 / NOTED <= row["ratio"] <= NOTED:
+        return f"{percent(row['beyond'])} of the changes of {ahead} are larger than any in training"
+    return f"changes of {ahead} are {row['ratio']:.2g} times as large as in training"
 
 
 def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[str, str, str]], ahead: str) -> str:
