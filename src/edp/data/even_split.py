@@ -13,8 +13,8 @@ from edp.recording import Recording
 
 LEAST_OF_SHARE = 0.25
 """Of what the share of a part stands for: of 300 s and 4 s a draw of whole recordings let the 4 s train."""
-MOVES = 0.1
-"""Of the root-mean-square change of a channel, from which a tick counts as motion."""
+MOVES = 0.5
+"""Of the root-mean-square change of a channel, from which a tick counts as motion: steps of an encoder are less."""
 BLOCKS, LEAST_GAPS = 15, 8
 """Blocks of a recording, three of which test, and gaps that one is long at least."""
 EVERY = 5

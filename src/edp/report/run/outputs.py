@@ -66,7 +66,7 @@ def situation_line(scores: Mapping[str, Any]) -> str:
         return ""
     more = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
     return (
-        f"The test recordings go beyond the training: {'; '.join(parts[:SHOWN])}{more}. What left-out data of the "
+        f"The test recordings differ from the training: {'; '.join(parts[:SHOWN])}{more}. What left-out data of the "
         "training promise may not hold there: record more like it, and train on it."
     )
 
