@@ -73,7 +73,7 @@ def content(test=1.1, floor=2.0):
         "key": "k", "sentence": "s", "minutes": 1.0, "chosen": "committee", "excess": {"committee": 0.0},
         "candidates": {"committee": {"label": "c", "parameters": 3, "seconds": 1.0, "promise": errors(1.0)}},
         "persistence": errors(3.0), "interval": {"low": errors(0.8), "high": errors(1.2)}, "skill": skill,
-        "divided": "",
+        "notes": [],
     }  # fmt: skip
 
 
@@ -101,7 +101,8 @@ def test_what_became_of_a_promise_is_said(tmp_path):
         {"interval": {"low": errors(1.0)}},
         {"skill": {"against": "x"}},
         {"skill": []},
-        {"divided": 3},
+        {"notes": 3},
+        {"notes": [3]},
         {"interval": {"low": {"1": {"v": "a"}}, "high": errors(1.0)}},
     ],
 )
@@ -112,7 +113,7 @@ def test_damaged_promises_are_refused(tmp_path, change):
 
 
 def test_runs_of_earlier_versions_have_no_interval(tmp_path):
-    old = {key: value for key, value in content().items() if key not in ("interval", "skill", "divided")}
+    old = {key: value for key, value in content().items() if key not in ("interval", "skill", "notes")}
     (tmp_path / "auto.json").write_text(json.dumps(old))
     note_test_result(tmp_path, scores(1.1))
     assert promise_line(read_choice(tmp_path)) == ""

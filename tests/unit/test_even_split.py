@@ -42,7 +42,7 @@ def test_steps_of_an_encoder_are_no_motion():
 
 def test_a_recording_that_rests_at_its_end_is_divided_by_blocks():
     log = recording("a", RESTS_AT_ITS_END)
-    divided, words = divide([log], settings())
+    divided, (words,) = divide([log], settings())
     assert isinstance(divided.split, ByBlocks)
     assert "rests" in words
     assert f"{divided.split.block_s:.3g} s" in words
@@ -56,19 +56,19 @@ def test_a_recording_that_rests_at_its_end_is_divided_by_blocks():
 def test_any_other_recording_is_divided_by_time_as_before(moves):
     divided, words = divide([recording("a", moves)], settings())
     assert divided.split == ByTime()
-    assert words == ""
+    assert words == []
 
 
 def test_a_split_that_was_asked_for_stays():
     asked = settings("split.kind='time'")
-    assert divide([recording("a", RESTS_AT_ITS_END)], asked) == (asked, "")
+    assert divide([recording("a", RESTS_AT_ITS_END)], asked) == (asked, [])
 
 
 def test_whole_recordings_stay_whole_where_each_moves():
     logs = [recording(name, RESTS_AT_ITS_END, seed) for seed, name in enumerate("abcdef")]
     divided, words = divide(logs, settings())
     assert isinstance(divided.split, ByRecording)
-    assert words == ""
+    assert words == []
 
 
 def test_recordings_at_rest_are_not_what_tests():

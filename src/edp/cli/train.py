@@ -103,8 +103,8 @@ def _train_auto(
 
     def show() -> None:
         out.print(result.sentence)
-        if result.facts.get("divided"):
-            out.print(result.facts["divided"])
+        for note in result.facts.get("notes", ()):
+            out.print(note)
         _promise_table(result.facts)
         _expected_table(result.facts)
         out.print(f"bundle in {folder / 'bundle'}")

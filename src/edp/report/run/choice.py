@@ -32,7 +32,8 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
     candidates, excess = content["candidates"], content["excess"]
     sound = (
         isinstance(content["sentence"], str)
-        and isinstance(content.get("divided", ""), str)
+        and isinstance(content.get("notes", []), list)
+        and all(isinstance(note, str) for note in content.get("notes", []))
         and isinstance(content["key"], str)
         and isinstance(content["minutes"], int | float)
         and isinstance(candidates, dict)

@@ -92,7 +92,7 @@ def choice_of(facts: run.Facts) -> dict[str, Any]:
         return {}
     return {
         "sentence": unbroken(
-            " ".join(filter(None, (content["sentence"], content.get("divided"), promise_line(content))))
+            " ".join(filter(None, (content["sentence"], *content.get("notes", ()), promise_line(content))))
         ),
         "tables": [entry for entry in (candidates_table(content), promise_table(facts, content)) if entry is not None],
         "models": model_tables(facts, content),

@@ -17,15 +17,15 @@ LEAST_DIVIDED = 14
 """Gaps that a recording is long of which 15 % are two of them."""
 
 
-def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[AutoSettings, str]:
-    """Settings with a split whose every part has data and motion, and what it is in words; empty for the usual one.
+def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[AutoSettings, list[str]]:
+    """Settings with a split whose every part has data and motion, and what it is in words where it is unusual.
 
     Whole recordings stay whole. A single one, or recordings of such different lengths that a part would have next to
     nothing, are divided by time; where the machine rests in a part, so that it would say nothing of motion, by blocks.
     """
     split = settings.split
     if not isinstance(split, ByRecording) or split.validation or split.test:
-        return settings, ""
+        return settings, []
     gap = LEAST_SPAN + max(settings.task.horizons)
     every = [np.ones(recording.samples, dtype=bool) for recording in recordings]
     moving = moving_ticks(recordings, _channels(settings), max(1, *settings.task.horizons))
@@ -33,17 +33,17 @@ def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[Aut
     if len(recordings) > 1:
         # Of equal recordings that are too short to be divided nothing would be left to validate.
         if all(recording.samples < LEAST_DIVIDED * gap for recording in recordings):
-            return settings, ""
+            return settings, []
         if is_even(split, recordings, gap, every) and is_even(split, recordings, gap, moving):
-            return settings, ""
+            return settings, []
         by_time = replace(by_time, whole_short=True)
     blocks = blocks_of_motion(recordings, gap)
     if not is_even(by_time, recordings, gap, moving) and is_even(blocks, recordings, gap, moving):
-        return replace(settings, split=blocks), (
+        return replace(settings, split=blocks), [
             f"The machine rests in most of what would be tested or validated: blocks of {blocks.block_s:.3g} s test in "
             "turn (split.kind decides otherwise)."
-        )
-    return replace(settings, split=by_time), ""
+        ]
+    return replace(settings, split=by_time), []
 
 
 def _channels(settings: AutoSettings) -> list[str]:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from edp.config.experiment import Experiment, plain_tree
-from edp.data.features import FEATURE_SETS
 from edp.data.prepared import Prepared
 from edp.data.scaling import least_spread
 from edp.data.task import TargetMode
@@ -24,6 +23,7 @@ from edp.storage.runs import run_key
 from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
+from edp.workflows.auto.channels import MOST_LISTED, fit_to_channels
 from edp.workflows.auto.choice_facts import choice_facts
 from edp.workflows.auto.division import divide
 from edp.workflows.auto.foundation import Foundation, read_foundation
@@ -32,12 +32,8 @@ from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.auto.train_candidates import CandidateTraining, TrainedCandidate, train_all
 from edp.workflows.train_evaluate import keep_fitted, prepare_data
 
-USUAL = "FG2"
-"""The feature set that is taken without a word where the recordings have its channels."""
 MOST_TICKS = 0.9
 """Share of the ticks whose stretches settle how far changes reach back: a short log among long ones shortens none."""
-MOST_LISTED = 20
-"""Channels that a message lists."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +81,8 @@ def train_auto(
     foundation = read_foundation(settings.auto.foundation)
     if foundation is not None:
         foundation.check_recordings(once.read())
-    settings, divided = divide(once.read(), _of_these_channels(once, settings))
+    settings, of_channels = fit_to_channels(settings, once.read()[0].channel_names, str(source.path))
+    settings, of_parts = divide(once.read(), settings)
     data, amount = _prepare(once, settings, foundation)
     if foundation is not None:
         foundation.check_task(data)
@@ -102,7 +99,10 @@ def train_auto(
     if not trained:
         raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
     choice = choose({name: one.promise for name, one in trained.items()})
-    facts = choice_facts(choice, trained, failed, data, settings, amount) | {"key": key, "divided": divided}
+    facts = choice_facts(choice, trained, failed, data, settings, amount) | {
+        "key": key,
+        "notes": [*of_channels, *of_parts, *_still_inputs(data)],
+    }
     winner, floor = trained[choice.name], trained.get(FLOOR)
     # First the choice, whose key tells a folder that a kill left between the two from one of another run.
     write_json(folder / FILE, facts)
@@ -153,28 +153,6 @@ class _ReadOnce:
     def to_plain(self) -> dict[str, Any]:
         """As the source has it."""
         return self._source.to_plain()
-
-
-def _of_these_channels(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
-    """Settings that read every channel where the recordings have not those of the usual feature set.
-
-    Raises:
-        ConfigError: a target is no channel of the recordings.
-    """
-    names = source.read()[0].channel_names
-    task = settings.task
-    if task.features == USUAL and not set(FEATURE_SETS[USUAL].inputs) <= set(names):
-        task = replace(task, features="all")
-    derived = () if isinstance(task.features, str) else task.features.derived
-    channels = {*names, *(entry.name for entry in (*derived, *task.derived_targets))}
-    absent = [target for target in task.targets if target not in channels]
-    if absent:
-        listed = ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "")
-        raise ConfigError(
-            f"task.targets: {', '.join(absent[:MOST_LISTED])} is no channel of '{source.path}', which has {listed}; "
-            f"name what to predict, for example --set 'task.targets=[\"{names[-1]}\"]'"
-        )
-    return replace(settings, task=task)
 
 
 def _prepare(source: _ReadOnce, settings: AutoSettings, foundation: Foundation | None) -> tuple[Prepared, Amount]:
@@ -249,6 +227,16 @@ def _check_moving(data: Prepared) -> None:
             "no input moves in the training part; a model of these recordings could only repeat a constant: record "
             "while the machine works, or check the signal map"
         )
+
+
+def _still_inputs(data: Prepared) -> list[str]:
+    """Which inputs say nothing since they stand still, in a sentence where there are some."""
+    moving = _moving([part.inputs for part in data.train], [channel.kind for channel in data.inputs])
+    still = [channel.name for channel, moves in zip(data.inputs, moving, strict=True) if not moves]
+    if not still:
+        return []
+    more = f" and {len(still) - MOST_LISTED} more" if len(still) > MOST_LISTED else ""
+    return [f"Still through the training part, so without weight: {', '.join(still[:MOST_LISTED])}{more}."]
 
 
 def _moving(parts: Sequence[FloatArray], kinds: Sequence[Kind]) -> list[bool]:
