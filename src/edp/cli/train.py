@@ -130,9 +130,9 @@ def _expected_table(facts: dict[str, Any]) -> None:
         return  # a run of an earlier version
     promised, interval, skill = facts["candidates"][facts["chosen"]]["promise"], facts["interval"], facts["skill"]
     horizon = max(promised, key=int)
-    told = [promised[horizon], interval["low"][horizon], interval["high"][horizon]]
+    expected = [promised[horizon], interval["low"][horizon], interval["high"][horizon]]
     rows = [
-        [target, *(f"{values[target]:.4g}" for values in told), f"{skill['promise'][horizon][target]:.2f}"]
+        [target, *(f"{values[target]:.4g}" for values in expected), f"{skill['promise'][horizon][target]:.2f}"]
         for target in list(promised[horizon])[:MOST_EXPECTED]
     ]
     beside = "persistence's" if skill["against"] == "persistence" else "the linear model's"

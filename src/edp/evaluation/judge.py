@@ -117,8 +117,8 @@ def judge(
     if coverages:
         say("intervals")
         models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
-    found = ruler.header() | {"models": models, "situation": situation_of(data)}
-    return Evaluation(found, predictions, data.test)
+    content = ruler.header() | {"models": models, "situation": situation_of(data)}
+    return Evaluation(content, predictions, data.test)
 
 
 def _on_validation(predictions: dict[str, Predictions], data: Prepared, skip: int) -> dict[str, Any]:

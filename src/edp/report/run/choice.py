@@ -239,8 +239,8 @@ def promise_line(content: Mapping[str, Any]) -> str:
     interval, skill = content.get("interval"), content.get("skill") or {}
     if not interval or not tested:
         return ""
-    held, count = _within(tested, interval)
-    line = f"The promised error held on {held} of {count} outputs and horizons (within its 90 % interval)"
+    inside, count = _within(tested, interval)
+    line = f"The promised error held on {inside} of {count} outputs and horizons (within its 90 % interval)"
     pairs = [
         (promised, skill["test"][k][name])
         for k, row in skill.get("promise", {}).items()
@@ -257,13 +257,13 @@ def promise_line(content: Mapping[str, Any]) -> str:
 
 def _within(tested: Mapping[str, Any], interval: Mapping[str, Any]) -> tuple[int, int]:
     """How many test errors lie within their bounds, and how many have some."""
-    inside = [
+    within = [
         low <= tested[k][name] <= interval["high"][k][name]
         for k, row in interval["low"].items()
         for name, low in row.items()
         if name in tested.get(k, {}) and name in interval["high"].get(k, {})
     ]
-    return sum(inside), len(inside)
+    return sum(within), len(within)
 
 
 def _at(errors: Mapping[str, Mapping[str, float]], k: int, name: str) -> float | None:

@@ -54,12 +54,12 @@ def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None)
 
 def situation_line(scores: Mapping[str, Any]) -> str:
     """Where the judged recordings are another situation than the training; empty where they are not."""
-    found = scores.get("situation") or {"outside": (), "changes": ()}
-    most = sorted(found["changes"], key=lambda row: abs(math.log(row["ratio"])))
+    situation = scores.get("situation") or {"outside": (), "changes": ()}
+    most = sorted(situation["changes"], key=lambda row: abs(math.log(row["ratio"])))
     changes = {row["target"]: row for row in most}  # of each target the horizon that differs most
     parts = [
         f"{row['channel']} is outside of its range in training in {percent(row['share'])} of the ticks"
-        for row in found["outside"]
+        for row in situation["outside"]
     ]
     parts += [_changed(row) for row in changes.values()]
     if not parts:
