@@ -10,6 +10,7 @@ import pytest
 
 from edp.errors import DataError
 from edp.logs import read_recording
+from edp.logs.formats.csv_dates import dates_of
 from edp.recording import Recording
 from edp.signals import ChannelMap, SignalMap
 
@@ -68,6 +69,35 @@ def test_german_dates_and_times_of_day(read, stamp):
     made = read("time;a\n" + lines(lambda i: f"{stamp.format(i)};1,5"))
     assert made.rate_hz == 1.0
     assert made.values[:, 0].tolist() == [1.5] * 30
+
+
+def test_american_dates_and_remarks_of_a_logger_behind_the_rows(read):
+    head = "Sampling Rate:  10\nSample Number, Date/Time, U, V, Events\n"
+    rows = [f"{i + 1},   06/29/2022 12:59:{56 + i // 10:02d}.{i % 10}00 PM, {i}.5, 2" for i in range(30)]
+    rows[0] += ", DAQ Start"
+    rows[-1] += ", DAQ Pause, DAQ Stop"
+    made = read(head + "\n".join(rows) + "\n")
+    assert made.channel_names == ("Sample Number", "U", "V")
+    assert made.rate_hz == pytest.approx(10.0)
+    assert made.values[:, 1].tolist() == [i + 0.5 for i in range(1, 29)]  # rows with remarks are left out
+
+
+@pytest.mark.parametrize("bad", ["7, 06/29/2022 01:00:00.700 PM, 1.0, 2, 3.5", "7, 06/29/2022 01:00:00.700 PM, 1.0"])
+def test_damaged_rows_among_such_are_refused(read, bad):
+    rows = [f"{i}, 06/29/2022 01:00:{i // 10:02d}.{i % 10}00 PM, 0.5, 2" for i in range(30)]
+    rows[7] = bad
+    with pytest.raises(DataError, match="line 9 has"):
+        read("N, Date/Time, U, V\n" + "\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize(("stamp", "hour"), [("12:05:00 AM", 0), ("12:05:00 PM", 12), ("01:05:00 pm", 13)])
+def test_halves_of_a_day(stamp, hour):
+    assert str(dates_of([f"06/29/2022 {stamp}"])[0])[:16] == f"2022-06-29T{hour:02d}:05"
+
+
+def test_thirteen_o_clock_has_no_half():
+    with pytest.raises(ValueError, match="half a day"):
+        dates_of(["06/29/2022 13:05:00 PM"])
 
 
 @pytest.mark.parametrize("remark", ["# t, u, y", "% t u y", "#t,u,y"])

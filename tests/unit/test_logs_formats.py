@@ -263,6 +263,13 @@ def test_find_recordings_says_what_it_looks_for(tmp_path):
     assert [path.name for path in find_recordings(tmp_path)] == ["a.parquet", "b.csv"]
 
 
+def test_text_files_are_logs_where_there_are_no_others(tmp_path):
+    (tmp_path / "a.txt").write_text("time,x\n0,1\n")
+    assert [path.name for path in find_recordings(tmp_path)] == ["a.txt"]
+    (tmp_path / "b.csv").write_text("time,x\n0,1\n")
+    assert [path.name for path in find_recordings(tmp_path)] == ["b.csv"]
+
+
 def test_a_map_may_take_all_other_columns(tmp_path):
     path = tmp_path / "a.csv"
     rows = "\n".join(f"{k / 100},{k},{k / 10},ok,{k % 7},{k % 5},{k % 3}" for k in range(50))

@@ -154,6 +154,22 @@ def test_different_sessions_do_not_repeat():
     assert repeats() == ()
 
 
+def test_two_machines_driven_by_one_programme_are_no_repeat():
+    """The command agrees in every window, what it drives in none."""
+    commanded = session("other", 60).values.copy()
+    commanded[:, :2] = OTHERS[0].values[:, :2]
+    assert repeats(replace(OTHERS[0], name="other", values=commanded)) == ()
+
+
+def test_steps_that_look_alike_now_and_then_are_no_repeat():
+    """Every second window is that of another session."""
+    mixed = OTHERS[0].values.copy()
+    other = session("other", 70).values
+    for start in range(0, 12_000, 2560):
+        mixed[start : start + 1280] = other[start : start + 1280]
+    assert repeats(replace(OTHERS[0], name="mixed", values=mixed)) == ()
+
+
 def test_the_same_samples_under_another_name():
     (found,) = repeats(replace(OTHERS[1], name="copy"))
     assert (found.first, found.second, found.identical, found.share) == ("b", "copy", True, 1.0)

@@ -63,12 +63,15 @@ def evaluate(
         raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
     names = None if baselines is None else baseline_names(baselines)
     from edp.evaluation.guard import beaten_by
-    from edp.report.run.outputs import judged_line, losses_line
+    from edp.report.run.choice import promise_line, read_choice
+    from edp.report.run.outputs import judged_line, losses_line, situation_line
     from edp.storage.runs import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json, minutes)
     beaten = beaten_by(scores)
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
+    choice = read_choice(run) if source is None else None
+    beyond, promise = situation_line(scores), "" if choice is None else promise_line(choice)
     importances = run_importance(run, source, as_json) if channel_importance else None
 
     def show() -> None:
@@ -77,7 +80,9 @@ def evaluate(
         if lost:
             out.print(lost, style="bold red")
         score_table(scores)
-        out.print(judged)
+        for line in (promise, beyond, judged):
+            if line:
+                out.print(line)
         if scores.get("left_out"):
             left = ", ".join(map(str, scores["left_out"]))
             out.print(f"left out after --minutes {minutes:g}: {left}; give the command without it to judge them, too")
@@ -87,7 +92,7 @@ def evaluate(
             out.print(f"importance of the channels in {folder / 'channel_importance.json'}")
         out.print(f"next: edp report {folder}")
 
-    sentences = {"losses": lost, "tests": judged}
+    sentences = {"losses": lost, "tests": judged, "promise": promise, "situation_line": beyond}
     facts = {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **sentences, **scores}
     importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
     emit(as_json, facts | importance_json, show)
@@ -187,6 +192,8 @@ def importance_table(importances: ChannelImportances) -> None:
 
 def score_table(scores: dict[str, Any]) -> None:
     """Print a table a horizon: every model's mean scores, best first."""
+    from edp.evaluation.guard import MEASURE, MEASURE_NAME
+
     rate = scores["task"]["rate_hz"]
     units = {target["unit"] for target in scores["targets"]}
     unit = units.pop() if len(units) == 1 else "mixed units"
@@ -199,11 +206,11 @@ def score_table(scores: dict[str, Any]) -> None:
         for model in scores["models"].values():
             s = model["overall"][str(horizon)]["mean"]
             r2 = "-" if s["r2"] is None else f"{s['r2']:.4f}"
-            figures = [f"{s[key]:.4g}" for key in ("mae", "rmse", "p95", "p99", "composite")]
-            rows.append((s["mae"], [model["label"], *figures, r2]))
+            figures = [f"{s[key]:.4g}" for key in (MEASURE, "mae", "p95", "p99", "composite")]
+            rows.append((s[MEASURE], [model["label"], *figures, r2]))
         rows.sort(key=lambda row: row[0])
         ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
-        heads = ["model", "MAE", "RMSE", "P95", "P99", "composite", "R2"]
+        heads = ["model", MEASURE_NAME, "MAE", "P95", "P99", "composite", "R2"]
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
     interval_rows(scores, unit)
     for name, model in scores["models"].items():
@@ -213,16 +220,18 @@ def score_table(scores: dict[str, Any]) -> None:
 
 def _tables_by_output(scores: dict[str, Any], rate: float) -> None:
     """Print a table a horizon with a column an output: numbers in different units, or in none, have no mean."""
+    from edp.evaluation.guard import MEASURE, MEASURE_NAME
+
     targets = scores["targets"]
     heads = ["model", *(f"{t['name']}{'' if t['unit'] == '1' else ', ' + t['unit']}" for t in targets)]
     for horizon in scores["task"]["horizons"]:
         errors = {
-            model["label"]: [model["overall"][str(horizon)][t["name"]]["mae"] for t in targets]
+            model["label"]: [model["overall"][str(horizon)][t["name"]][MEASURE] for t in targets]
             for model in scores["models"].values()
         }
         ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
         rows = [[label, *(f"{value:.4g}" for value in values)] for label, values in errors.items()]
-        table(f"{ahead}, MAE of each output", heads, rows)
+        table(f"{ahead}, {MEASURE_NAME} of each output", heads, rows)
     for name, model in scores["models"].items():
         for target, integral_scores in model.get("integrated", {}).items():
             out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g}")

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 """`edp.config.experiment.AUTO`, known here without loading that module."""
+MOST_EXPECTED = 12
+"""Outputs of which the terminal says what to expect; the report has all."""
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
     list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort.")
@@ -101,7 +103,10 @@ def _train_auto(
 
     def show() -> None:
         out.print(result.sentence)
+        for note in result.facts.get("notes", ()):
+            out.print(note)
         _promise_table(result.facts)
+        _expected_table(result.facts)
         out.print(f"bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
@@ -117,6 +122,22 @@ def _promise_table(facts: dict[str, Any]) -> None:
         rows.append([f"{one['label']} {mark}".strip(), f"{one['parameters']:,}", duration(one["seconds"]), share])
     title = f"error on left-out data against the model that is kept (*), within {facts['minutes']:g} min"
     table(title, ["model", "parameters", "trained in", "error"], rows)
+
+
+def _expected_table(facts: dict[str, Any]) -> None:
+    """Print the error to expect of each output at the longest horizon."""
+    if "interval" not in facts:
+        return  # a run of an earlier version
+    promised, interval, skill = facts["candidates"][facts["chosen"]]["promise"], facts["interval"], facts["skill"]
+    horizon = max(promised, key=int)
+    expected = [promised[horizon], interval["low"][horizon], interval["high"][horizon]]
+    rows = [
+        [target, *(f"{values[target]:.4g}" for values in expected), f"{skill['promise'][horizon][target]:.2f}"]
+        for target in list(promised[horizon])[:MOST_EXPECTED]
+    ]
+    beside = "persistence's" if skill["against"] == "persistence" else "the linear model's"
+    heads = ["output", "error", "90 % of tests: from", "to", f"over {beside}"]
+    table(f"error (RMSE) to expect of tests that are like the training, k = {horizon}", heads, rows)
 
 
 def run(

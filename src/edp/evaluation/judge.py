@@ -15,6 +15,7 @@ from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
+from edp.evaluation.situation import situation_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_intervals, stream_predictions
 from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
@@ -122,7 +123,8 @@ def judge(
     if coverages:
         say("intervals")
         models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
-    scores = ruler.header() | {"models": models} | ({"left_out": left_out} if left_out else {})
+    left = {"left_out": left_out} if left_out else {}
+    scores = ruler.header() | {"models": models, "situation": situation_of(data)} | left
     return Evaluation(scores, predictions, data.test)
 
 

@@ -87,6 +87,18 @@ MODEL = KeyedObject(
     },
     ("overall",),
 )
+SITUATION = KeyedObject(
+    {
+        "outside": Listed(KeyedObject({"channel": NAME, "share": REAL}, ("channel", "share"))),
+        "changes": Listed(
+            KeyedObject(
+                {"target": NAME, "horizon": COUNT, "ratio": REAL, "beyond": REAL},
+                ("target", "horizon", "ratio", "beyond"),
+            )
+        ),
+    },
+    ("outside", "changes"),
+)
 SCORES = KeyedObject(
     {
         "task": KeyedObject(
@@ -94,6 +106,7 @@ SCORES = KeyedObject(
         ),
         "targets": Listed(KeyedObject({"name": NAME, "description": NAME, "unit": NAME, "factor": SIZE}, ("name",))),
         "models": NamedValues(MODEL),
+        "situation": SITUATION,
     },
     ("task", "targets", "models"),
 )
@@ -106,6 +119,14 @@ def read_scores(path: str | Path) -> dict[str, Any]:
         StorageError: it cannot be read, or a value in it has another form; the message names the value.
     """
     return read_shaped(path, SCORES)
+
+
+def earlier_scores(folder: Path, key: str) -> dict[str, Any] | None:
+    """Scores of an earlier judgement with this key, beside their predictions; None where there are none."""
+    if not (folder / "scores.json").is_file() or not (folder / "predictions.safetensors").is_file():
+        return None
+    scores = read_scores(folder / "scores.json")
+    return scores if scores.get("key") == key else None
 
 
 def read_shaped(path: str | Path, shape: Shape) -> dict[str, Any]:

@@ -31,7 +31,6 @@ _EXPORT = {
     ".7z": "unpack it and give the files in it",
     ".active": "the bag was not closed (its recorder was killed): run 'rosbag reindex' and rename it to .bag",
     ".dat": "save it as MDF 4 (.mf4), MAT or CSV with your measurement tool",
-    ".txt": "rename it to .csv if it holds a table",
     ".xlsx": "save the sheet as CSV",
     ".xls": "save the sheet as CSV",
 }

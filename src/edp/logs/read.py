@@ -17,6 +17,7 @@ from edp.logs.write import truth_path
 from edp.recording import Recording, columns
 from edp.signals import SignalMap
 
+TEXT = ".txt"
 RATE_TOLERANCE = 1e-3
 """Share by which rates of logs of one data set may differ: loggers state the same rate with different digits."""
 
@@ -110,8 +111,8 @@ def read_truth(path: str | Path) -> Recording | None:
 def find_recordings(path: str | Path) -> tuple[Path, ...]:
     """The log files at a path: the file itself, or all files with a known ending in a folder and below, sorted.
 
-    In a folder, files that hold the truth of the log beside them (``NAME.truth.SUFFIX``) are passed over. A folder that
-    is a ROS 2 bag counts as one log.
+    In a folder, files that hold the truth of the log beside them (``NAME.truth.SUFFIX``) are passed over, and text
+    files (``.txt``) where there are other logs. A folder that is a ROS 2 bag counts as one log.
 
     Raises:
         DataError: the path does not exist, or holds no log file.
@@ -121,8 +122,8 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         return (source,)
     if not source.exists():
         raise DataError(f"'{source}' does not exist; give a log file or a folder of log files")
-    suffixes = known_suffixes()
     bags = {entry.parent for entry in source.rglob(BAG_MARK)}
+    suffixes = known_suffixes()
     files = [
         entry
         for entry in source.rglob("*")
@@ -132,6 +133,9 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         and entry.is_file()
         and not _is_truth(entry)
     ]
+    # Beside logs of other endings text files hold remarks and licences; loggers of text write nothing else.
+    if bags or any(file.suffix.lower() != TEXT for file in files):
+        files = [file for file in files if file.suffix.lower() != TEXT]
     recording_paths = sorted([*bags, *(file for file in files if file.parent not in bags)])
     if not recording_paths:
         raise DataError(f"'{source}' holds no log files; known endings: {', '.join(suffixes)}")

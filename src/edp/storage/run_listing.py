@@ -136,7 +136,7 @@ def _touched(path: Path) -> str:
 
 
 def _score(scores: Mapping[str, Any]) -> str:
-    """The network's mean absolute error at the longest horizon, of the first output where they have no one unit."""
+    """The network's root-mean-square error at the longest horizon, of the first output where they have no one unit."""
     if not scores:
         return ""
     horizon = max(int(one) for one in scores["task"]["horizons"])
@@ -144,7 +144,7 @@ def _score(scores: Mapping[str, Any]) -> str:
     units = {str(target["unit"]) for target in targets}
     shared = len(targets) == 1 or (len(units) == 1 and units != {"1"})
     name = "mean" if shared else str(targets[0]["name"])
-    error = float(scores["models"]["network"]["overall"][str(horizon)][name]["mae"])
+    error = float(scores["models"]["network"]["overall"][str(horizon)][name]["rmse"])
     if not math.isfinite(error):
         return ""
     unit = str(targets[0]["unit"])

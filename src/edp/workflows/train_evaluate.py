@@ -13,12 +13,7 @@ import torch
 from safetensors.numpy import save
 
 from edp import __version__
-from edp.config.experiment import (
-    Experiment,
-    experiment_toml,
-    load_experiment,
-    plain_tree,
-)
+from edp.config.experiment import Experiment, experiment_toml, load_experiment, plain_tree
 from edp.data.coverage import Coverage, cover
 from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
@@ -29,13 +24,14 @@ from edp.evaluation.channel_importance import ChannelImportances, ChannelImporta
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import Evaluation, JudgeSpec, judge
-from edp.evaluation.scores_file import read_scores
+from edp.evaluation.judge import Evaluation, JudgeSpec, judge, score_predictions
+from edp.evaluation.scores_file import earlier_scores
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
+from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.report import build_report
-from edp.report.run.choice import note_test_result
+from edp.report.run.choice import FLOOR, note_test_result
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
@@ -48,7 +44,7 @@ from edp.training.strategy import DirectFit, TrainingStrategy
 if TYPE_CHECKING:
     from edp.sim.data_set import SimulationOrder, simulate_data_set
 
-# 60,000 ticks are ten minutes at 100 Hz: more than a picture can show.
+# Ten minutes at 100 Hz: more than a picture can show.
 SHOWN_RECORDINGS, SHOWN_TICKS = 6, 60_000
 
 
@@ -283,7 +279,7 @@ def evaluate(
     chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
     settings = plain_tree(replace(experiment, judge=chosen))["judge"]
     key = run_key({"judge": settings, "weights": weights_digest(bundle.predictor)}, " ".join(judged))
-    scores = _kept(target, key)
+    scores = earlier_scores(target, key)
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
         evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
@@ -292,7 +288,7 @@ def evaluate(
         write_bytes(target / "predictions.safetensors", save(_shown(evaluation)))
         write_json(target / "scores.json", scores)
     if source is None:
-        note_test_result(folder, scores)
+        note_test_result(folder, scores, _floor_scores(folder, data, scores))
         save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
     return target
 
@@ -354,12 +350,12 @@ def channel_importance(
     return importances, target / "channel_importance.json"
 
 
-def _kept(folder: Path, key: str) -> dict[str, Any] | None:
-    """Scores of an earlier judgement of the same things."""
-    if not (folder / "scores.json").is_file() or not (folder / "predictions.safetensors").is_file():
+def _floor_scores(folder: Path, data: Prepared, scores: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Scores, on the same ticks, of what the preset auto tells its skill against; None where the run has none."""
+    if not (folder / FLOOR).is_dir():
         return None
-    scores = read_scores(folder / "scores.json")
-    return scores if scores.get("key") == key else None
+    floor = load_bundle(folder / FLOOR).predictor
+    return score_predictions(stream_predictions(floor, data.test), data, scores["task"]["skip"])
 
 
 def _shown(evaluation: Evaluation) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ def scores(*targets, error=1.5):
     return {
         "task": {"horizons": [1, 10]},
         "targets": [{"name": name, "unit": unit} for name, unit in targets],
-        "models": {"network": {"overall": {"10": {key: {"mae": error} for key in ("mean", *dict(targets))}}}},
+        "models": {"network": {"overall": {"10": {key: {"rmse": error} for key in ("mean", *dict(targets))}}}},
     }
 
 

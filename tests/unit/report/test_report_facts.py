@@ -38,18 +38,18 @@ def test_headline_states_the_scores_of_the_longest_horizon(run_folder):
 
     edit_scores(run_folder, change)
     said = headline(read_facts(run_folder))
-    assert said == "At 100 ms ahead the network is off by 7.1 mm/s on average; ridge 13.0; persistence 21.4."
+    assert said == "At 100 ms ahead the network is off by 7.1 mm/s (RMSE); ridge 13.0; persistence 21.4."
 
 
 def test_comparison_sorts_by_error_and_relates_the_network_to_each_model(run_folder):
     rows = comparison_rows(read_facts(run_folder), horizon=5)
-    errors = [row["mae"] for row in rows]
+    errors = [row["rmse"] for row in rows]
     assert errors == sorted(errors)
     network = next(row for row in rows if row["is_network"])
     assert network["change"] is None
     for row in rows:
         if not row["is_network"]:
-            assert row["change"] == pytest.approx(network["mae"] / row["mae"] - 1)
+            assert row["change"] == pytest.approx(network["rmse"] / row["rmse"] - 1)
 
 
 def test_a_network_worse_than_a_baseline_is_called_worse(run_folder):
@@ -75,7 +75,7 @@ def test_outputs_in_different_units_have_no_common_unit(run_folder):
     assert "bar in stick cylinder velocity" in line
     assert not any("best baseline" in line for line in verdict_lines(facts))
     # Nor do tables and tiles show a mean of speeds and pressures.
-    assert all(table.columns[1][0] != "MAE" for table in comparison_tables(facts))
+    assert all(table.columns[1][0] not in ("RMSE", "MAE") for table in comparison_tables(facts))
     assert [unit for _, unit, _ in key_figures(facts)[:3]] == ["mm/s", "bar", "mm/s"]
     assert spread_text(facts) == ""
 
@@ -88,7 +88,7 @@ def test_outputs_without_a_unit_are_never_averaged(run_folder):
     edit_scores(run_folder, change)
     facts = read_facts(run_folder)
     assert not facts.averaged
-    assert "network is off by 3.28 in boom cylinder velocity" in headline(facts)
+    assert "network is off by (RMSE) 4.68 in boom cylinder velocity" in headline(facts)
     assert " 1 " not in headline(facts)
 
 

@@ -82,7 +82,7 @@ def test_residual_shares_and_what_lies_outside_add_up(facts):
 def test_horizon_curves_are_in_milliseconds(facts):
     curve = figures.horizon_curves(facts)[NETWORK]
     assert [x for x, _ in curve] == [10.0, 50.0, 100.0]
-    assert curve[-1][1] == facts.models[NETWORK]["overall"]["10"]["mean"]["mae"]
+    assert curve[-1][1] == facts.models[NETWORK]["overall"]["10"]["mean"]["rmse"]
 
 
 def test_recordings_are_sorted_by_the_networks_error(facts):
@@ -135,7 +135,7 @@ def test_each_choice_shows_one_recording_horizon_and_extent(facts):
 
 
 def test_many_recordings_become_a_rank_curve(facts):
-    recordings = {f"r{i:03d}": {"10": {"mean": {"mae": float(i)}}} for i in range(60)}
+    recordings = {f"r{i:03d}": {"10": {"mean": {"rmse": float(i)}}} for i in range(60)}
     models = {"network": {"label": "N", "recordings": recordings}}
     plot = plots_of(dataclasses.replace(facts, scores={**facts.scores, "models": models}))["recordings"]
     assert list(plot.figure.data[0].x) == list(range(1, 61))

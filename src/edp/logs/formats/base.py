@@ -237,7 +237,7 @@ def holds_truth_apart(log_format: LogFormat) -> bool:
     return bool(getattr(log_format, "parts", False))
 
 
-_TIME_NAMES = ("time_s", "time", "timestamp", "timestamps", "tout", "time_ms", "time_us", "time_ns")
+_TIME_NAMES = ("time_s", "time", "timestamp", "timestamps", "tout", "time_ms", "time_us", "time_ns", "date/time")
 _TIME_UNIT_NAMES = {"sec": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 
 

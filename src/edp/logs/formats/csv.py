@@ -54,7 +54,7 @@ class CsvFormat:
     """Comma, semicolon or tab separated text."""
 
     name = "csv"
-    suffixes: tuple[str, ...] = (".csv", ".tsv")
+    suffixes: tuple[str, ...] = (".csv", ".tsv", ".txt")
     content = "CSV text"
     libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
@@ -114,7 +114,8 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
     check_names(path, () if len(rows[0]) <= MOST_COLUMNS else map(str, range(len(rows[0]))))
     table_place = find_table(rows, _number_of_any_kind(delimiter), _is_unit_row) or TablePlace(0, 0)
     named = table_place.header < table_place.first
-    rows[table_place.header] = [*rows[table_place.header], *[""] * table_place.padding]
+    padding = table_place.padding
+    rows[table_place.header] = [*rows[table_place.header], *[""] * padding][: padding if padding < 0 else None]
     head = rows[table_place.header]
     body = rows[table_place.first :] if named else rows[table_place.header + signal_map.header :]
     decimal = signal_map.decimal

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 _GERMAN = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?:[ T]+(\d.*))?")
-"""``31.12.2025 13:00:00``; a date with slashes may mean day or month first and is not read."""
+"""``31.12.2025 13:00:00``; a date with slashes and without AM or PM may mean day or month first and is not read."""
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9})\d*)?)?")
+_AMERICAN = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})[ T]+(\d.*\d) ?([AP])M", re.IGNORECASE)
+"""``06/29/2022 04:05:36.674 PM``: who writes AM and PM writes the month first."""
 _MIDNIGHT = "1970-01-01"
 """Of times of day without a date: only their differences count."""
 
@@ -33,15 +35,23 @@ def _iso(cell: str | None) -> str:
         day, month, year, clock = german.groups()
         date = f"{year}-{int(month):02d}-{int(day):02d}"
         return date if clock is None else f"{date}T{_clock(clock)}"
+    american = _AMERICAN.fullmatch(text)
+    if american is not None:
+        month, day, year, clock, half = american.groups()
+        return f"{year}-{int(month):02d}-{int(day):02d}T{_clock(clock, half.upper())}"
     if _CLOCK.fullmatch(text):
         return f"{_MIDNIGHT}T{_clock(text)}"
     # ISO 8601 allows a decimal comma, NumPy does not.
     return text.replace(",", ".")
 
 
-def _clock(text: str) -> str:
+def _clock(text: str, half: str = "") -> str:
+    """A time of day as ISO 8601 has it; `half` of the day is A, P or unknown."""
     match = _CLOCK.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"{text[:40]!r} is no time of day")
     hours, minutes, seconds, part = match.groups()
-    return f"{int(hours):02d}:{minutes}:{seconds or '00'}.{part or '0'}"
+    if half and not 1 <= int(hours) <= 12:
+        raise ValueError(f"{text[:40]!r} is no time of half a day")
+    hour = int(hours) if not half else int(hours) % 12 + 12 * (half == "P")
+    return f"{hour:02d}:{minutes}:{seconds or '00'}.{part or '0'}"

@@ -13,6 +13,8 @@ _NUMBERS = 0.8
 """Share of the filled cells of a column that are numbers, where it is one of numbers."""
 _MOST_HEADER_ROWS = 4
 """Names, units and descriptions: what stands between the names and the numbers at most."""
+_MOST_REMARKS = 2
+"""Columns of remarks that are named behind those of numbers."""
 _WORDS = 3
 """Words of a cell from which a row describes channels instead of naming them."""
 _NAME = re.compile(r"[^\s]{1,48}(?: [^\s]+)?")
@@ -26,7 +28,8 @@ class TablePlace:
     Attributes:
         header: the row of names; that of `first` where there is none.
         first: the first row of numbers.
-        padding: cells that the row of names lacks at its end, where the rows of numbers end with a delimiter.
+        padding: cells that the row of names lacks at its end, where the rows of numbers end with a delimiter; below
+            zero those that it has beside the numbers, of remarks that hardly any row has.
     """
 
     header: int
@@ -73,7 +76,7 @@ def _is_numeric(cells: list[str], is_number: Callable[[str], bool]) -> bool:
 
 def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Callable[[str], bool]) -> bool:
     """Whether most cells of a row in the columns of numbers are numbers: text may stand for a missing value."""
-    if len(row) != width:
+    if not width <= len(row) <= width + _MOST_REMARKS or any(map(is_number, row[width:])):
         return False
     filled = [row[i] for i in columns if row[i].strip()]
     return 2 * len(filled) >= len(columns) and 2 * sum(map(is_number, filled)) > len(filled)
@@ -82,6 +85,8 @@ def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Call
 def _may_name(row: Sequence[str], width: int, whole: Sequence[Sequence[str]], is_number: Callable[[str], bool]) -> bool:
     """Whether a row may hold names, units or descriptions: more than half of its cells filled, none with a number."""
     ends_open = len(row) == width - 1 and not any(other[-1].strip() for other in whole)
+    if width < len(row) <= width + _MOST_REMARKS:
+        row = row[:width]
     filled = [cell for cell in row if cell.strip()]
     # 1 is the unit of a ratio, too.
     return (

@@ -57,6 +57,8 @@ def is_number(cell: str, decimal: str = ".") -> bool:
     return True
 
 
+_REMARKS, _FEW_REMARKS = 0.001, 10
+"""Share of rows that may end in a remark, or so many of few rows."""
 _GROUPED = r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?"
 _GERMAN = rf"^({_GROUPED}|[-+]?[0-9]*,?[0-9]+([eE][-+]?[0-9]+)?)$"
 
@@ -215,9 +217,15 @@ class CsvTable:
         key = self.keys[column_index]
         return [cell for batch in self.stream([key]) for cell in batch.column(key).to_pylist()]
 
+    def _is_remark(self, row: Any) -> bool:
+        """Whether a row has words behind its last column, as loggers note events; such rows are left out."""
+        behind = row.text.split(self.layout.delimiter)[row.expected_columns :]
+        return bool(behind) and all(re.search(r"[^\W\d_]{2}", cell) and '"' not in cell for cell in behind)
+
     def refuse_ragged(self) -> None:
-        if self.ragged:
-            bad = self.ragged[0]
+        damaged = [row for row in self.ragged if not self._is_remark(row)]
+        if damaged or len(self.ragged) > max(_FEW_REMARKS, _REMARKS * self.rows):
+            bad = (damaged or self.ragged)[0]
             raise DataError(
                 f"'{self.path}': line {bad.number} has {bad.actual_columns} cells, the header has "
                 f"{bad.expected_columns} ('{bad.text[:60]}'); the file may be cut off: export it again or delete "

@@ -41,6 +41,11 @@ _LEAST_VOTES = 4
 _HOPELESS = 0.8
 """Correlation below which no fraction of a block makes two windows the same."""
 _LEAST_SHARE = 0.5
+"""Of the channels that move in a window more than this must agree: steps of two sessions look alike in one channel or
+another (correlations of 0.99 on a bench with two machines), but not in most of them."""
+_LEAST_UNBROKEN = 2 / 3
+"""Of the windows in motion between the first and the last one that agree, so many must agree, too. Of one session all
+do but for noise; of two that are driven alike about half of them did."""
 _SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
 """Fractions of a block: two recordings began at different moments between the ticks of 10 Hz."""
 
@@ -139,7 +144,7 @@ def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
     """Pairs of recordings that hold the same session, the longest shared stretch first.
 
     Recordings shorter than 12.8 s are compared by their samples alone. A pair counts where at least two windows agree
-    (correlation above 0.98 in at least half of the channels that move), at one lag.
+    (correlation above 0.98 in more than half of the channels that move), and most of those between them, at one lag.
     """
     repeats_by_pair = {pair: _identical(*(sketches[i] for i in pair)) for pair in _equal_pairs(sketches)}
     for pair, lag in _candidates(sketches).items():
@@ -283,13 +288,15 @@ def _judged(
     moves = np.isfinite(alike)
     agree = np.where(moves, alike, 0.0) > _SAME
     moving = moves.sum(axis=1)
-    same = (moving > 0) & (agree.sum(axis=1) >= np.maximum(_LEAST_SHARE * moving, 1))
+    same = agree.sum(axis=1) > _LEAST_SHARE * moving
     if same.sum() < _LEAST_WINDOWS:
         return None
     hit = np.flatnonzero(same)
+    if len(hit) < _LEAST_UNBROKEN * (moving[hit[0] : hit[-1] + 1] > 0).sum():
+        return None
     compared = moves[hit].any(axis=0)
     agreeing_pairs = agree[hit].sum(axis=0) >= 0.5 * np.maximum(moves[hit].sum(axis=0), 1)
-    if agreeing_pairs.sum() < max(_LEAST_SHARE * compared.sum(), 1):
+    if agreeing_pairs.sum() <= _LEAST_SHARE * compared.sum():
         return None
     begins = start + int(hit[0]) * WINDOW
     ends = start + (int(hit[-1]) + 1) * WINDOW

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from edp.evaluation.guard import MEASURE, MEASURE_NAME
 from edp.report.common.wording import MISSING, count_text, decimals_for, duration, moment, number, percent
 from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
@@ -33,7 +34,7 @@ _TILES = 3
 def comparison_tables(facts: Facts) -> list[TextTable]:
     """Metrics of every model, one table per horizon, the headline's horizon first.
 
-    Means over outputs where they have one unit, else the mean absolute error of each output.
+    Means over outputs where they have one unit, else the error of each output.
     """
     order = sorted(facts.horizons, key=lambda k: (k != main_horizon(facts), k))
     if not facts.averaged:
@@ -44,13 +45,13 @@ def comparison_tables(facts: Facts) -> list[TextTable]:
 def _comparison(facts: Facts, horizon: int) -> TextTable:
     rows = comparison_rows(facts, horizon)
     unit = facts.unit
-    shown = [metric for metric in ("mae", "rmse", "p95", "p99", "composite") if _any(rows, metric)]
+    shown = [metric for metric in ("rmse", "mae", "p95", "p99", "composite") if _any(rows, metric)]
     places = {metric: decimals_for(row[metric] for row in rows) for metric in shown}
     names = {"mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99", "composite": "Composite"}
     with_bias, with_r2, with_time = _any(rows, "bias"), _any(rows, "r2"), _any(rows, "seconds")
     columns = [("Model", ""), *((names[metric], unit) for metric in shown)]
     columns += [("Bias", unit)] * with_bias + [("R²", "")] * with_r2
-    columns += [("Network relative to it", "MAE")] + [("Fitted in", "")] * with_time
+    columns += [("Network relative to it", MEASURE_NAME)] + [("Fitted in", "")] * with_time
     lines = []
     for row in rows:
         cells = [row["label"], *(number(row[metric], places[metric]) for metric in shown)]
@@ -68,7 +69,7 @@ def _any(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
 
 
 def output_table(facts: Facts) -> TextTable | None:
-    """Mean absolute error by output at the longest horizon; None where `comparison_tables` shows it already."""
+    """Error by output at the longest horizon; None where `comparison_tables` shows it already."""
     return _by_output(facts, main_horizon(facts)) if facts.averaged else None
 
 
@@ -82,7 +83,7 @@ def _by_output(facts: Facts, horizon: int | None) -> TextTable | None:
     units = ["" if target.unit == "1" else target.unit for target in facts.targets]
     columns = (("Model", ""), *((target.description, unit) for target, unit in zip(facts.targets, units)))
     marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
-    return TextTable(f"MAE by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
+    return TextTable(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
 
 
 def interval_table(facts: Facts) -> TextTable | None:
@@ -237,10 +238,10 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
     if not facts.averaged and ours:
         for target in facts.targets[:_TILES]:
             unit = "" if target.unit == "1" else target.unit
-            tiles.append((number(ours["outputs"][target.name]), unit, f"mean absolute error, {target.name}"))
+            tiles.append((number(ours["outputs"][target.name]), unit, f"{MEASURE_NAME}, {target.name}"))
         ours = None
     if ours:
-        tiles.append((number(ours["mae"]), facts.unit, "mean absolute error"))
+        tiles.append((number(ours[MEASURE]), facts.unit, f"{MEASURE_NAME} (root mean square of errors)"))
         if ours["p95"] is not None:
             tiles.append((number(ours["p95"]), facts.unit, "95 % of errors are below"))
     best = next((row for row in rows if row["change"] is not None), None)

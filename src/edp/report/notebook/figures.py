@@ -74,7 +74,7 @@ def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> 
 
 
 def score_figure(facts: Facts) -> go.Figure:
-    """Mean absolute error of every judged model, against the horizon where there are several."""
+    """Root-mean-square error of every judged model, against the horizon where there are several."""
     chart = horizon_chart(facts)
     if chart is None:
         raise ConfigError("there are no scores to draw; judge the predictor first")

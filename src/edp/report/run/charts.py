@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from edp.evaluation.guard import MEASURE_NAME
 from edp.report.common.chart import (
     BLUE,
     GREY,
@@ -70,8 +71,8 @@ def _look(facts: Facts, model: str) -> dict[str, Any]:
     }
 
 
-def _error_axis(facts: Facts) -> ChartAxis:
-    return ChartAxis(with_unit("Mean absolute error", facts.unit), from_zero=True)
+def _error_axis(facts: Facts, of: str = MEASURE_NAME) -> ChartAxis:
+    return ChartAxis(with_unit(of, facts.unit), from_zero=True)
 
 
 def _horizons(facts: Facts, horizons: Sequence[int], keeps_zoom: bool = False) -> Control:
@@ -188,7 +189,10 @@ def speed_chart(facts: Facts) -> Chart | None:
             values=[100 * (row["count"] or 0) / total for row in rows], hover="{y:.3g} % of the samples", remark="",
         ))  # fmt: skip
     across = ChartAxis(with_unit("Speed band", facts.unit), kind="names")
-    panels = (Panel(tuple(errors), across, _error_axis(facts)), Panel(tuple(counts), across, ChartAxis("Samples [%]")))
+    panels = (
+        Panel(tuple(errors), across, _error_axis(facts, "Mean absolute error")),
+        Panel(tuple(counts), across, ChartAxis("Samples [%]")),
+    )
     choices = (_horizons(facts, horizons),)
     return Chart("speed", panels, choices=choices, height=400, shares=(0.76, 0.24), together=True)
 

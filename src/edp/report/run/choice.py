@@ -15,6 +15,8 @@ from edp.report.run.figures import horizons_shown
 from edp.storage import read_object, write_json
 
 FILE = "auto.json"
+FLOOR, PERSISTENCE = "linear", "persistence"
+"""What a skill is relative to: the candidate whose bundle lies in a folder of this name, or the present value."""
 
 
 def read_choice(folder: Path) -> Mapping[str, Any] | None:
@@ -30,6 +32,8 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
     candidates, excess = content["candidates"], content["excess"]
     sound = (
         isinstance(content["sentence"], str)
+        and isinstance(content.get("notes", []), list)
+        and all(isinstance(note, str) for note in content.get("notes", []))
         and isinstance(content["key"], str)
         and isinstance(content["minutes"], int | float)
         and isinstance(candidates, dict)
@@ -40,18 +44,21 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
         and all(isinstance(excess.get(name), int | float) for name in candidates)
         and all(_is_promise(one.get("promise")) for one in candidates.values())
         and _is_promise(content["persistence"])
+        and _is_interval(content.get("interval", {"low": {}, "high": {}}))
+        and _is_skill(content.get("skill"))
     )
     if not sound:
         raise StorageError(f"'{path}' does not hold what edp train --preset auto writes; train again in another folder")
     return content
 
 
-def note_test_result(folder: Path, scores: Mapping[str, Any]) -> None:
+def note_test_result(folder: Path, scores: Mapping[str, Any], floor: Mapping[str, Any] | None = None) -> None:
     """Write what every model reached into ``auto.json``, where a run has one.
 
     Args:
         folder: the run folder.
         scores: the content of its ``scores.json``: of the kept model and of each baseline.
+        floor: scores of the linear candidate on the same ticks; None where the run left none.
 
     Raises:
         StorageError: the file does not hold what the preset auto writes, or cannot be written.
@@ -64,7 +71,21 @@ def note_test_result(folder: Path, scores: Mapping[str, Any]) -> None:
         | ({"validation": _errors(model["validation"])} if "validation" in model else {})
         for name, model in scores["models"].items()
     }
-    write_json(folder / FILE, {**content, "results": results})
+    against = scores["models"].get(PERSISTENCE) if floor is None else floor
+    skill = content.get("skill")
+    if skill and against and (floor is not None) == (skill["against"] == FLOOR):
+        skill = {**skill, "test": _ratios(results[NETWORK]["test"], _errors(against["overall"]))}
+    write_json(folder / FILE, {**content, "results": results, **({"skill": skill} if skill else {})})
+
+
+def _ratios(
+    errors: Mapping[str, Mapping[str, float]], below: Mapping[str, Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """Of errors, where the lower one is not zero."""
+    return {
+        k: {name: error / below[k][name] for name, error in row.items() if below.get(k, {}).get(name, 0.0) > 0}
+        for k, row in errors.items()
+    }
 
 
 def _errors(overall: Mapping[str, Any]) -> dict[str, dict[str, float]]:
@@ -90,6 +111,22 @@ def _is_promise(value: Any) -> bool:
     return isinstance(value, dict) and all(
         isinstance(row, dict) and all(isinstance(error, int | float) for error in row.values())
         for row in value.values()
+    )
+
+
+def _is_interval(value: Any) -> bool:
+    """Whether a value is bounds by horizon and target."""
+    return isinstance(value, dict) and all(_is_promise(value.get(side)) for side in ("low", "high"))
+
+
+def _is_skill(value: Any) -> bool:
+    """Whether a value is errors relative to another model, promised and measured; runs before version 0.2 have none."""
+    return value is None or (
+        isinstance(value, dict)
+        and value.get("against") in (FLOOR, PERSISTENCE)
+        and _is_promise(value.get("promise"))
+        and _is_interval(value.get("interval"))
+        and _is_promise(value.get("test", {}))
     )
 
 
@@ -151,28 +188,90 @@ def _of_output(facts: Facts, content: Mapping[str, Any], target: Target) -> Text
 
 
 def promise_table(facts: Facts, content: Mapping[str, Any]) -> TextTable | None:
-    """Root-mean-square errors by output and horizon: promised, on the test recordings, of persistence."""
-    promised = content["candidates"][content["chosen"]]["promise"]
+    """By output and horizon the error promised and that on the test recordings, both beside a simple model's."""
+    promised, interval = content["candidates"][content["chosen"]]["promise"], content.get("interval")
+    skill = content.get("skill") or {"against": FLOOR, "promise": {}, "interval": {"low": {}, "high": {}}}
     rows = []
     for target in facts.targets:
         for k in facts.horizons:
-            expected = promised.get(str(k), {}).get(target.name)
-            still = content["persistence"].get(str(k), {}).get(target.name)
+            expected = _at(promised, k, target.name)
             test = score(facts.models.get(NETWORK, {}), k, "rmse", target.name)
             if expected is None or test is None:
                 continue
+            bounds = [_at((interval or {}).get(side, {}), k, target.name) for side in ("low", "high")]
+            still = _at(content["persistence"], k, target.name)
             places = decimals_for([expected, test])
-            ratio = percent(test / expected - 1, signed=True) if expected > 0 else MISSING
-            row = (f"{target.description}, {horizon_text(facts, k)} ahead", target.unit)
-            rows.append((*row, number(expected, places), number(test, places), ratio, number(still, places)))
+            rows.append(
+                (
+                    f"{target.description}, {horizon_text(facts, k)} ahead",
+                    target.unit,
+                    _with_bounds(expected, bounds, places),
+                    number(test, places),
+                    percent(test / expected - 1, signed=True) if expected > 0 else MISSING,
+                    _with_bounds(
+                        _at(skill["promise"], k, target.name),
+                        [_at(skill["interval"][side], k, target.name) for side in ("low", "high")],
+                        2,
+                    ),
+                    number(_at(skill.get("test", {}), k, target.name), 2),
+                    number(still, places),
+                )
+            )
     if not rows:
         return None
+    beside = "Error over the linear model's" if skill["against"] == FLOOR else "Error over persistence's"
     columns = (
         ("Output", ""),
         ("Unit", ""),
-        ("Promised", "RMSE"),
+        ("Promised (90 % of tests)", "RMSE"),
         ("On the test recordings", "RMSE"),
         ("Test against promise", ""),
+        (f"{beside}, promised (90 %)", ""),
+        ("the same, test", ""),
         ("Present value kept, left-out data", "RMSE"),
     )
     return TextTable("What left-out data promised, and what came of it", columns, tuple(rows))
+
+
+def promise_line(content: Mapping[str, Any]) -> str:
+    """What became of the promise on the test recordings, in a sentence; empty before they were judged."""
+    tested = content.get("results", {}).get(NETWORK, {}).get("test", {})
+    interval, skill = content.get("interval"), content.get("skill") or {}
+    if not interval or not tested:
+        return ""
+    inside, count = _within(tested, interval)
+    line = f"The promised error held on {inside} of {count} outputs and horizons (within its 90 % interval)"
+    pairs = [
+        (promised, skill["test"][k][name])
+        for k, row in skill.get("promise", {}).items()
+        for name, promised in row.items()
+        if promised > 0 and skill.get("test", {}).get(k, {}).get(name, 0.0) > 0
+    ]
+    if not pairs:
+        return f"{line}."
+    # Geometric means: ratios of errors.
+    promised, measured = (math.exp(sum(map(math.log, each)) / len(each)) for each in zip(*pairs, strict=True))
+    beside = "the linear model's" if skill["against"] == FLOOR else "persistence's"
+    return f"{line}; relative to {beside} it was promised as {promised:.2f} and is {measured:.2f}."
+
+
+def _within(tested: Mapping[str, Any], interval: Mapping[str, Any]) -> tuple[int, int]:
+    """How many test errors lie within their bounds, and how many have some."""
+    within = [
+        low <= tested[k][name] <= interval["high"][k][name]
+        for k, row in interval["low"].items()
+        for name, low in row.items()
+        if name in tested.get(k, {}) and name in interval["high"].get(k, {})
+    ]
+    return sum(within), len(within)
+
+
+def _at(errors: Mapping[str, Mapping[str, float]], k: int, name: str) -> float | None:
+    return errors.get(str(k), {}).get(name)
+
+
+def _with_bounds(value: float | None, bounds: list[float | None], places: int) -> str:
+    """A number with its interval, where it has one."""
+    if value is None or None in bounds:
+        return number(value, places)
+    return f"{number(value, places)} ({number(bounds[0], places)} to {number(bounds[1], places)})"

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError
-from edp.evaluation.guard import beaten_by
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, beaten_by
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
-from edp.report.run.outputs import by_output, judged_line, losses_line
+from edp.report.run.outputs import by_output, judged_line, losses_line, situation_line
 from edp.report.run.predictability import limit_line, read_limit
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
 
@@ -29,7 +29,7 @@ MAKERS = {
     "predictions.safetensors": "edp evaluate",
     "footprint.json": "edp evaluate",
 }
-METRICS = ("mae", "rmse", "p95", "p99", "r2", "bias", "composite")
+METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def main_horizon(facts: Facts) -> int | None:
     return max(facts.horizons, default=None)
 
 
-def score(model: Mapping[str, Any], horizon: int, metric: str = "mae", output: str = "mean") -> float | None:
+def score(model: Mapping[str, Any], horizon: int, metric: str = MEASURE, output: str = "mean") -> float | None:
     """One overall score of a model, or None where it was not computed."""
     value = model.get("overall", {}).get(str(horizon), {}).get(output, {}).get(metric)
     return None if value is None or not math.isfinite(value) else float(value)
@@ -246,10 +246,10 @@ def label_of(facts: Facts, name: str) -> str:
 
 
 def comparison_rows(facts: Facts, horizon: int | None = None) -> list[dict[str, Any]]:
-    """One row per scored model, best mean absolute error first, in report units.
+    """One row per scored model, least error (`MEASURE`) first, in report units.
 
     Keys: `model`, `label`, `is_network`, each of `METRICS`, `change` (network's error against this model's, -0.45
-    is 45 % lower; None for the network itself), `outputs` (name -> MAE) and `seconds` of fitting.
+    is 45 % lower; None for the network itself), `outputs` (name -> error) and `seconds` of fitting.
     """
     samples = main_horizon(facts) if horizon is None else horizon
     if samples is None:
@@ -257,16 +257,16 @@ def comparison_rows(facts: Facts, horizon: int | None = None) -> list[dict[str, 
     ours = score(facts.models.get(NETWORK, {}), samples)
     rows: list[dict[str, Any]] = []
     for name, model in facts.models.items():
-        mae = score(model, samples)
-        if mae is None:
+        error = score(model, samples)
+        if error is None:
             continue
         row: dict[str, Any] = {"model": name, "label": label_of(facts, name), "is_network": name == NETWORK}
         row |= {metric: score(model, samples, metric) for metric in METRICS}
-        row["change"] = ours / mae - 1 if ours is not None and mae > 0 and name != NETWORK else None
+        row["change"] = ours / error - 1 if ours is not None and error > 0 and name != NETWORK else None
         row["outputs"] = {target.name: score(model, samples, output=target.name) for target in facts.targets}
         row["seconds"] = model.get("seconds")
         rows.append(row)
-    return sorted(rows, key=lambda row: row["mae"])
+    return sorted(rows, key=lambda row: row[MEASURE])
 
 
 def headline(facts: Facts) -> str:
@@ -290,8 +290,9 @@ def headline(facts: Facts) -> str:
     places = min(max(decimals_for(values.values(), significant=2), 1), 4 if unit else 8)
     parts = [f"{row['label']} {number(values[row['model']], places)}" for row in rows if not row["is_network"]]
     shown = parts if len(parts) <= 4 else [*parts[:3], f"{len(parts) - 3} more above that"]
-    start = f"At {horizon_text(facts, samples)} ahead the network is off by {number(values[NETWORK], places)} {unit}"
-    return f"{first} {'; '.join([f'{start.rstrip()} on average', *shown])}.".strip()
+    ours = f"{number(values[NETWORK], places)} {unit}".rstrip()
+    start = f"At {horizon_text(facts, samples)} ahead the network is off by {ours}"
+    return f"{first} {'; '.join([f'{start} ({MEASURE_NAME})', *shown])}.".strip()
 
 
 def verdict_lines(facts: Facts) -> list[str]:
@@ -310,8 +311,9 @@ def verdict_lines(facts: Facts) -> list[str]:
         if both:
             lines.append(f"It is the better of the two on {won} of {both} test recordings.")
     judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
+    beyond = situation_line(facts.scores) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))
-    lines += [line for line in (judged, limit) if line]
+    lines += [line for line in (judged, beyond, limit) if line]
     checks = (facts.footprint or {}).get("verdict", [])
     if checks:
         over = [str(check["what"]) for check in checks if not check["fits"]]
@@ -327,7 +329,7 @@ def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:
 
     def errors(name: str) -> dict[str, float]:
         scored = facts.models.get(name, {}).get("recordings", {})
-        recording_errors = {key: value.get(samples, {}).get("mean", {}).get("mae") for key, value in scored.items()}
+        recording_errors = {key: value.get(samples, {}).get("mean", {}).get(MEASURE) for key, value in scored.items()}
         return {key: value for key, value in recording_errors.items() if value is not None}
 
     ours, theirs = errors(NETWORK), errors(baseline)
@@ -348,6 +350,7 @@ def spread_text(facts: Facts) -> str:
     places = decimals_for(spread[key] for key in ("median", "q25", "q75"))
     text = {key: number(spread[key], places) for key in ("median", "q25", "q75", "min", "max")}
     return (
-        f"Over the test recordings the network's error has a median of {text['median']} {facts.unit}; half of them lie "
-        f"between {text['q25']} and {text['q75']}, the best at {text['min']} and the worst at {text['max']}."
+        f"Over the test recordings the network's mean absolute error has a median of {text['median']} {facts.unit}; "
+        f"half of them lie between {text['q25']} and {text['q75']}, the best at {text['min']} and the worst at "
+        f"{text['max']}."
     )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tsdownsample import MinMaxLTTBDownsampler
 
+from edp.evaluation.guard import MEASURE
 from edp.report.run.facts import NETWORK, TRUTH, Facts, main_horizon, score
 
 WHOLE, EXCERPT = "whole", "excerpt"
@@ -193,12 +194,12 @@ def _residuals(facts: Facts, model: str, horizon: int, output: int) -> Array:
 
 
 def horizon_curves(facts: Facts) -> dict[str, list[tuple[float, float]]]:
-    """Mean absolute error of each model against the horizon: name -> (milliseconds or samples, report units)."""
+    """Error (`MEASURE`) of each model against the horizon: name -> (milliseconds or samples, report units)."""
     scale = 1000.0 / facts.rate_hz if facts.rate_hz else 1.0
     curves: dict[str, list[tuple[float, float]]] = {}
     for name, model in facts.models.items():
         points = [(k * scale, score(model, k)) for k in sorted(facts.horizons)]
-        curve = [(x, mae) for x, mae in points if mae is not None]
+        curve = [(x, error) for x, error in points if error is not None]
         if curve:
             curves[name] = curve
     return curves
@@ -223,17 +224,17 @@ def speed_bands(facts: Facts, horizon: int) -> dict[str, list[dict[str, float | 
 
 
 def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, list[float | None]]]:
-    """Recordings, the network's worst last, and each model's mean absolute error on them in that order."""
+    """Recordings, the network's worst last, and each model's error on them in that order."""
 
-    def mae(model: Mapping[str, Any], recording: str) -> float | None:
-        value = model.get("recordings", {}).get(recording, {}).get(str(horizon), {}).get("mean", {}).get("mae")
+    def error(model: Mapping[str, Any], recording: str) -> float | None:
+        value = model.get("recordings", {}).get(recording, {}).get(str(horizon), {}).get("mean", {}).get(MEASURE)
         return None if value is None or not math.isfinite(value) else float(value)
 
     scored = {name: model for name, model in facts.models.items() if model.get("recordings")}
     lead = scored.get(NETWORK) or next(iter(scored.values()), {})
-    keys = [(mae(lead, recording), recording) for recording in lead.get("recordings", {})]
+    keys = [(error(lead, recording), recording) for recording in lead.get("recordings", {})]
     order = [recording for _, recording in sorted((value, key) for value, key in keys if value is not None)]
-    return order, {name: [mae(model, recording) for recording in order] for name, model in scored.items()}
+    return order, {name: [error(model, recording) for recording in order] for name, model in scored.items()}
 
 
 def learning_curves(facts: Facts) -> dict[str, list[float | None]]:

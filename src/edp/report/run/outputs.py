@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edp.data.splits import kind_of_name
-from edp.evaluation.guard import NETWORK, lost_outputs
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
 from edp.report.common.wording import listed, number, percent
 
 SHOWN = 4
 """Outputs or logs that a sentence names."""
+NOTED = 2.0
+"""Times that changes differ from those in training before the ratio is what is said of them."""
 FEW = 3
 """Test logs below which one odd log decides the figure."""
 
@@ -21,7 +23,7 @@ def losses_line(scores: Mapping[str, Any]) -> str:
     losses = lost_outputs(scores)
     if not losses:
         return ""
-    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less RMSE)" for loss in losses[:SHOWN]]
+    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less {MEASURE_NAME})" for loss in losses[:SHOWN]]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
     return (
         f"The network loses to a baseline on {len(losses)} of {len(scores['targets'])} outputs: {listed(parts)}{more}."
@@ -50,6 +52,33 @@ def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None)
     return line
 
 
+def situation_line(scores: Mapping[str, Any]) -> str:
+    """Where the judged recordings are another situation than the training; empty where they are not."""
+    situation = scores.get("situation") or {"outside": (), "changes": ()}
+    most = sorted(situation["changes"], key=lambda row: abs(math.log(row["ratio"])))
+    changes = {row["target"]: row for row in most}  # of each target the horizon that differs most
+    parts = [
+        f"{row['channel']} is outside of its range in training in {percent(row['share'])} of the ticks"
+        for row in situation["outside"]
+    ]
+    parts += [_changed(row) for row in changes.values()]
+    if not parts:
+        return ""
+    more = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
+    return (
+        f"The test recordings differ from the training: {'; '.join(parts[:SHOWN])}{more}. What left-out data of the "
+        "training promise may not hold there: record more like it, and train on it."
+    )
+
+
+def _changed(row: Mapping[str, Any]) -> str:
+    """A target that changes otherwise than in training, in words."""
+    ahead = f"{row['target']} in {row['horizon']} tick{'s' if row['horizon'] > 1 else ''}"
+    if 1 / NOTED <= row["ratio"] <= NOTED:
+        return f"{percent(row['beyond'])} of the changes of {ahead} are larger than any in training"
+    return f"changes of {ahead} are {row['ratio']:.2g} times as large as in training"
+
+
 def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[str, str, str]], ahead: str) -> str:
     """The headline where outputs have no common unit: each with its own error, and the best baseline's.
 
@@ -62,11 +91,11 @@ def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[s
     parts = []
     for name, description, unit in targets[:SHOWN]:
         errors = {
-            str(model["label"]): model["overall"].get(str(horizon), {}).get(name, {}).get("mae")
+            str(model["label"]): model["overall"].get(str(horizon), {}).get(name, {}).get(MEASURE)
             for key, model in scores["models"].items()
             if key != NETWORK
         }
-        ours = scores["models"][NETWORK]["overall"].get(str(horizon), {}).get(name, {}).get("mae")
+        ours = scores["models"][NETWORK]["overall"].get(str(horizon), {}).get(name, {}).get(MEASURE)
         if ours is None:
             continue
         finite = {label: error for label, error in errors.items() if error is not None and math.isfinite(error)}
@@ -75,7 +104,7 @@ def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[s
         of_unit = "" if unit in ("", "1") else f" {unit}"
         parts.append(f"{number(ours, _places(ours))}{of_unit} in {description[:1].lower()}{description[1:]}{beside}")
     more = f"; {len(targets) - SHOWN} more outputs below" if len(targets) > SHOWN else ""
-    return f"At {ahead} ahead the network is off by {', '.join(parts)} on average{more}."
+    return f"At {ahead} ahead the network is off by ({MEASURE_NAME}) {', '.join(parts)}{more}."
 
 
 def _places(value: float) -> int:

@@ -16,7 +16,7 @@ from edp.report.common.templates import template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
 from edp.report.run.charts import DOTS_AT_MOST, run_charts
-from edp.report.run.choice import candidates_table, model_tables, promise_table, read_choice
+from edp.report.run.choice import candidates_table, model_tables, promise_line, promise_table, read_choice
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.storage import write_bytes
 
@@ -94,7 +94,9 @@ def choice_of(facts: run.Facts) -> dict[str, Any]:
     if content is None:
         return {}
     return {
-        "sentence": unbroken(content["sentence"]),
+        "sentence": unbroken(
+            " ".join(filter(None, (content["sentence"], *content.get("notes", ()), promise_line(content))))
+        ),
         "tables": [entry for entry in (candidates_table(content), promise_table(facts, content)) if entry is not None],
         "models": model_tables(facts, content),
     }

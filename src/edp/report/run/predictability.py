@@ -51,6 +51,6 @@ def limit_line(facts: Facts, samples: int | None) -> str:
     error_with_commands = number(limit["commands_known"]["mae"][row][-1], 2)
     return (
         f"The limit of predictability here is {least} {facts.unit} (95 %: {low} to {high}): even a predictor that "
-        f"knows the true state is off by that, for it knows neither the operator's next choices nor the noise to come; "
-        f"with the commands known, its error would be {error_with_commands}."
+        f"knows the true state has that mean absolute error, for it knows neither the operator's next choices nor the "
+        f"noise to come; with the commands known, its error would be {error_with_commands}."
     )

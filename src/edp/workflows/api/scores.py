@@ -9,7 +9,7 @@ from typing import Any
 from edp.report import Facts, headline
 from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, score_figure, score_tables, study_figure, study_html, text_of
-from edp.report.run.facts import comparison_rows
+from edp.report.run.facts import comparison_rows, score
 from edp.report.search import words
 from edp.report.search.facts import StudyFacts, facts_of
 from edp.storage.study_file import read_study
@@ -61,7 +61,7 @@ class JudgedScores(OneFrame):
         return ShownTable(score_tables(self._facts))
 
     def plot(self) -> Any:
-        """A Plotly figure: mean absolute error of every judged model, against the horizon where there are several."""
+        """A Plotly figure: RMSE of every judged model, against the horizon where there are several."""
         return score_figure(self._facts)
 
     def _columns(self) -> dict[str, list[Any]]:
@@ -69,7 +69,10 @@ class JudgedScores(OneFrame):
         keys = [key for key in rows[0] if key not in ("outputs", "is_network", "label")]
         columns = {key: [row[key] for row in rows] for key in keys}
         for target in self._facts.targets:
-            columns[f"mae {target.name}"] = [row["outputs"][target.name] for row in rows]
+            for metric in ("mae", "rmse"):
+                columns[f"{metric} {target.name}"] = [
+                    score(self._facts.models[row["model"]], row["horizon"], metric, target.name) for row in rows
+                ]
         return columns
 
     def __repr__(self) -> str:

@@ -10,47 +10,30 @@ from typing import Any
 import numpy as np
 
 from edp.config.experiment import Experiment, plain_tree
-from edp.data.features import FEATURE_SETS
 from edp.data.prepared import Prepared
 from edp.data.scaling import least_spread
-from edp.data.splits import ByRecording, ByTime
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.source import DataSource
-from edp.networks.predictor import build_model
 from edp.recording import FloatArray, Recording
-from edp.report.run.choice import FILE, read_choice
+from edp.report.run.choice import FILE, FLOOR, read_choice
 from edp.signals import Kind
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.runs import run_key
-from edp.training import Bundle, TrainingProgress, load_bundle
+from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
+from edp.workflows.auto.channels import MOST_LISTED, fit_to_channels
+from edp.workflows.auto.choice_facts import choice_facts
+from edp.workflows.auto.division import divide
 from edp.workflows.auto.foundation import Foundation, read_foundation
-from edp.workflows.auto.promise import (
-    PortfolioChoice,
-    Promise,
-    blocks_of,
-    choose,
-    in_report_units,
-    promise_of,
-    standard_truth,
-    to_json,
-)
+from edp.workflows.auto.promise import blocks_of, choose
 from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.auto.train_candidates import CandidateTraining, TrainedCandidate, train_all
 from edp.workflows.train_evaluate import keep_fitted, prepare_data
 
-USUAL = "FG2"
-"""The feature set that is taken without a word where the recordings have its channels."""
-LEAST_OF_SHARE = 0.25
-"""Of the ticks that the share of a part stands for: of 300 s and 4 s a draw of whole recordings let the 4 s train."""
-LEAST_DIVIDED = 14
-"""Gaps that a recording is long of which 15 % are two of them."""
 MOST_TICKS = 0.9
 """Share of the ticks whose stretches settle how far changes reach back: a short log among long ones shortens none."""
-MOST_LISTED = 20
-"""Channels that a message lists."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +81,8 @@ def train_auto(
     foundation = read_foundation(settings.auto.foundation)
     if foundation is not None:
         foundation.check_recordings(once.read())
-    settings = _divided(once, _of_these_channels(once, settings))
+    settings, of_channels = fit_to_channels(settings, once.read()[0].channel_names, str(source.path))
+    settings, of_parts = divide(once.read(), settings)
     data, amount = _prepare(once, settings, foundation)
     if foundation is not None:
         foundation.check_task(data)
@@ -115,10 +99,16 @@ def train_auto(
     if not trained:
         raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
     choice = choose({name: one.promise for name, one in trained.items()})
-    facts = _facts(choice, trained, failed, data, settings, amount, key)
-    winner = trained[choice.name]
+    facts = choice_facts(choice, trained, failed, data, settings, amount) | {
+        "key": key,
+        "notes": [*of_channels, *of_parts, *_still_inputs(data)],
+    }
+    winner, floor = trained[choice.name], trained.get(FLOOR)
     # First the choice, whose key tells a folder that a kill left between the two from one of another run.
     write_json(folder / FILE, facts)
+    if floor is not None and winner is not floor:
+        # What the skill is measured against: `edp evaluate` needs its error on the test recordings, too.
+        save_bundle(make_bundle(floor.fitted.predictor, data, {"auto": facts["sentence"]}), folder / FLOOR)
     bundle = keep_fitted(folder, source, winner.experiment, data, winner.fitted, {"auto": facts["sentence"]})
     return AutoResult(bundle, facts)
 
@@ -163,59 +153,6 @@ class _ReadOnce:
     def to_plain(self) -> dict[str, Any]:
         """As the source has it."""
         return self._source.to_plain()
-
-
-def _of_these_channels(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
-    """Settings that read every channel where the recordings have not those of the usual feature set.
-
-    Raises:
-        ConfigError: a target is no channel of the recordings.
-    """
-    names = source.read()[0].channel_names
-    task = settings.task
-    if task.features == USUAL and not set(FEATURE_SETS[USUAL].inputs) <= set(names):
-        task = replace(task, features="all")
-    derived = () if isinstance(task.features, str) else task.features.derived
-    channels = {*names, *(entry.name for entry in (*derived, *task.derived_targets))}
-    absent = [target for target in task.targets if target not in channels]
-    if absent:
-        listed = ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "")
-        raise ConfigError(
-            f"task.targets: {', '.join(absent[:MOST_LISTED])} is no channel of '{source.path}', which has {listed}; "
-            f"name what to predict, for example --set 'task.targets=[\"{names[-1]}\"]'"
-        )
-    return replace(settings, task=task)
-
-
-def _divided(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
-    """Settings that divide recordings by time where whole ones cannot train, validate and test.
-
-    These are a single recording, and recordings of such different lengths that a part would have next to nothing.
-    """
-    split, recordings = settings.split, source.read()
-    if not isinstance(split, ByRecording) or split.validation or split.test:
-        return settings
-    by_time = ByTime(validation_share=split.validation_share, test_share=split.test_share)
-    if len(recordings) == 1:
-        return replace(settings, split=by_time)
-    gap = LEAST_SPAN + max(settings.task.horizons)
-    # Of equal recordings that are too short to be divided nothing would be left to validate.
-    if _even(split, recordings, gap) or all(recording.samples < LEAST_DIVIDED * gap for recording in recordings):
-        return settings
-    return replace(settings, split=replace(by_time, whole_short=True))
-
-
-def _even(split: ByRecording, recordings: Sequence[Recording], gap: int) -> bool:
-    """Whether each part has at least `LEAST_OF_SHARE` of the ticks that its share of the recordings stands for."""
-    try:
-        parts = split.split(recordings, gap)
-    except DataError:
-        return False
-    total = sum(recording.samples for recording in recordings)
-    shares = {"validation": split.validation_share, "test": split.test_share}
-    shares["train"] = 1.0 - sum(shares.values())
-    ticks = {part: sum(one.stop - one.start for one in getattr(parts, part)) for part in shares}
-    return all(ticks[part] >= LEAST_OF_SHARE * share * total for part, share in shares.items())
 
 
 def _prepare(source: _ReadOnce, settings: AutoSettings, foundation: Foundation | None) -> tuple[Prepared, Amount]:
@@ -292,6 +229,16 @@ def _check_moving(data: Prepared) -> None:
         )
 
 
+def _still_inputs(data: Prepared) -> list[str]:
+    """Which inputs say nothing since they stand still, in a sentence where there are some."""
+    moving = _moving([part.inputs for part in data.train], [channel.kind for channel in data.inputs])
+    still = [channel.name for channel, moves in zip(data.inputs, moving, strict=True) if not moves]
+    if not still:
+        return []
+    more = f" and {len(still) - MOST_LISTED} more" if len(still) > MOST_LISTED else ""
+    return [f"Still through the training part, so without weight: {', '.join(still[:MOST_LISTED])}{more}."]
+
+
 def _moving(parts: Sequence[FloatArray], kinds: Sequence[Kind]) -> list[bool]:
     """Whether each channel moves in stretches ``(time, channel)``, by its own size: units differ by factors of 1e12."""
     values = np.concatenate(parts).astype(np.float64)
@@ -322,70 +269,3 @@ def _jobs(experiments: dict[str, Experiment], data: Prepared, amount: Amount, fo
         CandidateTraining(name, experiment, data, folder / "candidates" / name, blocks, judged, begun.get(name))
         for name, experiment in experiments.items()
     ]
-
-
-def _facts(
-    choice: PortfolioChoice,
-    trained: dict[str, TrainedCandidate],
-    failed: dict[str, str],
-    data: Prepared,
-    settings: AutoSettings,
-    amount: Amount,
-    key: str,
-) -> dict[str, Any]:
-    """The content of ``auto.json``."""
-    candidates = {
-        name: {
-            "label": CANDIDATES[name].label,
-            "seconds": round(one.fitted.seconds, 2),
-            "parameters": sum(parameter.numel() for parameter in one.fitted.predictor.parameters()),
-            "promise": in_report_units(one.promise.error(), data),
-        }
-        for name, one in trained.items()
-    }
-    rows = trained[choice.name].promise.rows
-    unchanged = in_report_units(_persistence(settings, data, amount).last(len(rows)).error(), data)
-    return {
-        "schema": 1,
-        "key": key,
-        "minutes": settings.auto.minutes,
-        "rows": amount.rows,
-        **to_json(choice),
-        "sentence": sentence(choice, trained, amount, data),
-        "candidates": candidates,
-        "persistence": unchanged,
-        "failed": failed,
-    }
-
-
-def _persistence(settings: AutoSettings, data: Prepared, amount: Amount) -> Promise:
-    """Errors of the present value, or of the mean in absolute mode."""
-    # Any network with the scaling of the data: the kept one may have that of other machines.
-    model = settings.experiment(CANDIDATES["linear"].tables(amount) or {}).model
-    net = build_model(data.task, model, data.scaler(), 0)
-    truth = standard_truth(net, data)  # zero is no change, or in absolute mode the mean
-    blocks, _ = blocks_of(data, amount.window)
-    return promise_of([np.zeros_like(one) for one in truth], truth, blocks)
-
-
-def sentence(choice: PortfolioChoice, trained: dict[str, TrainedCandidate], amount: Amount, data: Prepared) -> str:
-    """What was chosen and why, for a person."""
-    label = CANDIDATES[choice.name].label
-    minutes = amount.rows / data.task.rate_hz / 60
-    start = f"Of {len(trained)} models on {minutes:.1f} min of recordings, {label} is kept"
-    others = [name for name in trained if name != choice.name]
-    if not others:
-        return f"{start}: no other one was tried, or all others diverged."
-    if choice.name != choice.best:
-        gain = 100 * (1 - np.exp(-choice.excess[choice.name]))
-        best = CANDIDATES[choice.best].label
-        return (
-            f"{start}: {best} had {gain:.1f} % less error on left-out data, but that is within one standard error, and "
-            "the simpler model wins a tie."
-        )
-    second = min(others, key=lambda name: choice.excess[name])
-    gain = 100 * (1 - np.exp(-choice.excess[second]))
-    return (
-        f"{start}: on left-out data its error is {gain:.1f} % less than that of the next best, "
-        f"{CANDIDATES[second].label}."
-    )

@@ -1,0 +1,96 @@
+"""Whether the parts of a split hold motion, and how the preset auto divides recordings that rest at one end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.data.even_split import blocks_of_motion, is_even, moving_ticks
+from edp.data.splits import ByBlocks, ByName, ByRecording, ByTime
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+from edp.workflows.auto import load_auto
+from edp.workflows.auto.division import divide
+
+RATE = 50.0
+
+
+def recording(name, moves, seed=0):
+    """A position that wanders where `moves`, seen by an encoder whose steps come and go at rest."""
+    rng = np.random.default_rng(seed)
+    speed = np.repeat(rng.uniform(-1, 1, len(moves) // 25 + 1), 25)[: len(moves)] * moves
+    x = np.round(np.cumsum(speed) / RATE / 0.002 + rng.uniform(-0.5, 0.5, len(moves))) * 0.002
+    values = np.float32(np.stack([speed, x], axis=1))
+    return Recording(name, (Channel("u", Kind.GENERIC), Channel("x", Kind.GENERIC)), values, RATE)
+
+
+def settings(*changes):
+    return load_auto(None, ["task.targets=['x']", "task.horizons=[1, 10]", *changes])
+
+
+RESTS_AT_ITS_END = np.arange(6000) < 3600
+MOVES = np.ones(6000, dtype=bool)
+
+
+def test_steps_of_an_encoder_are_no_motion():
+    (moving,) = moving_ticks([recording("a", RESTS_AT_ITS_END)], ["x"], 10)
+    assert moving[:3500].mean() > 0.5
+    assert moving[3700:].mean() < 0.01
+
+
+def test_a_recording_that_rests_at_its_end_is_divided_by_blocks():
+    log = recording("a", RESTS_AT_ITS_END)
+    divided, (words,) = divide([log], settings())
+    assert isinstance(divided.split, ByBlocks)
+    assert "rests" in words
+    assert f"{divided.split.block_s:.3g} s" in words
+    moving = moving_ticks([log], ["x"], 10)
+    gap = 42
+    assert is_even(divided.split, [log], gap, moving)
+    assert not is_even(ByTime(), [log], gap, moving)
+
+
+@pytest.mark.parametrize("moves", [MOVES, np.zeros(6000, dtype=bool)])
+def test_any_other_recording_is_divided_by_time_as_before(moves):
+    divided, words = divide([recording("a", moves)], settings())
+    assert divided.split == ByTime()
+    assert words == []
+
+
+def test_a_split_that_was_asked_for_stays():
+    asked = settings("split.kind='time'")
+    assert divide([recording("a", RESTS_AT_ITS_END)], asked) == (asked, [])
+
+
+def test_whole_recordings_stay_whole_where_each_moves():
+    logs = [recording(name, RESTS_AT_ITS_END, seed) for seed, name in enumerate("abcdef")]
+    divided, words = divide(logs, settings())
+    assert isinstance(divided.split, ByRecording)
+    assert words == []
+
+
+def test_recordings_at_rest_are_not_what_tests():
+    at_rest = np.zeros(6000, dtype=bool)
+    drawn = ByName().split([recording(name, MOVES) for name in "abcdef"], 42)
+    tests = {one.recording for one in drawn.test}
+    logs = [recording(name, at_rest if i in tests else MOVES, i) for i, name in enumerate("abcdef")]
+    divided, _ = divide(logs, settings())
+    moving = moving_ticks(logs, ["x"], 10)
+    assert not isinstance(divided.split, ByRecording)
+    assert is_even(divided.split, logs, 42, moving)
+
+
+def test_missing_values_and_channels_are_no_motion():
+    log = recording("a", MOVES)
+    log.values[100:200] = np.nan
+    (moving,) = moving_ticks([log], ["x", "absent"], 10)
+    assert len(moving) == 6000
+    other = replace(recording("b", MOVES), channels=(Channel("u", Kind.GENERIC), Channel("y", Kind.GENERIC)))
+    assert all(one.all() for one in moving_ticks([log, other], ["x"], 10))
+
+
+def test_blocks_are_longer_than_their_gaps():
+    short = recording("a", MOVES[:600])
+    assert blocks_of_motion([short], 42).block_s * RATE >= 8 * 42
