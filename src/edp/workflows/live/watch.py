@@ -1,0 +1,85 @@
+"""A monitor beside the source: its statistics as columns, its alarms as events."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from edp.errors import ConfigError
+from edp.monitor.alarms import MonitorAlarm
+from edp.monitor.diagnosis.causes import NONE_OF_THESE
+from edp.monitor.monitor import Monitor
+from edp.recording import Recording
+from edp.signals import Channel
+from edp.workflows.live.parts import LivePart, Note, Row
+
+
+class LiveMonitor(LivePart):
+    """The only one who raises alarms: a value outside of its interval is none.
+
+    Args:
+        monitor: at work.
+        channels: of the source.
+        rate_hz: of the source.
+        note: takes events.
+        recording: that is played, whose machine and units are checked; None where there is none.
+
+    Raises:
+        EdpError: another rate, another machine, or none of the monitor's channels.
+    """
+
+    def __init__(
+        self,
+        monitor: Monitor,
+        channels: Sequence[Channel],
+        rate_hz: float,
+        note: Note,
+        recording: Recording | None = None,
+    ) -> None:
+        names = [channel.name for channel in channels]
+        if abs(rate_hz - monitor.rate_hz) > 1e-3 * monitor.rate_hz:
+            raise ConfigError(
+                f"the source has {rate_hz:g} Hz, the monitor {monitor.rate_hz:g} Hz; set rate_hz in the signal map"
+            )
+        lacking = [name for name in monitor.inputs if name not in names]
+        if len(lacking) == len(monitor.inputs):
+            raise ConfigError(f"the source has none of the monitor's channels, such as {monitor.inputs[0]}")
+        if recording is not None:
+            monitor.check(recording)
+        if lacking:
+            note("warning", f"the source lacks {', '.join(lacking)}: what judges or reads these channels is silent", "")
+        self._stream, self._note = monitor.stream(), note
+        # One behind the last: NaN for a channel that is not there.
+        self._columns = [names.index(name) if name in names else len(names) for name in monitor.inputs]
+        self._limit, self.width = monitor.chain.limit, len(monitor.chain.watches)
+        note("note", f"monitor: {monitor.limit.sentence()}", "")
+
+    def step(self, row: Row, missed: int) -> Row:
+        """See `LivePart`: statistics over the limit."""
+        if missed > self._stream.monitor.chain.summaries.block:
+            self._stream.reset()
+        verdict = self._stream.step(np.append(row, np.float32(np.nan))[self._columns])
+        if verdict.alarm is not None:
+            self._note("alarm", verdict.alarm.sentence, group_of(verdict.alarm))
+        return np.array(verdict.statistics, np.float32) / np.float32(self._limit)
+
+    def reset(self) -> None:
+        """See `LivePart`."""
+        self._stream.reset()
+
+    def statistics(self, first: int) -> Mapping[str, int]:
+        """Columns of the statistics by name."""
+        watches = self._stream.monitor.chain.watches
+        return {
+            f"{type(watch.detector).__name__.removesuffix('Spec').lower()} {n + 1}": first + n
+            for n, watch in enumerate(watches)
+        }
+
+
+def group_of(alarm: MonitorAlarm) -> str:
+    """Alarms of one group say the same, as `edp.monitor.alarms.episodes` puts them together."""
+    cause = alarm.causes[0] if alarm.causes else None
+    if cause is not None and cause.kind != NONE_OF_THESE:
+        return f"alarm of {cause.component}"
+    return f"alarm of {alarm.evidence[0][0].rpartition('.')[0]}" if alarm.evidence else ""
