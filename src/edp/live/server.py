@@ -34,6 +34,7 @@ MOST_ROWS = 3000
 """Of one message; a source that runs ahead leaves out what nobody could watch, which is counted and shown."""
 BACKLOG_S = 30.0
 """Of rows that a new viewer gets at once."""
+MOST_AHEAD_S = 600.0
 MOST_VIEWERS = 32
 TOKEN_BYTES = 24
 HEADERS = {
@@ -223,7 +224,8 @@ class LiveServer:
         for event in session.events():
             viewer.tell(text_message("event", event=event.to_plain()))
         viewer.tell(self._state())
-        first, rows = session.read(self._sent - backlog, min(backlog, self._sent))
+        oldest = max(0, self._sent - backlog)
+        first, rows = session.read(oldest, self._sent - oldest)
         if len(rows):
             viewer.offer(rows_message(PAST, first, rows, session.stamp), 0)
         sending = asyncio.create_task(viewer.send())
@@ -259,7 +261,9 @@ class LiveServer:
         elif request.name == "speed":
             self.pace.set_speed(request.numbers[0])
         else:
-            self.pace.run_ahead(int(request.numbers[0]))
+            # Of a source without an end a viewer may skip some minutes, not send it off for good.
+            most = self.session.layout.ticks or self.session.ticks + round(MOST_AHEAD_S * self.session.layout.rate_hz)
+            self.pace.run_ahead(min(int(request.numbers[0]), most))
 
 
 def _page(text: str, headers: dict[str, str]) -> Response:

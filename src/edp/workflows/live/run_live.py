@@ -95,6 +95,7 @@ class LiveRun:
     Args:
         order: what to show.
         on_event: called with kind and text of each event.
+        source: of the rows, in place of the order's.
 
     Attributes:
         source: of the rows.
@@ -106,7 +107,12 @@ class LiveRun:
         EdpError: source, models or files do not fit together.
     """
 
-    def __init__(self, order: LiveOrder, on_event: Callable[[str, str], None] | None = None) -> None:
+    def __init__(
+        self,
+        order: LiveOrder,
+        on_event: Callable[[str, str], None] | None = None,
+        source: LiveSource | None = None,
+    ) -> None:
         if order.save is not None and order.save.suffix.lower() not in (".html", ".htm"):
             raise ConfigError(f"--save {order.save}: the page of a session ends in .html")
         self.order, self._on_event = order, on_event or (lambda kind, text: None)
@@ -114,7 +120,7 @@ class LiveRun:
         self._waiting: list[tuple[str, str, str]] = []
         self._recorder: McapRecorder | None = None
         models = _models(order)
-        self.source = SOURCES[order.source].of(order.options, _needs(models, order))
+        self.source = source or SOURCES[order.source].of(order.options, _needs(models, order))
         try:
             self._parts, layout = self._assembled(models)
             self.pace = Pace(self.source.rate_hz, order.speed)
@@ -247,6 +253,7 @@ def run_live(
     order: LiveOrder,
     on_ready: Callable[[LiveServer], None] | None = None,
     on_event: Callable[[str, str], None] | None = None,
+    source: LiveSource | None = None,
 ) -> LiveResult:
     """Serve a session until Ctrl-C, a request to end, or with `LiveOrder.until_end` the end of the source.
 
@@ -254,11 +261,12 @@ def run_live(
         order: what to show.
         on_ready: called once the page can be opened.
         on_event: called with kind and text of each event.
+        source: of the rows, in place of the order's.
 
     Raises:
         EdpError: source, models, port or files cannot be used.
     """
-    live = LiveRun(order, on_event)
+    live = LiveRun(order, on_event, source)
     playing = threading.Thread(target=live.play, name="edp-live-source", daemon=True)
     try:
         asyncio.run(_served(live, playing, on_ready))
