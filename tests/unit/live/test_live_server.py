@@ -199,7 +199,10 @@ def test_a_stalled_viewer_loses_frames_and_nobody_else_does(served, monkeypatch)
     narrow = socket.socket()
     narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     narrow.connect(("127.0.0.1", served.server.port))
-    with served.viewer(max_queue=1, sock=narrow, max_size=None) as stalled, served.viewer(max_size=None) as good:
+    with (
+        served.viewer(max_queue=1, sock=narrow, max_size=None, close_timeout=0.1) as stalled,
+        served.viewer(max_size=None) as good,
+    ):
         texts(stalled, "layout")
         texts(good, "layout")
         received = []

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from edp.errors import DataError
 from edp.live.layout import Forecast, label
 from edp.networks.twin import TwinState
 from edp.signals import KINDS, Channel
@@ -91,5 +92,11 @@ class LiveTwin(LivePart):
         rows = np.array(self._prefix)
         if len(rows) < self._twin.prefix_ticks or not np.isfinite(rows[:, self._answers]).all():
             return
-        self._state = self._twin.reset(rows[None, :, self._commands], rows[None, :, self._answers])
+        try:
+            self._state = self._twin.reset(rows[None, :, self._commands], rows[None, :, self._answers])
+        except DataError as error:
+            # Beyond an end stop of the twin, for example: a whole prefix later the machine may be elsewhere.
+            self._prefix.clear()
+            self._note("warning", f"the twin cannot begin here: {error}", "begin")
+            return
         self._note("note", "the twin runs free from here", "free")

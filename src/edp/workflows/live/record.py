@@ -47,7 +47,7 @@ class McapRecorder:
             self._writer = foxglove.open_mcap(self.path, context=self._context)
         except (OSError, RuntimeError, FileExistsError) as error:
             raise StorageError(
-                f"--record {path}: {error}; choose a file that is not there, in a folder that is"
+                f"--record {path}: {error}; choose a new file in a folder that is there"
             ) from error
 
         def channel(topic: str, schema: dict[str, Any]) -> Any:

@@ -165,6 +165,10 @@ class UdpSource(LiveSource):
             data = self._socket.recv(MOST_BYTES + 1)
         except TimeoutError:
             return None
+        except OSError as error:
+            if sink.stopped:
+                return None
+            raise DataError(f"{self.text} cannot be read any more: {error}; start the session again") from error
         try:
             return row_of(data)
         except DataError as error:
