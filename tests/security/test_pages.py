@@ -28,7 +28,7 @@ def test_all_pages_are_looked_at():
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-@pytest.mark.parametrize("embed", [page.script_json, animation._script_json])
+@pytest.mark.parametrize("embed", [page.script_json, animation.script_text])
 def test_data_in_a_page_ends_no_script(embed, name):
     text = str(embed({"name": name, name: [name]}))
     assert "<" not in text

@@ -26,11 +26,13 @@ def house(benchmark):
 
 def test_rooms_are_few_and_imports_go_down(house):
     # 22 before the room of monitoring, which stands beside that of closed loops: neither knows the other.
-    assert len(house.siblings) <= 23, house.siblings
+    # 23 before the room of the live view: a server that runs on, and knows neither networks nor machines.
+    assert len(house.siblings) <= 24, house.siblings
     # 130 before the rooms of closed loops, which imports eight and is imported by three, and of monitoring, which
     # imports three.
     # 141 before the monitor read networks, twins and recordings (seven more rooms), and settings and testing read it.
-    assert house.arrows <= 150
+    # 150 before the live view, which imports errors, signals, storage and report, and is imported by workflows.
+    assert house.arrows <= 155
     assert house.circles == []
 
 

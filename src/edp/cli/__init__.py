@@ -25,6 +25,7 @@ from edp.cli import (
     identify,
     init,
     inspect,
+    live,
     monitor,
     parity,
     pretrain,
@@ -63,6 +64,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("twin")(twin.twin)
 app.command("rollout")(twin.rollout)
 app.command("control")(control.control)
+app.command("live")(live.live)
 app.command("tune")(control.tune)
 app.command("identify")(identify.identify)
 app.add_typer(search.app, name="search")

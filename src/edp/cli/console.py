@@ -71,7 +71,21 @@ PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
         *("budget", "config", "data", "features", "further", "limit", "map", "on", "out", "page", "scenario", "start"),
-        *("mdf", "monitor", "plant", "plots", "predictor", "run", "study", "teacher", "twin", "w8a16"),
+        *(
+            "log",
+            "mdf",
+            "monitor",
+            "plant",
+            "plots",
+            "predictor",
+            "record",
+            "run",
+            "save",
+            "study",
+            "teacher",
+            "twin",
+            "w8a16",
+        ),
     )
 )
 """Options of all commands that name a file or folder."""

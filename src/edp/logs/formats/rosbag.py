@@ -22,6 +22,7 @@ from edp.errors import DataError, brief
 from edp.logs.formats.bag_guard import check_counts, definitions_of, open_reader
 from edp.logs.formats.base import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
 from edp.logs.formats.edp_metadata import EdpMetadata, parse_edp_metadata
+from edp.logs.formats.mcap_json import holds_json, read_json_mcap
 from edp.logs.formats.names import only, told_apart
 from edp.logs.formats.ros_message import columns_of, layout_of
 from edp.logs.formats.rosbag_write import FACTS_TOPIC, write_bag
@@ -52,6 +53,8 @@ class BagFormat:
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read topics, types and each topic's first message; the others when their values are asked for."""
+        if self.name == "mcap" and path.is_file() and holds_json(path):
+            return read_json_mcap(path)
         column_names = {entry.column for entry in signal_map.channels} or set(VOCABULARY)
         bag = _Bag(path, column_names, signal_map)
         edp_metadata = bag.facts()
@@ -308,7 +311,7 @@ def damage(path: Path) -> Iterator[None]:
 
 def _advice(text: str) -> str:
     advice_by_symptom = {
-        "Profile is not": " (only ROS 2 messages in MCAP are read); convert the wanted topics to CSV or Parquet",
+        "Profile is not": " (only ROS 2 messages in MCAP are read, or JSON); convert topics to CSV or Parquet",
         "encryption": "; decrypt the bag first",
         "not indexed": " (its recorder was killed): run 'rosbag reindex' or record it again",
         "encrypted": "; it may be password-protected",

@@ -157,10 +157,6 @@ def _machine_of(recording: Recording) -> str:
 
 def _angles(shown: _Columns, machine: Machine) -> Array:
     """Joint angles, shape (frame, 3), from the angles themselves or from strokes."""
-    from edp.sim.machine import layout as at
-    from edp.sim.machine.parameters import pack
-    from edp.sim.physics import linkage
-
     angles, strokes = ([f"{kind}_{i}" for i in (1, 2, 3)] for kind in ("JointAngle", "CylStroke"))
     if shown.has(*angles):
         return shown.take(*angles)
@@ -169,24 +165,38 @@ def _angles(shown: _Columns, machine: Machine) -> Array:
             f"recording '{shown.recording.name}' has neither {', '.join(angles)} nor {', '.join(strokes)}; an "
             "animation needs one set: map your columns to these names in a signal map (--map)"
         )
-    axes, plant = pack(machine)
+    angle_tables = stroke_tables(machine)
     joint_angles = []
     for i, name in enumerate(strokes):
-        values, full = shown.take(name)[:, 0], float(axes[i, at.STROKE])
-        if values.min() < -OUTSIDE or values.max() > full + OUTSIDE:
+        values, (grid, psi) = shown.take(name)[:, 0], angle_tables[i]
+        if values.min() < -OUTSIDE or values.max() > grid[-1] + OUTSIDE:
             raise DataError(
                 f"channel '{name}' of '{shown.recording.name}' runs from {values.min():.3f} to {values.max():.3f} m, "
-                f"the {JOINTS[i]} cylinder of {machine.name} from 0 to {full:.3f} m; choose another --machine, or "
+                f"the {JOINTS[i]} cylinder of {machine.name} from 0 to {grid[-1]:.3f} m; choose another --machine, or "
                 "correct unit and zero in the signal map"
             )
+        joint_angles.append(np.interp(values, grid, psi))
+    return np.stack(joint_angles, axis=1)
+
+
+def stroke_tables(machine: Machine) -> tuple[tuple[Array, Array], ...]:
+    """Strokes (m, ascending) and the joint angles (rad) that go with them, of boom, arm and bucket, 201 of each."""
+    from edp.sim.machine import layout as at
+    from edp.sim.machine.parameters import pack
+    from edp.sim.physics import linkage
+
+    axes, plant = pack(machine)
+    angle_tables = []
+    for i in range(len(JOINTS)):
+        full = float(axes[i, at.STROKE])
         grid = np.linspace(0.0, full, 201)
         if i < 2:
             psi = np.array([linkage.angle_at_stroke(i, s, axes, plant) for s in grid])
         else:
             branch, length = linkage.bucket_branch(axes[i, at.CLOSED], axes[i, at.CLOSED] + full, plant)
             psi = np.interp(grid + axes[i, at.CLOSED], length[::-1], branch[::-1])
-        joint_angles.append(np.interp(values, grid, psi))
-    return np.stack(joint_angles, axis=1)
+        angle_tables.append((grid, psi))
+    return tuple(angle_tables)
 
 
 def write_animation(scene: Scene, output: str | Path) -> Path:
@@ -200,7 +210,7 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
         name=scene.name,
         machine=f"{scene.machine.name}, {scene.machine.description}",
         stretch=f"{scene.start_s:g} to {scene.start_s + seconds:g} s",
-        style=Markup(_asset("animation.css")),
+        style=Markup(asset("animation.css")),
         **animation_parts(scene),
     )
     target = Path(output)
@@ -210,7 +220,7 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
 
 def animation_parts(scene: Scene) -> dict[str, Markup]:
     """Script and data of a scene for a page with the elements of ``animation.html.jinja``."""
-    return {"script": Markup(_asset("animation.js")), "data": Markup(_script_json(_plain(scene)))}
+    return {"script": Markup(asset("side_view.js") + asset("animation.js")), "data": Markup(script_text(_plain(scene)))}
 
 
 def _plain(scene: Scene) -> dict[str, Any]:
@@ -218,14 +228,7 @@ def _plain(scene: Scene) -> dict[str, Any]:
     return {
         "rate": FRAMES_PER_S,
         "start": scene.start_s,
-        "geometry": {
-            "length": machine.bodies.length,
-            "boom": asdict(machine.boom_cylinder),
-            "arm": asdict(machine.arm_cylinder),
-            "linkage": asdict(machine.bucket_linkage),
-            "bucket": asdict(machine.bucket),
-            "foot": machine.chassis.boom_foot_height,
-        },
+        "geometry": geometry_of(machine),
         # Decimals finer than a pixel would only enlarge the page.
         "angles": np.round(scene.angles.T, 4).tolist(),
         "velocity": np.round(scene.velocity.T, 1).tolist(),
@@ -237,11 +240,25 @@ def _plain(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _asset(name: str) -> str:
+def geometry_of(machine: Machine) -> dict[str, Any]:
+    """What ``side_view.js`` draws a machine from: lengths (m) and angles (degrees) as plain JSON values."""
+    return {
+        "length": machine.bodies.length,
+        "boom": asdict(machine.boom_cylinder),
+        "arm": asdict(machine.arm_cylinder),
+        "linkage": asdict(machine.bucket_linkage),
+        "bucket": asdict(machine.bucket),
+        "foot": machine.chassis.boom_foot_height,
+    }
+
+
+def asset(name: str) -> str:
+    """Text of a file that pages carry with them: a script or a style."""
     return resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def _script_json(value: Any) -> str:
+def script_text(value: Any) -> str:
+    """Plain JSON values as the text of a script element, which nothing in them can end."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     # A text in the data must not end the script element.
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

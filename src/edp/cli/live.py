@@ -1,0 +1,114 @@
+"""``edp live``: a machine, its models and alarms in the browser, while it works."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, emit, err, out
+from edp.cli.train import MapOption
+from edp.errors import ConfigError
+
+if TYPE_CHECKING:
+    from edp.live.server import LiveServer
+
+LIVE_SOURCES = ("log", "sim", "loop", "udp", "ros2")
+
+
+def live(
+    run: Annotated[
+        Path | None, typer.Argument(metavar="RUN", help="Run folder of edp train or edp twin; may be left out.")
+    ] = None,
+    log: Annotated[Path | None, typer.Option("--log", help="Play this log.")] = None,
+    sim: Annotated[str | None, typer.Option("--sim", help="Run this machine of the simulator, such as M22.")] = None,
+    loop: Annotated[
+        str | None, typer.Option("--loop", help="Closed loops along this task, such as grade, or settings (.toml).")
+    ] = None,
+    udp: Annotated[
+        int | None, typer.Option("--udp", min=0, max=65535, help="Take JSON datagrams on this port.")
+    ] = None,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Take joints and pressures of ROS 2.")] = False,
+    monitor: Annotated[Path | None, typer.Option("--monitor", help="Monitor that raises the alarms.")] = None,
+    speed: Annotated[float, typer.Option(help="Factor on real time of a log, simulator or loop.")] = 1.0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 for a free one.")] = 0,
+    bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    save: Annotated[Path | None, typer.Option("--save", help="Page (.html) to write at the end.")] = None,
+    record: Annotated[Path | None, typer.Option("--record", help="Write the session as MCAP (.mcap).")] = None,
+    until_end: Annotated[bool, typer.Option("--until-end", help="End with the source, for scripts.")] = False,
+    machine: Annotated[str | None, typer.Option(help="Machine or machine file (.toml) of the side view.")] = None,
+    rate: Annotated[float | None, typer.Option(min=0.01, help="Rate (Hz) where no model says it.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulator or the loop.")] = 0,
+    excitation: Annotated[str | None, typer.Option(help="Operator of --sim; default: combined.")] = None,
+    fault: Annotated[list[str], typer.Option("--fault", help="Fault of --sim, as edp simulate takes it.")] = [],  # noqa: B006
+    controller: Annotated[str | None, typer.Option(help="Controller of --loop, such as pi.")] = None,
+    twin: Annotated[Path | None, typer.Option("--twin", help="Twin that the controller of --loop uses.")] = None,
+    udp_bind: Annotated[str, typer.Option("--udp-bind", help="Address that --udp listens on.")] = "127.0.0.1",
+    free_s: Annotated[float, typer.Option("--free-s", min=0.1, help="Length (s) of a twin's free runs.")] = 60.0,
+    signal_map: MapOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show a machine live in the browser: predictions and what then happened, residuals, alarms, side view.
+
+    Only who has the printed address sees the page; nothing on it moves a machine. Ctrl-C ends.
+
+    Example: `edp live runs/m22 --log data/m22/m22_000_combined.parquet --monitor monitors/m22`
+    """
+    from edp.workflows.live import LiveOrder, SourceOptions, run_live
+
+    sources = {"log": log, "sim": sim, "loop": loop, "udp": udp, "ros2": "ros2" if ros2 else None}
+    name, value = _source(sources)
+    settings = {"excitation": excitation, "faults": fault, "controller": controller, "twin": twin, "bind": udp_bind}
+    options = SourceOptions(
+        str(value), signal_map, machine, seed, rate, {key: entry for key, entry in settings.items() if entry}
+    )
+    order = LiveOrder(
+        source=name, options=options, run=run, monitor=monitor, speed=speed, free_s=free_s, host=bind, port=port,
+        save=save, record=record, until_end=until_end,
+    )  # fmt: skip
+
+    def ready(server: LiveServer) -> None:
+        # To standard error, so that JSON on standard output stays one document.
+        (err if as_json else out).print(f"live view: {server.address}")
+        (err if as_json else out).print("whoever has this address sees the session; Ctrl-C ends it")
+        if bind not in ("127.0.0.1", "::1", "localhost"):
+            err.print(f"the page is open to the network of {bind}, and what it shows is not encrypted")
+
+    def event(kind: str, text: str) -> None:
+        if kind != "note":
+            err.print(f"{kind}: {text}")
+
+    result = run_live(order, ready, event)
+    facts = {
+        "ticks": result.ticks,
+        "alarms": result.alarms,
+        "ended": result.ended,
+        "late": result.late,
+        "saved": result.saved and str(result.saved),
+        "recorded": result.recorded and str(result.recorded),
+    }
+
+    def show() -> None:
+        out.print(f"{result.ticks:,} ticks, {result.alarms:,} alarms; {result.ended}")
+        if result.saved is not None:
+            out.print(f"session: {result.saved.resolve()}")
+        if result.recorded is not None:
+            out.print(f"recording: {result.recorded.resolve()}")
+
+    emit(as_json, facts, show)
+
+
+def _source(options: Mapping[str, object]) -> tuple[str, object]:
+    """The one source that was given.
+
+    Raises:
+        ConfigError: none, or several.
+    """
+    chosen = [(name, value) for name, value in options.items() if value is not None]
+    if len(chosen) != 1:
+        names = ", ".join(f"--{name}" for name in LIVE_SOURCES)
+        what = "no source" if not chosen else " and ".join(f"--{name}" for name, _ in chosen)
+        raise ConfigError(f"edp live takes one source, and {what} was given; choose one of {names}")
+    return chosen[0]

@@ -1,0 +1,8 @@
+"""The live view: what a source and its models say, tick by tick, on a page of a small server of this machine."""
+
+from edp.live.layout import Forecast, LiveLayout, LiveTrace
+from edp.live.pace import Pace
+from edp.live.saved import write_session_page
+from edp.live.session import LiveSession
+
+__all__ = ["Forecast", "LiveLayout", "LiveSession", "LiveTrace", "Pace", "write_session_page"]

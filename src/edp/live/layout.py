@@ -1,0 +1,120 @@
+"""What the columns of a live session are, and how a page shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from edp.signals import KINDS, Channel, Kind
+
+MOST_LABEL = 80
+"""Characters of a name on the page; a longer one would push everything else off it."""
+KELVIN = 273.15
+
+
+@dataclass(frozen=True)
+class LiveTrace:
+    """One column of measured values.
+
+    Attributes:
+        name: as text; nothing in it is markup.
+        unit: that the page shows.
+        factor: from SI to that unit.
+        offset: added behind the factor.
+        description: in words.
+    """
+
+    name: str
+    unit: str
+    factor: float = 1.0
+    offset: float = 0.0
+    description: str = ""
+
+    @staticmethod
+    def of(channel: Channel) -> LiveTrace:
+        """A channel in the unit of reports."""
+        facts = KINDS[channel.kind]
+        offset = -KELVIN if channel.kind is Kind.TEMPERATURE else 0.0
+        return LiveTrace(
+            label(channel.name), facts.report_unit, facts.report_factor, offset, label(channel.description)
+        )
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """A prediction, made at a tick for `ticks` later, with its interval.
+
+    Attributes:
+        name: of what is predicted.
+        unit: see `LiveTrace`; `factor` likewise.
+        factor: from SI to that unit.
+        ticks: how far ahead; 0 where the value of the present tick is meant.
+        column: of the prediction.
+        lower: column of the interval's lower bound, None without one; `upper` likewise.
+        upper: see `lower`.
+        coverage: share that the interval is meant to hold.
+        measured: column of what then happened, None where nothing measures it.
+        model: what made it, in words.
+    """
+
+    name: str
+    unit: str
+    factor: float
+    ticks: int
+    column: int
+    lower: int | None = None
+    upper: int | None = None
+    coverage: float | None = None
+    measured: int | None = None
+    model: str = "network"
+
+
+@dataclass(frozen=True)
+class LiveLayout:
+    """The columns of a session, and what a page needs to show them.
+
+    Attributes:
+        title: of the page.
+        source: where the rows come from, in words.
+        rate_hz: ticks per second.
+        width: number of columns.
+        traces: of the first columns, in order.
+        forecasts: of further columns.
+        geometry: of the machine for the side view; None without one.
+        angles: columns of the joint angles (rad) of boom, arm and bucket; empty without a side view.
+        levers: columns that an operator or controller commands.
+        statistics: columns of a monitor's statistics over their limit, by name; an alarm is raised above 1.
+        steered: whether viewers may pause the source, change its speed and let it run ahead.
+        ticks: of the whole source, where its end is known.
+    """
+
+    title: str
+    source: str
+    rate_hz: float
+    width: int
+    traces: Sequence[LiveTrace]
+    forecasts: Sequence[Forecast] = ()
+    geometry: Mapping[str, Any] | None = None
+    angles: Sequence[int] = ()
+    levers: Sequence[int] = ()
+    statistics: Mapping[str, int] | None = None
+    steered: bool = False
+    ticks: int | None = None
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain JSON values, keys as the fields."""
+        plain = asdict(self)
+        plain["statistics"] = [{"name": label(name), "column": n} for name, n in (self.statistics or {}).items()]
+        return plain
+
+
+def sentence(text: str) -> str:
+    """A text without invisible signs, which could turn its direction or move a cursor."""
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+
+
+def label(text: str) -> str:
+    """A text of a file or a sender as a page may have it: of bounded length, and without invisible signs."""
+    visible = sentence(text[: MOST_LABEL + 1])
+    return visible if len(visible) <= MOST_LABEL else visible[: MOST_LABEL - 1] + "…"

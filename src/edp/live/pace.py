@@ -1,0 +1,100 @@
+"""When a tick is due: real time times a speed, with pauses; viewers change it, the thread of the source obeys."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+
+from edp.errors import ConfigError
+
+SLOWEST, FASTEST = 0.01, 1000.0
+"""Factors on real time that a viewer may ask for."""
+LATE_S = 1.0
+"""A source that is later than this gives up the lost time: it would otherwise race until it caught up."""
+
+
+class Pace:
+    """The clock of a source that can be steered.
+
+    Args:
+        rate_hz: ticks per second.
+        speed: factor on real time; infinite for as fast as possible.
+        clock: seconds that never go back.
+
+    Attributes:
+        speed: factor on real time.
+        paused: whether ticks wait.
+        stopped: whether the session is over.
+        late: how often time was given up.
+    """
+
+    def __init__(self, rate_hz: float, speed: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
+        self.rate_hz, self.speed, self.paused, self.stopped, self.late = rate_hz, checked_speed(speed), False, False, 0
+        self._clock, self._changed = clock, threading.Condition()
+        self._ahead = 0
+        self._base: tuple[int, float] | None = None
+
+    def wait(self, tick: int) -> bool:
+        """Wait until a tick is due; False once the session is over."""
+        with self._changed:
+            while not self.stopped:
+                if tick < self._ahead or (math.isinf(self.speed) and not self.paused):
+                    self._base = None
+                    return True
+                if self.paused:
+                    self._base = None
+                    self._changed.wait()
+                    continue
+                now = self._clock()
+                first, began = self._base = self._base or (tick, now)
+                left = began + (tick - first) / (self.rate_hz * self.speed) - now
+                if left <= 0.0:
+                    if left < -LATE_S:
+                        self.late += 1
+                        self._base = None
+                    return True
+                self._changed.wait(left)
+            return False
+
+    def pause(self, paused: bool) -> None:
+        """Let ticks wait, or go on."""
+        with self._changed:
+            self.paused, self._base = paused, None
+            self._changed.notify_all()
+
+    def set_speed(self, speed: float) -> None:
+        """Change the factor on real time.
+
+        Raises:
+            ConfigError: it is none.
+        """
+        with self._changed:
+            self.speed, self._base = checked_speed(speed), None
+            self._changed.notify_all()
+
+    def run_ahead(self, tick: int) -> None:
+        """Let all ticks before this one come as fast as they can: models have seen each of them."""
+        with self._changed:
+            self._ahead = tick
+            self._changed.notify_all()
+
+    def stop(self) -> None:
+        """End the session."""
+        with self._changed:
+            self.stopped = True
+            self._changed.notify_all()
+
+
+def checked_speed(speed: float) -> float:
+    """A factor on real time.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if math.isinf(speed) and speed > 0:
+        return speed
+    if not SLOWEST <= speed <= FASTEST:
+        raise ConfigError(f"speed {speed:g}; from {SLOWEST:g} to {FASTEST:g} times real time, or inf")
+    return speed

@@ -1,0 +1,62 @@
+"""Messages between server and page: rows as binary, everything else as JSON; what a page may ask for."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+
+ROWS, PAST = 1, 2
+HEAD = struct.Struct("<4I d")
+"""Kind, first tick, number of rows, number of columns; time of the newest tick (s since 1970)."""
+MOST_REQUEST = 256
+"""Bytes of a request."""
+MOST_PAST = 12_000
+"""Rows of one answer: two minutes at 100 Hz."""
+REQUESTS = {"past": ("first", "count"), "pause": ("value",), "speed": ("value",), "ahead": ("tick",)}
+"""What a page may ask for, with its numbers. Nothing here reaches a machine, a disk or a setting."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a page asks for; see `REQUESTS`."""
+
+    name: str
+    numbers: tuple[float, ...]
+
+
+def rows_message(kind: int, first: int, rows: NDArray[np.float32], stamp: float) -> bytes:
+    """Rows, shape (ticks, columns), as a message; little endian, float32."""
+    head = HEAD.pack(kind, first & 0xFFFFFFFF, *rows.shape, stamp)
+    return head + np.ascontiguousarray(rows, dtype="<f4").tobytes()
+
+
+def text_message(kind: str, **values: Any) -> str:
+    """Everything but rows."""
+    return json.dumps({"type": kind, **values}, allow_nan=False, separators=(",", ":"))
+
+
+def request_of(message: Any) -> Request:
+    """What a page asks for.
+
+    Raises:
+        DataError: anything else.
+    """
+    if not isinstance(message, str) or len(message) > MOST_REQUEST:
+        raise DataError(f"a request is a text of at most {MOST_REQUEST} characters")
+    try:
+        entry = json.loads(message)
+        name, names = entry["do"], REQUESTS[entry["do"]]
+        numbers = tuple(float(entry[key]) for key in names)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise DataError(f"a request names one of {', '.join(REQUESTS)} with its numbers") from error
+    if not all(math.isfinite(number) and abs(number) < 2**53 for number in numbers):
+        raise DataError("a request has numbers that are none")
+    return Request(name, numbers)

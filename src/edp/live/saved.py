@@ -1,0 +1,90 @@
+"""The page of a session: live, from a server, or as one file that replays what was streamed."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from edp.live.session import LiveSession
+from edp.report.animation.page import asset, script_text
+from edp.report.common.templates import template
+from edp.storage import write_bytes
+
+SAVED_BYTES = 24 << 20
+"""Of rows in a saved page, which is a third larger: 17 minutes of 60 columns at 100 Hz. The newest ones stay."""
+_SCRIPTS = ("uplot/uPlot.iife.min.js", "side_view.js", "live_store.js", "live_charts.js", "live.js")
+_STYLES = ("uplot/uPlot.min.css", "live.css")
+
+
+def live_page(title: str, host: str) -> tuple[str, str]:
+    """The page that a server gives, and the content security policy that goes with it.
+
+    Args:
+        title: of the page.
+        host: address and port under which the page was asked for, checked.
+    """
+    script, style = parts()
+    connect = f"ws://{host}"
+    policy = "; ".join(
+        [
+            "default-src 'none'",
+            # Hashes, not 'unsafe-inline': nothing that a name smuggles in could run.
+            f"script-src '{_hash(script)}'",
+            f"style-src '{_hash(style)}'",
+            f"connect-src {connect}",
+            "img-src data: blob:",
+            "form-action 'none'",
+            "base-uri 'none'",
+            "frame-ancestors 'none'",
+        ]
+    )
+    return _rendered(title, connect, {"mode": "live"}), policy
+
+
+def session_page(session: LiveSession) -> str:
+    """What was streamed so far as one page that needs no server; at most `SAVED_BYTES` of rows, the newest ones."""
+    most = max(1, SAVED_BYTES // (4 * session.layout.width))
+    first, rows = session.read(session.ticks - most, most)
+    content = {
+        "mode": "saved",
+        "layout": session.layout.to_plain(),
+        "first": first,
+        "count": len(rows),
+        "all": session.ticks,
+        "rows": base64.b64encode(rows.astype("<f4").tobytes()).decode(),
+        "events": [event.to_plain() for event in session.events()],
+        "ended": session.ended,
+    }
+    return _rendered(session.layout.title, "'none'", content)
+
+
+def write_session_page(session: LiveSession, target: str | Path) -> Path:
+    """Write `session_page`.
+
+    Raises:
+        StorageError: the page cannot be written.
+    """
+    write_bytes(Path(target), session_page(session).encode("utf-8", "replace"))
+    return Path(target)
+
+
+@cache
+def parts() -> tuple[str, str]:
+    """Script and style of the page."""
+    return "\n".join(map(asset, _SCRIPTS)), "\n".join(map(asset, _STYLES))
+
+
+def _rendered(title: str, connect: str, content: dict[str, Any]) -> str:
+    script, style = parts()
+    return template("live.html.jinja").render(
+        title=title, connect=connect, style=Markup(style), script=Markup(script), data=Markup(script_text(content))
+    )
+
+
+def _hash(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"

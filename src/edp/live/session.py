@@ -1,0 +1,114 @@
+"""What was streamed so far, bounded: a ring of rows, and a log of events. One thread writes, any may read."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+from edp.live.layout import LiveLayout
+
+Rows = NDArray[np.float32]
+HISTORY_BYTES = 64 << 20
+"""Of rows that are kept: 46 minutes of 60 columns at 100 Hz."""
+MOST_EVENTS, MOST_TEXT = 500, 400
+"""Events that are kept, and characters of one."""
+KINDS = ("note", "warning", "alarm")
+
+
+@dataclass(frozen=True)
+class LiveEvent:
+    """Something that happened.
+
+    Attributes:
+        number: of the event in its session, from 0.
+        tick: at which.
+        kind: one of `KINDS`.
+        text: for a reader.
+        group: events of one group say the same again; empty for none.
+    """
+
+    number: int
+    tick: int
+    kind: str
+    text: str
+    group: str = ""
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain JSON values, keys as the fields."""
+        return asdict(self)
+
+
+class LiveSession:
+    """A session under way.
+
+    Args:
+        layout: of the columns.
+        history_bytes: of rows that are kept; the oldest go first.
+
+    Attributes:
+        layout: of the columns.
+        ticks: streamed so far.
+        ended: why nothing more comes, in words; empty while it runs.
+        stamp: time (s since 1970) of the newest tick.
+    """
+
+    def __init__(self, layout: LiveLayout, history_bytes: int = HISTORY_BYTES) -> None:
+        self.layout, self.ticks, self.ended, self.stamp = layout, 0, "", time.time()
+        capacity = max(1, history_bytes // (4 * layout.width))
+        # A source whose end is known needs no more; pages of memory are taken as they are written.
+        self._rows = np.zeros((min(capacity, layout.ticks or capacity), layout.width), np.float32)
+        self._events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
+        self._counted, self._lock = 0, threading.Lock()
+
+    @property
+    def oldest(self) -> int:
+        """The first tick that is still there."""
+        return max(0, self.ticks - len(self._rows))
+
+    def append(self, row: Rows) -> None:
+        """Take a row, shape (width,), SI units, NaN where there is nothing.
+
+        Raises:
+            DataError: another width.
+        """
+        if row.shape != (self.layout.width,):
+            raise DataError(f"a row of shape {row.shape} came; ({self.layout.width},) must hold")
+        with self._lock:
+            self._rows[self.ticks % len(self._rows)] = row
+            self.ticks += 1
+            self.stamp = time.time()
+
+    def event(self, kind: str, text: str, group: str = "") -> None:
+        """Log an event at the present tick."""
+        with self._lock:
+            self._events.append(LiveEvent(self._counted, self.ticks, kind, text[:MOST_TEXT], group[:MOST_TEXT]))
+            self._counted += 1
+
+    def end(self, why: str) -> None:
+        """Nothing more comes."""
+        with self._lock:
+            self.ended = why[:MOST_TEXT]
+
+    def read(self, first: int, count: int) -> tuple[int, Rows]:
+        """Rows from a tick on, as far as they are there: the first tick and a copy, shape (ticks, width)."""
+        with self._lock:
+            start = min(max(first, self.oldest), self.ticks)
+            stop = min(max(first + count, start), self.ticks)
+            return start, self._rows[np.arange(start, stop) % len(self._rows)]
+
+    def events(self, first: int = 0) -> list[LiveEvent]:
+        """Events from a number on, as far as they are kept."""
+        with self._lock:
+            return [event for event in self._events if event.number >= first]
+
+    @property
+    def event_count(self) -> int:
+        """Of all events, kept or not."""
+        return self._counted

@@ -1,0 +1,80 @@
+"""One viewer of a live session, with a queue of its own: whoever is slow loses frames, and nobody else does."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections import deque
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from edp.live.protocol import text_message
+
+SEND_BUFFER = 1 << 16
+"""Bytes on the way to a viewer; the system's megabytes would show a slow one what was seconds ago."""
+MOST_WAITING = 50
+"""Messages of rows: two seconds."""
+MOST_TEXTS = 1000
+"""Other messages; a viewer that takes none of so many is gone."""
+REQUESTS_PER_S = 30.0
+
+
+class Viewer:
+    """A connection, and what waits for it.
+
+    Attributes:
+        dropped: rows that this viewer did not get.
+    """
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self.dropped = 0
+        self._told_dropped = 0
+        self._connection = connection
+        self._rows: deque[tuple[bytes, int]] = deque()
+        self._texts: deque[str] = deque()
+        self._ready = asyncio.Event()
+        self._budget, self._asked = REQUESTS_PER_S, asyncio.get_running_loop().time()
+        tcp = connection.transport.get_extra_info("socket")
+        if tcp is not None:
+            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+
+    def offer(self, message: bytes, ticks: int) -> None:
+        """Rows; the oldest that wait are dropped where there are too many."""
+        if len(self._rows) >= MOST_WAITING:
+            self.dropped += self._rows.popleft()[1]
+        self._rows.append((message, ticks))
+        self._ready.set()
+
+    def tell(self, text: str) -> None:
+        """Anything else."""
+        if len(self._texts) < MOST_TEXTS:
+            self._texts.append(text)
+            self._ready.set()
+
+    def may_ask(self) -> bool:
+        """Whether another request is answered; more than `REQUESTS_PER_S` are not."""
+        now = asyncio.get_running_loop().time()
+        self._budget = min(self._budget + (now - self._asked) * REQUESTS_PER_S, REQUESTS_PER_S)
+        self._asked = now
+        if self._budget < 1.0:
+            return False
+        self._budget -= 1.0
+        return True
+
+    async def send(self) -> None:
+        """Send what waits, in order, for as long as the connection lasts."""
+        try:
+            while True:
+                await self._ready.wait()
+                self._ready.clear()
+                while self._texts or self._rows:
+                    while self._texts:
+                        await self._connection.send(self._texts.popleft())
+                    if self.dropped != self._told_dropped:
+                        self._told_dropped = self.dropped
+                        await self._connection.send(text_message("dropped", ticks=self.dropped))
+                    if self._rows:
+                        await self._connection.send(self._rows.popleft()[0])
+        except ConnectionClosed:
+            return

@@ -1,0 +1,156 @@
+"""What gives rows to a live session: the registry of sources, and what they have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError
+from edp.logs.source import load_signal_map
+from edp.recording import Recording
+from edp.registry import Registry
+from edp.signals import Channel, SignalMap
+
+Row = NDArray[np.float32]
+
+
+class SourceStopped(Exception):
+    """The session is over; a source passes it on."""
+
+
+class Sink(Protocol):
+    """What a source gives its rows to."""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the session is over."""
+        ...
+
+    def take(self, row: Row, missed: int = 0, trusted: bool = True) -> None:
+        """A row, shape (channels,), SI units, NaN where missing; returns when the next one is due.
+
+        Args:
+            row: of the source's channels.
+            missed: ticks that went by without a row before this one.
+            trusted: whether rows come at the models' rate; they predict nothing where they do not.
+
+        Raises:
+            SourceStopped: the session is over.
+        """
+        ...
+
+    def begin_anew(self) -> None:
+        """What follows does not continue what came: models forget."""
+        ...
+
+    def note(self, kind: str, text: str, group: str = "") -> None:
+        """An event, see `edp.live.session.LiveEvent`."""
+        ...
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What a user said about a source.
+
+    Attributes:
+        value: of the source's option: a path, a machine, a task, a port.
+        map_file: signal map.
+        machine: name or file, where it is not that of the source.
+        seed: of what is drawn.
+        rate_hz: of a source that does not know its own; None takes that of the model.
+        settings: further values by name, as a source's `of` explains.
+    """
+
+    value: str
+    map_file: Path | None = None
+    machine: str | None = None
+    seed: int = 0
+    rate_hz: float | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def signal_map(self) -> SignalMap | None:
+        """The map, read."""
+        return None if self.map_file is None else load_signal_map(self.map_file)
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What models read.
+
+    Attributes:
+        channels: of all models, each once.
+        rate_hz: that they were trained at; None without a model.
+        twin: channels of a twin among them.
+    """
+
+    channels: Sequence[Channel] = ()
+    rate_hz: float | None = None
+    twin: TwinChannels | None = None
+
+
+class LiveSource(ABC):
+    """Rows of channels at a rate.
+
+    Attributes:
+        steered: whether it can be paused and run at another speed.
+        channels: of a row, in order, SI units.
+        rate_hz: rows a second.
+        text: what it is, in words.
+        ticks: how many there will be, None where nobody knows.
+        machine: name or file of a machine for the side view, None without one.
+        recording: that is played, None where none is.
+        ending: what to say when no more rows come.
+    """
+
+    steered: ClassVar[bool] = True
+    channels: tuple[Channel, ...]
+    rate_hz: float
+    text: str
+    ticks: int | None = None
+    machine: str | None = None
+    recording: Recording | None = None
+    ending: str = "the source has ended"
+
+    @classmethod
+    @abstractmethod
+    def of(cls, options: SourceOptions, needs: Needs) -> LiveSource:
+        """The source that a user asked for.
+
+        Raises:
+            EdpError: there is none, or it does not give what the models read.
+        """
+
+    @abstractmethod
+    def run(self, sink: Sink) -> None:
+        """Give all rows.
+
+        Raises:
+            EdpError: it cannot go on.
+            SourceStopped: the session is over.
+        """
+
+    def close(self) -> None:  # noqa: B027  most sources hold nothing open
+        """Give back what was opened."""
+
+
+SOURCES: Registry[type[LiveSource]] = Registry("live source")
+"""By the name of its option."""
+
+
+def chosen_rate(options: SourceOptions, needs: Needs, what: str) -> float:
+    """Rate of a source that takes it from the models.
+
+    Raises:
+        ConfigError: nobody says it.
+    """
+    rate = options.rate_hz or needs.rate_hz
+    if rate is None:
+        raise ConfigError(f"{what} does not say its rate, and no model is given that has one; give --rate in Hz")
+    return rate

@@ -1,0 +1,93 @@
+"""``--sim``: the simulator tick by tick, with one of its operators at the levers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from edp.control.loop import LEVERS
+from edp.errors import ConfigError
+from edp.sim.excitation import EXCITATIONS
+from edp.sim.view import View
+from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Sink, SourceOptions
+
+EPISODE_S = 3600.0
+"""Length of an episode; another one of the next seed follows."""
+USUAL_RATE_HZ = 100.0
+USUAL_EXCITATION = "combined"
+
+
+@SOURCES.register("sim")
+class SimSource(LiveSource):
+    """A machine of the simulator that works on and on.
+
+    Args:
+        machine: name, or path of a machine file.
+        rate_hz: ticks per second.
+        seed: of the first episode.
+        settings: ``excitation``, ``faults`` (texts, see `edp.sim.faults`) and ``material``, where they are given.
+
+    Raises:
+        EdpError: gymnasium is not installed, or there is no such machine or excitation.
+    """
+
+    def __init__(self, machine: str, rate_hz: float, seed: int = 0, settings: Mapping[str, Any] | None = None) -> None:
+        # Gymnasium is an extra, and this brings the compiler of the simulator.
+        from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
+
+        chosen = dict(settings or {})
+        name = chosen.get("excitation") or USUAL_EXCITATION
+        self._kind, self._seed = EXCITATIONS[name], seed
+        material = chosen.get("material") or ""
+        if self._kind.works_ground and not material:
+            raise ConfigError(f"--excitation {name} works the ground, of which there is none here; choose another one")
+        self._env = ExcavatorEnv(
+            EnvironmentSpec(
+                machine=machine,
+                duration_s=EPISODE_S,
+                rate_hz=rate_hz,
+                hand=self._kind.by_hand,
+                material=material,
+                faults=tuple(chosen.get("faults") or ()),
+            )
+        )
+        self.channels, self.rate_hz, self.machine = (*self._env.channels, *LEVERS), rate_hz, machine
+        self.text = f"simulator, {self._env.machine.name}, {name}, seed {seed}"
+
+    @classmethod
+    def of(cls, options: SourceOptions, needs: Needs) -> SimSource:
+        """`SourceOptions.value` is the machine."""
+        return cls(options.value, options.rate_hz or needs.rate_hz or USUAL_RATE_HZ, options.seed, options.settings)
+
+    def run(self, sink: Sink) -> None:
+        """See `LiveSource`."""
+        seed = self._seed
+        while True:
+            self._episode(sink, seed)
+            seed += 1
+            sink.note("note", f"a new episode begins, seed {seed}")
+            sink.begin_anew()
+
+    def _episode(self, sink: Sink, seed: int) -> None:
+        env = self._env
+        observation, info = env.reset(seed=seed)
+        operator = self._kind(np.random.default_rng(seed), self.rate_hz, env.machine)
+        full = np.array(env.machine.cylinders.stroke)
+        ended = False
+        while not ended:
+            for levers in operator.block(view_of_truth(info["truth"], full)):
+                sink.take(np.concatenate([observation, levers]).astype(np.float32))
+                observation, _, _, ended, info = env.step(levers)
+                if ended:
+                    break
+
+
+def view_of_truth(truth: Mapping[str, Any], full: Any) -> View:
+    """What an operator sees, from the noise-free channels of an environment; `full` are the strokes (m), shape (3,)."""
+    strokes, angles, rates, speeds = (
+        np.array([truth[f"{kind}_{i}"] for i in (1, 2, 3)])
+        for kind in ("CylStroke", "JointAngle", "JointVel", "CylVels")
+    )
+    return View(strokes / full, angles, rates, speeds, truth["TipX"], truth["TipY"], truth["TipAngle"])
