@@ -150,8 +150,8 @@ def our_score(rig: Rig, training: Sequence[int], seed: int) -> Score:
 
     def score(cycle: int) -> float:
         part = blocks_of(summaries, (source,), channels, rig.recording(cycle))
-        z = chain.conditioning(part.summaries, part.points)
-        white = chain.bank.white(z)
+        gross = chain.conditioning.unclipped(part.summaries, part.points)
+        white = chain.bank.white(chain.conditioning(part.summaries, part.points), gross)
         return float(statistics(chain.bank.build(white.shape[1]), white[:, None]).max())
 
     return score
