@@ -30,6 +30,8 @@ MOVING = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PILOT_PRESSURE, Kind.FLOW)
 LEVELS = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.POSITION, Kind.ANGLE, Kind.RATIO, Kind.CURRENT, Kind.VOLTAGE)
 MOST_POINT = 24
 """Channels of an operating point; of more, those that vary most between blocks are taken."""
+LEAST_SESSIONS = 4
+"""For conditioning and limits."""
 LEAST_TICKS = 10
 """Of a block: spreads of fewer say nothing."""
 
@@ -39,7 +41,7 @@ def default_watches() -> tuple[WatchSpec, ...]:
     return (
         WatchSpec(detector=CusumSpec(slack=0.5), memory_s=40.0),
         WatchSpec(detector=SeparateCusumsSpec(slack=0.25), memory_s=40.0, view="adjusted"),
-        WatchSpec(detector=SeparateCusumsSpec(slack=0.5), view="own", reserve=1.2),
+        WatchSpec(detector=SeparateCusumsSpec(slack=0.7), view="own", reserve=1.2),
     )
 
 
@@ -52,7 +54,8 @@ class ChainSpec:
         settle_s: start of every session that is not watched, s; at most a tenth of the shortest healthy session.
         clip: largest size of a conditioned summary, in healthy standard deviations.
         watches: views with their detectors.
-        folds: parts into which sessions are dealt; what judges a session was fitted without its part.
+        folds: parts into which sessions are dealt, at most as many as there are; what judges a session was fitted
+            without its part. Of few parts each lacks much of what the monitor itself is fitted to: limits are too high.
         drift_per_hour: of the level of a summary that is followed, in healthy standard deviations.
         most_drift: of them together.
         doubtful: largest deviation of a session's means, over the usual largest one, beyond which it is left out and
@@ -66,7 +69,7 @@ class ChainSpec:
     settle_s: float = 5.0
     clip: float = 6.0
     watches: tuple[WatchSpec, ...] = field(default_factory=default_watches)
-    folds: int = 4
+    folds: int = 10
     drift_per_hour: float = 0.05
     most_drift: float = 0.5
     doubtful: float = 8.0
@@ -134,9 +137,10 @@ def fit_chain(
         ConfigError: too few hours for the promise; says for which there are enough.
         DataError: too few sessions or blocks.
     """
-    if len(sessions) < spec.folds:
+    least = min(spec.folds, LEAST_SESSIONS)
+    if len(sessions) < least:
         raise DataError(
-            f"{len(sessions)} healthy sessions are left for conditioning and limits; {spec.folds} at least must hold: "
+            f"{len(sessions)} healthy sessions are left for conditioning and limits; {least} at least must hold: "
             "bring more sessions, or cut long ones"
         )
     note("summaries of healthy sessions")
@@ -167,21 +171,22 @@ def fit_from_blocks(
     drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
     conditioning = _conditioning(spec, remaining, settle)
     whole = [_conditioned(conditioning, drift, part, settle) for part in remaining]
-    watches = scaled_alike(spec.watches, _watches(spec, whole, blocks_per_s, settle), whole, settle)
-    for fold in range(spec.folds):
-        others = [part for i, part in enumerate(remaining) if i % spec.folds != fold]
+    watches = _watches(spec, whole, blocks_per_s, settle)
+    folds = min(spec.folds, len(remaining))
+    for fold in range(folds):
+        others = [part for i, part in enumerate(remaining) if i % folds != fold]
         own_conditioning = _conditioning(spec, others, settle)
         fitted = [_conditioned(own_conditioning, drift, part, settle) for part in others]
         own = _watches(spec, fitted, blocks_per_s, settle)
-        # Scales belong to the watches that will be used: limits of the folds must mean the same.
-        own = [_as_wide(replace(w, scale=s.scale), s.directions) for w, s in zip(own, watches, strict=True)]
-        for i in range(fold, len(remaining), spec.folds):
+        own = [_as_wide(watch, whole_one.directions) for watch, whole_one in zip(own, watches, strict=True)]
+        for i in range(fold, len(remaining), folds):
             # The start of a session is operating time: its rows are missing, and count as healthy.
             white[i] = BankSpec(tuple(own)).white(*_conditioned(own_conditioning, drift, remaining[i], settle))
-    bank = BankSpec(watches)
+    # On sessions that a view was not fitted to: on its own ones one of many directions looks far too calm.
+    bank = BankSpec(scaled_alike(spec.watches, watches, white))
     limit = calibrated(bank, white, blocks_per_s, promised_hours)
     quiet = _quiet(bank, white)
-    chain = MonitorChain(summaries, conditioning, drift, watches, limit.limit, quiet, settle)
+    chain = MonitorChain(summaries, conditioning, drift, bank.watches, limit.limit, quiet, settle)
     return FittedChain(chain, limit, doubtful, tuple(remaining))
 
 

@@ -193,24 +193,22 @@ class BankSpec(DetectorSpec):
         return np.concatenate([watch(gross if watch.own else rows) for watch in self.watches], axis=1)
 
 
-def scaled_alike(
-    specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[tuple[Array, Array]], settle: int
-) -> tuple[Watch, ...]:
+def scaled_alike(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[Array]) -> tuple[Watch, ...]:
     """The watches with scales at which each is as eager: its third largest statistic of all healthy sessions.
 
     Args:
         specs: options of the watches; their reserve is a factor of the scale.
         watches: with a scale of one.
-        sessions: conditioned rows of healthy sessions, those that are clipped and those that are not.
-        settle: blocks of the start of a session that are not watched.
+        sessions: white rows of healthy sessions as a bank of these watches takes them.
     """
-    result = []
+    result, first = [], 0
     for spec, watch in zip(specs, watches, strict=True):
         peaks = []
-        for rows, gross in sessions:
-            detector, white = watch.detector.build(watch.directions), watch((gross if watch.own else rows)[settle:])
-            values = [float(detector.step(row[None])[0]) for row in white]
+        for white in sessions:
+            detector = watch.detector.build(watch.directions)
+            values = [float(detector.step(row[None])[0]) for row in white[:, first : first + watch.directions]]
             peaks.append(max(values, default=0.0))
+        first += watch.directions
         scale = float(np.sort(peaks)[-min(EAGER, len(peaks))]) if peaks else 1.0
         result.append(Watch(watch.detector, watch.mean, watch.matrix, spec.reserve * max(scale, 1e-9)))
     return tuple(result)

@@ -78,10 +78,10 @@ def test_a_view_of_what_is_gross_measures_each_summary_by_itself():
 
 def test_a_reserve_keeps_a_view_away_from_the_limit():
     rng = np.random.default_rng(5)
-    sessions = [(rows, rows) for rows in rng.normal(size=(6, 100, 2))]
+    sessions = list(rng.normal(size=(6, 100, 2)))
     specs = [WatchSpec(detector=CusumSpec(), reserve=reserve) for reserve in (1.0, 1.5)]
-    watch = fit_watch(specs[0], [rows for rows, _ in sessions], 1.0, 0)
-    near, far = scaled_alike(specs, [watch, watch], sessions, 0)
+    watch = fit_watch(specs[0], sessions, 1.0, 0)
+    near, far = scaled_alike(specs, [watch, watch], [np.tile(watch(rows), 2) for rows in sessions])
     assert far.scale == pytest.approx(1.5 * near.scale)
 
 

@@ -22,8 +22,8 @@ GRID = 12
 BEYOND = 1.3
 """Largest size that is tried in small steps, over the largest of the ladder."""
 FURTHER = (2.0, 4.0, 8.0)
-"""Sizes beyond the ladder that are tried, over its largest: signatures go on as they changed towards it, so that what is
-at its clip stays there."""
+"""Sizes beyond the ladder that are tried, over its largest: signatures go on as they changed towards it, and what is at
+its clip stays there."""
 MOST_SHARE = 100.0
 """Of what is measured in shares: there is no more to lose."""
 LEAST_SIZE = 0.5
