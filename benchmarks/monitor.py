@@ -12,29 +12,20 @@ moved. The promise: 20 fits of conditioning, whitening and limit to other health
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from common import Verdict, finish, in_folder, kept, parser, table, verdict
 from edp.config.monitor import load_monitor_experiment
-from edp.errors import DataError
 from edp.monitor.alarms import MonitorAlarm
-from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
-from edp.monitor.fitting import SessionBlocks, blocks_of, fit_from_blocks
-from edp.monitor.monitor import Monitor
-from edp.monitor.monitor_file import load_monitor, save_monitor
-from edp.recording import Recording
+from edp.monitor.fitting import SessionBlocks, fit_from_blocks
 from edp.sim.faults import FAULTS, parse_fault
 from edp.sim.plan import ordered
-from edp.storage import make_folder, read_json, write_bytes, write_json
-from edp.workflows.monitor import fit_to_recordings
 from monitor_metrics import (
     Case,
     curves,
@@ -56,8 +47,19 @@ from monitor_sessions import (
     session_plans,
     write_sessions,
 )
+from monitor_watching import (
+    NEVER_H,
+    Floats,
+    MonitorOfBlocks,
+    Plan,
+    blocks,
+    fitted,
+    monitor_of,
+    parts_of,
+    same_alarms,
+    watched,
+)
 
-Floats = NDArray[np.float64]
 BEST_PYOD = ("CBLOF", "GMM")
 """Of ten on the validation part."""
 GOALS = {
@@ -85,172 +87,6 @@ QUICK_SETTINGS = (
     'residuals=[{kind="virtual_sensors", units=16, lags_s=[0.04, 0.16]}, {kind="balances"}]',
 )
 """Averages over a minute need more than minutes, and faults that are simulated half an hour."""
-NEVER_H = 1e9
-"""In place of infinity, which JSON lacks."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What one run does.
-
-    Attributes:
-        data: folder of sessions.
-        monitor: folder of the monitor.
-        hours: to a false alarm, promised.
-        minutes: processor time of the monitor's networks.
-        sessions: healthy ones that are fitted to.
-        workers: processes.
-        quick: short form.
-        settings: of the monitor.
-    """
-
-    data: Path
-    monitor: Path
-    hours: float
-    minutes: float
-    sessions: int
-    workers: int
-    quick: bool
-    settings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class _Job:
-    folder: Path
-    name: str
-    monitor: Path
-    cache: Path
-    label: str
-
-
-class ChainOfBlocks(MonitorChain):
-    """A chain that takes summaries and operating points in place of residuals and raw rows."""
-
-    def conditioned(self, residuals: Floats, rows: Floats, state: ChainState) -> tuple[Floats, ChainState]:
-        """See `MonitorChain.conditioned`; whole sessions only."""
-        z = self.conditioning(residuals, rows)
-        z[: self.settle] = np.nan
-        z, drift = self.drift.run(z, state.drift)
-        return z, replace(state, drift=drift, blocks=len(z))
-
-
-class MonitorOfBlocks(Monitor):
-    """A monitor that watches summaries of sessions.
-
-    The networks of a session run once; what comes behind them is judged anew as often as it changes. `same_alarms`
-    holds this way to `Monitor.run`.
-    """
-
-    def verdicts(self, recording: Any) -> Iterator[BlockVerdict]:
-        """See `Monitor.verdicts`, of `SessionBlocks`."""
-        yield from self.chain.run(recording.summaries, recording.points, self.chain.initial_state())[0]
-
-    @staticmethod
-    def of(monitor: Monitor, chain: MonitorChain | None = None) -> MonitorOfBlocks:
-        """Of a monitor, with another chain where one is given."""
-        source = monitor.chain if chain is None else chain
-        own = ChainOfBlocks(**{field.name: getattr(source, field.name) for field in fields(MonitorChain)})
-        values = {field.name: getattr(monitor, field.name) for field in fields(Monitor)}
-        return MonitorOfBlocks(**values | {"chain": own})
-
-
-@lru_cache(maxsize=1)
-def _monitor(folder: Path) -> Monitor:
-    return load_monitor(folder)
-
-
-def refused(monitor: Monitor, recording: Recording) -> bool:
-    """Whether the monitor takes a session for one of another machine; a user gets that error in place of alarms."""
-    try:
-        monitor.check(recording)
-    except DataError:
-        return True
-    return False
-
-
-def _summarise(job: _Job) -> str:
-    monitor, recording = _monitor(job.monitor), read_session(job.folder, job.name).recording
-    part = blocks_of(monitor.chain.summaries, monitor.sources, monitor.channels, recording)
-    buffer = BytesIO()
-    np.savez(buffer, summaries=part.summaries, points=part.points, refused=refused(monitor, recording))
-    write_bytes(job.cache, buffer.getvalue())
-    return job.name
-
-
-def blocks(plan: Plan, part: str, names: Sequence[str]) -> list[SessionBlocks]:
-    """Summaries of sessions; those of an earlier run of the same monitor are read."""
-    cache = make_folder(plan.monitor / "blocks" / part)
-    jobs = [
-        _Job(plan.data / part, name, plan.monitor, cache / f"{name}.npz", name)
-        for name in names
-        if not (cache / f"{name}.npz").exists()
-    ]
-    for number, name in enumerate(ordered(_summarise, jobs, plan.workers) if jobs else (), start=1):
-        if number % 20 == 0:
-            print(f"{part}: {number} of {len(jobs)} summarised, {name}", flush=True)
-    result = []
-    for name in names:
-        with np.load(cache / f"{name}.npz", allow_pickle=False) as arrays:
-            result.append(SessionBlocks(name, arrays["summaries"], arrays["points"]))
-    return result
-
-
-def watched(plan: Plan, names: Sequence[str]) -> dict[str, list[MonitorAlarm]]:
-    """Alarms of test sessions by name; none where the monitor refuses a session as that of another machine."""
-    monitor = MonitorOfBlocks.of(load_monitor(plan.monitor))
-    found = {part.name: monitor.run(part) for part in blocks(plan, "test", names)}  # type: ignore[arg-type]
-    for name in names:
-        with np.load(plan.monitor / "blocks" / "test" / f"{name}.npz", allow_pickle=False) as arrays:
-            if arrays["refused"]:
-                print(f"{name}: refused as a session of another machine")
-                found[name] = []
-    return found
-
-
-def same_alarms(plan: Plan, found: dict[str, list[MonitorAlarm]], count: int = 6) -> tuple[int, int]:
-    """Of how many sessions with alarms `Monitor.run` raises the same ones, and of how many; and seconds a session."""
-    monitor = load_monitor(plan.monitor)
-    names = [name for name, alarms in found.items() if alarms][:count]
-    same = 0
-    for name in names:
-        direct = monitor.run(read_session(plan.data / "test", name).recording)
-        same += [alarm.raised_s for alarm in direct] == [alarm.raised_s for alarm in found[name]]
-    return same, len(names)
-
-
-def fitted(plan: Plan) -> dict[str, Any]:
-    """Fit the monitor where it is not there yet; what is kept of it."""
-    facts = plan.monitor / "fit.json"
-    if not facts.exists():
-        names = session_names(plan.data / "training", "healthy")[: plan.sessions]
-        recordings = [read_session(plan.data / "training", name).recording for name in names]
-        options = {"hours_per_false_alarm": plan.hours, "minutes": plan.minutes}
-        experiment = load_monitor_experiment(None, plan.settings, options)
-        result = fit_to_recordings(recordings, experiment, note=lambda text: print(f"fit: {text}", flush=True))
-        save_monitor(result.monitor, plan.monitor)
-        monitor = result.monitor
-        write_json(
-            facts,
-            {
-                "seconds": result.seconds,
-                "promise": monitor.limit.sentence(),
-                "limit": asdict(monitor.limit) | {"high_hours": min(monitor.limit.high_hours, NEVER_H)},
-                "residuals": list(monitor.residual_names),
-                "provenance": dict(monitor.provenance),
-                "doubtful": list(result.doubtful),
-            },
-        )
-    result_facts: dict[str, Any] = read_json(facts)
-    return result_facts
-
-
-def parts_of(plan: Plan) -> tuple[list[str], list[str]]:
-    """Names of healthy training sessions: those that models are fitted to, and those that set limits."""
-    names = session_names(plan.data / "training", "healthy")[: plan.sessions]
-    limits = load_monitor(plan.monitor).provenance.get("calibrated_on")
-    if not limits:
-        limits = names[round(0.35 * len(names)) :]
-    return [name for name in names if name not in set(limits)], list(limits)
 
 
 def our_cases(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> list[Case]:
@@ -365,7 +201,7 @@ def pool(plan: Plan) -> tuple[SessionBlocks, ...]:
 def promise(plan: Plan, seed: int) -> dict[str, Any]:
     """Fits of all behind the residuals to other healthy sessions each, and what they raise on others."""
     pool(plan)
-    fits = 2 if plan.quick else FITS
+    fits = 2 if plan.quick else plan.fits
     jobs = [_FitJob(plan, seed, number, f"fit {number}") for number in range(fits)]
     rows = []
     for row in ordered(_one_fit, jobs, plan.workers):
@@ -378,7 +214,7 @@ def promise(plan: Plan, seed: int) -> dict[str, Any]:
 
 
 def _one_fit(job: _FitJob) -> dict[str, Any]:
-    plan, parts, monitor = job.plan, pool(job.plan), _monitor(job.plan.monitor)
+    plan, parts, monitor = job.plan, pool(job.plan), monitor_of(job.plan.monitor)
     order = np.random.default_rng([job.seed, job.number]).permutation(len(parts))
     count = min(FIT_SESSIONS, len(parts) // 2)
     chosen, others = ([parts[i] for i in some] for some in (order[:count], order[count:][:MEASURED_SESSIONS]))
@@ -490,6 +326,8 @@ def verdicts(found: dict[str, Any], plan: Plan) -> list[Verdict]:
     for key in ("component", "top_three", "place") if named else ():
         result.append(verdict(f"named right: {key}", named[key], goals[key], ">= 1", "share", quick))
     fits = found["promise"]
+    if not fits["of"]:
+        return result
     wanted = goals["fits"] * fits["of"] / FITS
     result.append(verdict("fits whose interval holds the rate", float(fits["within"]), wanted, ">= 1", "fits", quick))
     return result
@@ -524,6 +362,8 @@ def main() -> None:
     options.add_argument("--hours", type=float, default=8.0, help="operating hours to one false alarm, promised")
     options.add_argument("--minutes", type=float, default=6.0, help="processor time of the monitor's networks")
     options.add_argument("--sessions", type=int, default=360, help="healthy sessions that are fitted to")
+    options.add_argument("--networks", type=Path, default=None, help="take over the networks of this earlier monitor")
+    options.add_argument("--fits", type=int, default=FITS, help="of the promise; 0 leaves it out")
     options.add_argument("--workers", type=int, default=2)
     options.add_argument("--set", action="append", default=[], help="a setting of the monitor")
     options.add_argument(
@@ -534,7 +374,7 @@ def main() -> None:
     def run(folder: Path) -> None:
         plan = Plan(
             folder, given.monitor or folder / "monitor", given.hours, given.minutes, given.sessions, given.workers,
-            given.quick, tuple(given.set),
+            given.quick, tuple(given.set), given.networks, given.fits,
         )  # fmt: skip
         if given.quick:
             plan = replace(plan, hours=QUICK_HOURS, minutes=0.05, workers=1, settings=(*QUICK_SETTINGS, *plan.settings))

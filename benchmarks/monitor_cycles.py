@@ -200,8 +200,8 @@ def drawn_parts(
         moving=tuple(i % inputs for i in range(points - points // 2)),
         drivers=np.arange(drivers * residuals * 2).reshape(drivers, residuals, 2) % inputs, point_offset=single(points),
         point_width=np.ones(points), point_limit=3.0, usual=single(summaries, points + 1),
-        wide=widths.astype(np.float32).astype(float), least=np.full(summaries, 0.25), clip=6.0, drift_step=0.001,
-        drift_most=0.5, watches=watches, limit=1e9, quiet=0.0, settle=SETTLE,
+        wide=widths.astype(np.float32).astype(float), least=np.full(summaries, 0.25), clip=6.0, gross=1e3,
+        drift_step=0.001, drift_most=0.5, watches=watches, limit=1e9, quiet=0.0, settle=SETTLE,
     )  # fmt: skip
     source = network or BalancePart(
         tuple(range(inputs)), np.zeros(inputs, np.float32), tuple(i % inputs for i in range(residuals)),

@@ -198,6 +198,16 @@ def test_a_limit_is_the_lowest_that_keeps_the_promise(spec):
     assert f"{count} false alarms in 0.667 h" in limit.sentence()
 
 
+def test_hours_that_are_no_multiple_of_the_promise_lie_between():
+    """Of 2.5 alarms that are allowed, half the way from the limit of two to that of three."""
+    sessions, hours = sessions_of(6), 8 * 300 / 3600
+    two, half, three = (calibrated(CusumSpec(), sessions, 1.0, hours / n) for n in (2.0, 2.5, 3.0))
+    assert three.limit < half.limit < two.limit
+    assert half.limit == pytest.approx(0.5 * (two.limit + three.limit), rel=1e-3)
+    count = sum(len(alarms(CusumSpec().build(2), session[:, None], half.limit)) for session in sessions)
+    assert count == half.alarms
+
+
 def test_promise_and_interval_hold_on_other_sessions():
     """Rates of ten limits on fresh sessions, long enough to be nearly exact."""
     inside, ratios, promise = 0, [], 0.06

@@ -24,6 +24,7 @@ def fitted_monitor(sessions: Sequence[Recording] = ()) -> Monitor:
             *(('"glr",window=5', 0.2), ('"separate_cusums",slack=3.0', 0.2)),
         )
     )
+    watches += ',{detector={kind="separate_cusums",slack=0.5},view="own",reserve=1.2}'
     sensors = '{kind="virtual_sensors",members=2,units=4,rows=2000,lags_s=[0.05,0.1]}'
     changes = [
         *("chain.block_s=0.2", "chain.settle_s=1.0", "chain.folds=2"),

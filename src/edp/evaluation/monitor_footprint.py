@@ -58,7 +58,7 @@ def chain_work(parts: MonitorParts) -> dict[str, float]:
 
 
 def _watch_doubles(watch: WatchPart) -> float:
-    summaries, directions = watch.matrix.shape
+    summaries, directions = len(watch.mean), watch.directions
     each = DETECTOR[watch.detector] * (watch.rows if watch.detector == "glr" else 1)
     return float(CENTRE * summaries + each * directions)
 
@@ -80,9 +80,9 @@ def _slices(parts: MonitorParts) -> list[float]:
     of_summary = 2.0 * product * parts.points + 6.0 * double
     costs += len(parts.residuals) * [parts.each * CORE_COSTS["summary"], *(parts.each * [of_summary])]
     for watch in parts.chain.watches:
-        directions = int(watch.matrix.shape[1])
+        directions = watch.directions
         each, steps = DETECTOR[watch.detector], watch.rows if watch.detector == "glr" else 1
-        costs += [CENTRE * double * summaries, *(directions * [product * summaries])]
+        costs += [CENTRE * double * summaries, *(directions * [product * (1 if watch.own else summaries)])]
         costs += steps * [each * double * directions]
     return [*costs, VERDICT * double * summaries]
 
@@ -184,8 +184,8 @@ def state_bytes(parts: MonitorParts) -> int:
     """
     chain, summaries, inputs, residuals = parts.chain, parts.summaries, len(parts.inputs), len(parts.residuals)
     sums = (8 + 2 * len(chain.drivers)) * residuals + len(chain.level) + len(chain.moving)
-    detectors = sum(int(w.matrix.shape[1]) * w.rows for w in chain.watches)
-    widest = max(int(w.matrix.shape[1]) for w in chain.watches)
+    detectors = sum(w.directions * w.rows for w in chain.watches)
+    widest = max(w.directions for w in chain.watches)
     doubles = (
         2 * sums + 5 * summaries + inputs + parts.points + widest + detectors + 3 * len(chain.watches) + parts.each
     )

@@ -19,6 +19,8 @@ CONFIDENCE = 0.95
 LANES = 48
 """Limits that one pass over the sessions tries; three passes place a limit to 1 in 1e5 of the range."""
 PASSES = 3
+LEAST_PART = 1e-6
+"""Of an alarm: parts below it are rounding of the division."""
 MOST_HOURS = above(0.0, 1e6)
 
 
@@ -28,7 +30,7 @@ class AlarmLimit:
 
     Attributes:
         limit: that a statistic has to pass.
-        alarms: on the healthy sessions; new ones of this kind have one more.
+        alarms: on the healthy sessions; new ones of this kind have up to one more.
         hours: of them.
         promised_hours: operating hours to one false alarm that were asked for.
         low_hours: shortest and `high_hours` longest mean time between false alarms that go with the count, exact for
@@ -63,8 +65,10 @@ def hours_between(count: int, hours: float) -> tuple[float, float]:
 def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float, promised_hours: float) -> AlarmLimit:
     """The lowest limit at which new sessions of this kind have at most one false alarm in `promised_hours`.
 
-    On these sessions it has one alarm fewer than the promise allows: the lowest limit with k alarms here has k + 1 in
-    as many new hours on average, as the largest of n values is passed by one new value of n + 1.
+    The lowest limit with k alarms here has k + 1 in as many new hours on average, as the largest of n values is passed
+    by one new value of n + 1. Where the hours allow k + 1 and a part of one more, the limit lies as far on the way from
+    the lowest one with k alarms to that with k + 1: in the tail the rate is a convex function of the limit, so that it
+    is no higher there than as far on the way from one rate to the other.
 
     Sessions are whole: each begins with a reset detector, and the detector is reset at each alarm. What holds on them
     holds elsewhere only for machines, work and weather of their kind.
@@ -89,36 +93,49 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
     hours = sum(len(session) for session in sessions) / rows_per_s / 3600.0
     # 1e-9 allows for the rounding of the division.
     allowed = math.floor(hours / promised_hours + 1e-9) - 1
+    part = max(hours / promised_hours - 1.0 - allowed, 0.0)
     if allowed < 0:
         raise ConfigError(
             f"calibration: {hours:.3g} h of healthy sessions are too few for one false alarm in {promised_hours:.3g} "
             f"h; they support one in {hours:.3g} h: ask for that, or bring {promised_hours - hours:.3g} h more"
         )
-    low, high = _range(spec, sessions)
-    if allowed == 0:
-        # No pass is needed: the lowest limit that nothing passes is the largest statistic.
-        return AlarmLimit(high, 0, hours, promised_hours, *hours_between(0, hours))
-    for _ in range(PASSES):
-        limits = np.linspace(low, high, LANES)
-        counts = _counts(spec, sessions, limits)
-        # The last limit with too many: resets make counts fall with the limit on the whole, not at each step.
-        bad = np.flatnonzero(counts > allowed)
-        first = int(bad[-1]) + 1 if len(bad) else 0
-        limit, count = float(limits[first]), int(counts[first])
-        if first == 0:
-            break
-        low, high = float(limits[first - 1]), limit
+    held = [session for session in sessions if len(session)]
+    peaks = [_range(spec, session) for session in held]
+    limit = _lowest(spec, held, peaks, allowed)
+    if part > LEAST_PART:
+        limit -= part * (limit - _lowest(spec, held, peaks, allowed + 1))
+    # A session whose largest statistic does not pass a limit has no alarm at it.
+    loud = [session for session, (_, most) in zip(held, peaks, strict=True) if most > limit]
+    count = int(_counts(spec, loud, np.array([limit]))[0])
     return AlarmLimit(limit, count, hours, promised_hours, *hours_between(count, hours))
 
 
-def _range(spec: DetectorSpec, sessions: Sequence[Array]) -> tuple[float, float]:
-    """Least and largest statistic of all sessions; no session passes the latter."""
-    least, most = math.inf, -math.inf
-    for session in sessions:
-        if len(session):
-            values = statistics(spec.build(session.shape[1]), session[:, None, :])
-            least, most = min(least, float(values.min())), max(most, float(values.max()))
-    return least, most
+def _lowest(
+    spec: DetectorSpec, sessions: Sequence[Array], ranges: Sequence[tuple[float, float]], allowed: int
+) -> float:
+    """The lowest limit at which sessions have at most so many alarms; `ranges` are those of their statistics."""
+    most = sorted((high for _, high in ranges), reverse=True)
+    # Below the largest statistics of one session more than may alarm, each of these does.
+    low, high = most[allowed] if len(most) > allowed else min(low for low, _ in ranges), most[0]
+    loud = [session for session, (_, peak) in zip(sessions, ranges, strict=True) if peak > low]
+    limit = low
+    for _ in range(PASSES if allowed and loud else 0):
+        limits = np.linspace(low, high, LANES)
+        counts = _counts(spec, loud, limits)
+        # The last limit with too many: resets make counts fall with the limit on the whole, not at each step.
+        bad = np.flatnonzero(counts > allowed)
+        first = int(bad[-1]) + 1 if len(bad) else 0
+        limit = float(limits[first])
+        if first == 0:
+            break
+        low, high = float(limits[first - 1]), limit
+    return limit
+
+
+def _range(spec: DetectorSpec, session: Array) -> tuple[float, float]:
+    """Least and largest statistic of a session."""
+    values = statistics(spec.build(session.shape[1]), session[:, None, :])
+    return float(values.min()), float(values.max())
 
 
 def _counts(spec: DetectorSpec, sessions: Sequence[Array], limits: Array) -> NDArray[np.int64]:

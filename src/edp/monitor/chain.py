@@ -109,14 +109,19 @@ class MonitorChain:
         bank = self.bank.build(directions)
         return ChainState(self.summaries.initial_state(), 0, none, bank, 0, none.copy(), none.copy())
 
-    def conditioned(self, residuals: NDArray[Any], rows: NDArray[Any], state: ChainState) -> tuple[Array, ChainState]:
-        """Conditioned rows of the blocks that end within a stretch, with drift taken off, shape (blocks, summaries)."""
+    def conditioned(
+        self, residuals: NDArray[Any], rows: NDArray[Any], state: ChainState
+    ) -> tuple[Array, Array, ChainState]:
+        """Conditioned rows of the blocks that end within a stretch, shape (blocks, summaries), and the state behind it.
+
+        First within the clip and with drift taken off, then as far as they reach.
+        """
         raw, points, summary = self.summaries.run(residuals, rows, state.summary)
-        z = self.conditioning(raw, points)
-        z[: max(0, self.settle - state.blocks)] = np.nan
-        z, drift = self.drift.run(z, state.drift)
+        gross = self.conditioning.unclipped(raw, points)
+        gross[: max(0, self.settle - state.blocks)] = np.nan
+        z, drift = self.drift.run(np.clip(gross, -self.conditioning.clip, self.conditioning.clip), state.drift)
         state = replace(state, summary=summary, drift=drift, blocks=state.blocks + len(z))
-        return z, state
+        return z, gross, state
 
     def run(
         self, residuals: NDArray[Any], rows: NDArray[Any], state: ChainState
@@ -132,9 +137,9 @@ class MonitorChain:
             A verdict a block, and the state behind the stretch.
         """
         first = state.blocks
-        z, state = self.conditioned(residuals, rows, state)
+        z, gross, state = self.conditioned(residuals, rows, state)
         verdicts = []
-        white = self.bank.white(z)
+        white = self.bank.white(z, gross)
         for index, (row, seen) in enumerate(zip(z, white, strict=True)):
             number = first + index + 1
             if number <= self.settle:
@@ -214,7 +219,7 @@ def _watches(entries: Sequence[Any], arrays: Mapping[str, NDArray[Any]], summari
         mean = np.asarray(arrays[f"watch.{index}.mean"], np.float64)
         matrix = np.asarray(arrays[f"watch.{index}.matrix"], np.float64)
         scale = _number(entry["scale"], "scale")
-        if mean.shape != (summaries,) or matrix.ndim != 2 or len(matrix) != summaries:
+        if mean.shape != (summaries,) or matrix.ndim not in (1, 2) or len(matrix) != summaries:
             raise ValueError(f"arrays of watch {index} have other shapes than the summaries")
         if not (np.isfinite(mean).all() and np.isfinite(matrix).all() and scale > 0.0):
             raise ValueError(f"a number of watch {index} is not finite, or its scale is not positive")

@@ -18,6 +18,8 @@ RIDGE = 1e-3
 """Share of the rows that is added below the regression: operating points that never vary alone."""
 TRIMMED = 4.0
 """Residuals of the regression in robust deviations, beyond which a row does not count in the second round."""
+GROSS = 1e3
+"""Largest size of a conditioned summary where gross deviations are to be told from large ones."""
 LEAST_WIDTH = 0.3
 """Of the usual width: where the line for the width falls below this share, the share is taken."""
 
@@ -43,7 +45,11 @@ class Conditioning:
     clip: float
 
     def __call__(self, summaries: Array, points: Array) -> Array:
-        """Conditioned rows, shape (blocks, summaries), within `clip`; NaN stays NaN.
+        """Conditioned rows, shape (blocks, summaries), within `clip`; NaN stays NaN."""
+        return np.clip(self.unclipped(summaries, points), -self.clip, self.clip)
+
+    def unclipped(self, summaries: Array, points: Array) -> Array:
+        """Conditioned rows within `GROSS` alone.
 
         Each sum goes from the first operating number to the last, as in C.
         """
@@ -56,7 +62,7 @@ class Conditioning:
             usual = usual + part[:, index, None] * lines[0][:, index + 1]
             width = width + part[:, index, None] * lines[1][:, index + 1]
         z: Array = (summaries - usual) / np.maximum(width.astype(np.float64), self.floor)
-        return np.clip(z, -self.clip, self.clip)
+        return np.clip(z, -GROSS, GROSS)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Numbers of its file."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +30,18 @@ MOVING = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PILOT_PRESSURE, Kind.FLOW)
 LEVELS = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.POSITION, Kind.ANGLE, Kind.RATIO, Kind.CURRENT, Kind.VOLTAGE)
 MOST_POINT = 24
 """Channels of an operating point; of more, those that vary most between blocks are taken."""
+LEAST_SESSIONS = 4
+"""For conditioning and limits."""
 LEAST_TICKS = 10
 """Of a block: spreads of fewer say nothing."""
 
 
 def default_watches() -> tuple[WatchSpec, ...]:
-    """One view for shifts of many summaries, one for the shift of a single one."""
+    """One view for shifts of many summaries, one for the shift of a single one, one for what is gross."""
     return (
         WatchSpec(detector=CusumSpec(slack=0.5), memory_s=40.0),
         WatchSpec(detector=SeparateCusumsSpec(slack=0.25), memory_s=40.0, view="adjusted"),
+        WatchSpec(detector=SeparateCusumsSpec(slack=0.7), view="own", reserve=1.2),
     )
 
 
@@ -51,7 +54,8 @@ class ChainSpec:
         settle_s: start of every session that is not watched, s; at most a tenth of the shortest healthy session.
         clip: largest size of a conditioned summary, in healthy standard deviations.
         watches: views with their detectors.
-        folds: parts into which sessions are dealt; what judges a session was fitted without its part.
+        folds: parts into which sessions are dealt, at most as many as there are; what judges a session was fitted
+            without its part. Of few parts each lacks much of what the monitor itself is fitted to: limits are too high.
         drift_per_hour: of the level of a summary that is followed, in healthy standard deviations.
         most_drift: of them together.
         doubtful: largest deviation of a session's means, over the usual largest one, beyond which it is left out and
@@ -65,7 +69,7 @@ class ChainSpec:
     settle_s: float = 5.0
     clip: float = 6.0
     watches: tuple[WatchSpec, ...] = field(default_factory=default_watches)
-    folds: int = 4
+    folds: int = 10
     drift_per_hour: float = 0.05
     most_drift: float = 0.5
     doubtful: float = 8.0
@@ -133,9 +137,10 @@ def fit_chain(
         ConfigError: too few hours for the promise; says for which there are enough.
         DataError: too few sessions or blocks.
     """
-    if len(sessions) < spec.folds:
+    least = min(spec.folds, LEAST_SESSIONS)
+    if len(sessions) < least:
         raise DataError(
-            f"{len(sessions)} healthy sessions are left for conditioning and limits; {spec.folds} at least must hold: "
+            f"{len(sessions)} healthy sessions are left for conditioning and limits; {least} at least must hold: "
             "bring more sessions, or cut long ones"
         )
     note("summaries of healthy sessions")
@@ -162,42 +167,44 @@ def fit_from_blocks(
     note("conditioning, views and limit")
     remaining, doubtful = _without_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
-    rows: list[Array] = [np.zeros(0)] * len(remaining)
     white: list[Array] = [np.zeros(0)] * len(remaining)
     drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
     conditioning = _conditioning(spec, remaining, settle)
     whole = [_conditioned(conditioning, drift, part, settle) for part in remaining]
-    watches = scaled_alike([fit_watch(w, whole, blocks_per_s, settle) for w in spec.watches], whole, settle)
-    for fold in range(spec.folds):
-        others = [part for i, part in enumerate(remaining) if i % spec.folds != fold]
+    watches = _watches(spec, whole, blocks_per_s, settle)
+    folds = min(spec.folds, len(remaining))
+    for fold in range(folds):
+        others = [part for i, part in enumerate(remaining) if i % folds != fold]
         own_conditioning = _conditioning(spec, others, settle)
         fitted = [_conditioned(own_conditioning, drift, part, settle) for part in others]
-        own = [fit_watch(watch, fitted, blocks_per_s, settle) for watch in spec.watches]
-        # Scales belong to the watches that will be used: limits of the folds must mean the same.
-        own = [Watch(w.detector, w.mean, w.matrix, s.scale) for w, s in zip(own, watches, strict=True)]
-        for i in range(fold, len(remaining), spec.folds):
-            rows[i] = _conditioned(own_conditioning, drift, remaining[i], settle)
+        own = _watches(spec, fitted, blocks_per_s, settle)
+        own = [_as_wide(watch, whole_one.directions) for watch, whole_one in zip(own, watches, strict=True)]
+        for i in range(fold, len(remaining), folds):
             # The start of a session is operating time: its rows are missing, and count as healthy.
-            white[i] = np.concatenate([watch(rows[i]) for watch in own], axis=1)
-    bank = _widths_of(watches)
-    limit = calibrated(bank, [_padded(part, bank) for part in white], blocks_per_s, promised_hours)
-    quiet = _quiet(bank, [_padded(part, bank) for part in white])
-    chain = MonitorChain(summaries, conditioning, drift, watches, limit.limit, quiet, settle)
+            white[i] = BankSpec(tuple(own)).white(*_conditioned(own_conditioning, drift, remaining[i], settle))
+    # On sessions that a view was not fitted to: on its own ones one of many directions looks far too calm.
+    bank = BankSpec(scaled_alike(spec.watches, watches, white))
+    limit = calibrated(bank, white, blocks_per_s, promised_hours)
+    quiet = _quiet(bank, white)
+    chain = MonitorChain(summaries, conditioning, drift, bank.watches, limit.limit, quiet, settle)
     return FittedChain(chain, limit, doubtful, tuple(remaining))
 
 
-def _widths_of(watches: Sequence[Watch]) -> BankSpec:
-    return BankSpec(tuple(watches))
+def _watches(spec: ChainSpec, sessions: Sequence[tuple[Array, Array]], blocks_per_s: float, settle: int) -> list[Watch]:
+    """Views of healthy sessions, each of the rows that it sees."""
+    return [
+        fit_watch(watch, [gross if watch.view == "own" else rows for rows, gross in sessions], blocks_per_s, settle)
+        for watch in spec.watches
+    ]
 
 
-def _padded(white: Array, bank: BankSpec) -> Array:
-    """White rows of a fold as wide as those of all sessions: a direction that one of them lacks counts as healthy."""
-    width = sum(watch.directions for watch in bank.watches)
-    if white.shape[1] == width:
-        return white
-    out = np.zeros((len(white), width))
-    out[:, : min(width, white.shape[1])] = white[:, :width]
-    return out
+def _as_wide(watch: Watch, directions: int) -> Watch:
+    """A view of a fold as wide as that of all sessions: a direction that it lacks counts as healthy."""
+    if watch.directions == directions:
+        return watch
+    matrix = np.zeros((len(watch.matrix), directions))
+    matrix[:, : min(directions, watch.directions)] = watch.matrix[:, :directions]
+    return replace(watch, matrix=matrix)
 
 
 def _quiet(bank: BankSpec, sessions: Sequence[Array]) -> float:
@@ -213,10 +220,14 @@ def _conditioning(spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: in
     return fit_conditioning([p.summaries[settle:] for p in sessions], [p.points[settle:] for p in sessions], spec.clip)
 
 
-def _conditioned(conditioning: Conditioning, drift: SlowDrift, session: SessionBlocks, settle: int) -> Array:
-    z = conditioning(session.summaries, session.points)
-    z[:settle] = np.nan
-    return drift.run(z, np.zeros(z.shape[1]))[0]
+def _conditioned(
+    conditioning: Conditioning, drift: SlowDrift, session: SessionBlocks, settle: int
+) -> tuple[Array, Array]:
+    """Rows within the clip and with drift taken off, and as far as they reach."""
+    gross = conditioning.unclipped(session.summaries, session.points)
+    gross[:settle] = np.nan
+    z = np.clip(gross, -conditioning.clip, conditioning.clip)
+    return drift.run(z, np.zeros(z.shape[1]))[0], gross
 
 
 def _without_doubtful(

@@ -219,19 +219,25 @@ class Monitor:
 
     def conditioned_rows(self, recording: Recording) -> Array:
         """Conditioned summaries of each block, NaN where missing, shape (blocks, summaries); see `summary_names`."""
+        return self._conditioned(recording)[0]
+
+    def _conditioned(self, recording: Recording) -> tuple[Array, Array]:
+        """Those within the clip, and as far as they reach."""
         self.check(recording)
         state, rows, out = self.initial_state(), rows_of(recording, self.inputs), []
         for start in range(0, len(rows), PIECE):
             piece = self.plausible(rows[start : start + PIECE])
             residuals, sources = self.residuals(piece, state)
-            z, chain = self.chain.conditioned(residuals, piece, state.chain)
+            z, gross, chain = self.chain.conditioned(residuals, piece, state.chain)
             state = replace(state, sources=sources, chain=chain)
-            out.append(z)
-        return np.concatenate(out) if out else np.zeros((0, self.chain.summaries.width))
+            out.append((z, gross))
+        none = np.zeros((0, self.chain.summaries.width))
+        near, far = zip(*out, strict=True) if out else ((none,), (none,))
+        return np.concatenate(near), np.concatenate(far)
 
     def white_rows(self, recording: Recording) -> Array:
         """White rows as the detectors see them, shape (blocks, directions of all watches)."""
-        return self.chain.bank.white(self.conditioned_rows(recording))
+        return self.chain.bank.white(*self._conditioned(recording))
 
     def alarm(self, verdict: BlockVerdict, recording: str = "") -> MonitorAlarm:
         """The alarm of a block's verdict.

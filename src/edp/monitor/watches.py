@@ -13,7 +13,7 @@ from edp.monitor.detectors.base import Detector, DetectorSpec
 from edp.settings.bounds import check_bounds, span
 
 Array = NDArray[np.float64]
-VIEWS = ("white", "adjusted")
+VIEWS = ("white", "adjusted", "own")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,11 @@ class WatchSpec:
             in other directions, than independent rows would.
         shrink: share of the diagonal in that covariance.
         view: ``white``: uncorrelated directions; ``adjusted``: each summary less what the others tell of it (Hawkins,
-            Technometrics 33, 1991), the best view of a shift of one summary alone.
+            Technometrics 33, 1991), the best view of a shift of one summary alone; ``own``: each summary by itself, not
+            clipped, over the largest size that it has on healthy machines: what is gross is seen at once, and a summary
+            with rare large values is given its own measure.
+        reserve: factor of the scale of its statistic. A view that is there for what is gross keeps away from the limit
+            by more than 1, so that of the false alarms that are promised it takes a small share.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -37,11 +41,12 @@ class WatchSpec:
     memory_s: float = 0.0
     shrink: float = 0.1
     view: str = "white"
+    reserve: float = 1.0
 
     def __post_init__(self) -> None:
         if self.view not in VIEWS:
             raise ConfigError(f"watches: view = '{self.view}'; one of {', '.join(VIEWS)} must hold")
-        check_bounds("watches", self, memory_s=span(0.0, 3600.0), shrink=span(0.0, 1.0))
+        check_bounds("watches", self, memory_s=span(0.0, 3600.0), shrink=span(0.0, 1.0), reserve=span(0.1, 100.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,7 @@ class Watch:
     Attributes:
         detector: that sees it.
         mean: of healthy rows, shape (summaries,).
-        matrix: shape (summaries, directions).
+        matrix: shape (summaries, directions), or (summaries,) of factors where it sees each summary by itself.
         scale: of the detector's statistic: over it, statistics of all watches are compared with one limit.
     """
 
@@ -63,7 +68,12 @@ class Watch:
     @property
     def directions(self) -> int:
         """Numbers that the detector sees."""
-        return int(self.matrix.shape[1])
+        return int(self.matrix.shape[-1])
+
+    @property
+    def own(self) -> bool:
+        """Whether it sees each summary by itself, in rows that are not clipped."""
+        return self.matrix.ndim == 1
 
     def __call__(self, rows: Array) -> Array:
         """White rows, shape (blocks, directions); a missing summary counts as healthy.
@@ -73,18 +83,23 @@ class Watch:
         centred = rows - self.mean
         # Single precision: a controller computes it in hardware, forty times as fast as doubles.
         part = np.where(np.isfinite(centred), centred, 0.0).astype(np.float32)
-        matrix, white = self.matrix.astype(np.float32), np.zeros((len(rows), self.directions), np.float32)
+        matrix = self.matrix.astype(np.float32)
+        if self.own:
+            return (part * matrix).astype(np.float64)
+        white = np.zeros((len(rows), self.directions), np.float32)
         for index in range(part.shape[1]):
             white = white + part[:, index, None] * matrix[index]
         return white.astype(np.float64)
 
 
 def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, settle: int) -> Watch:
-    """A view from conditioned rows of healthy sessions, shape (blocks, summaries) each.
+    """A view from conditioned rows of healthy sessions, shape (blocks, summaries) each; not clipped for ``own``.
 
     Raises:
         DataError: too few rows.
     """
+    if spec.view == "own":
+        return _own(spec, sessions, settle)
     usual = int(np.median([len(session) - settle for session in sessions])) if sessions else 0
     # A quarter of a session at most: of longer averages there would be too few.
     blocks = max(1, min(round(spec.memory_s * blocks_per_s), usual // 4))
@@ -115,6 +130,16 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
     # Single precision: a controller stores half as much, and the bits stay the same.
     mean, matrix = (values.astype(np.float32).astype(np.float64) for values in (mean, matrix))
     return Watch(spec.detector, mean, matrix)
+
+
+def _own(spec: WatchSpec, sessions: Sequence[Array], settle: int) -> Watch:
+    """Each summary over the largest size that it has on healthy machines."""
+    peaks = [np.abs(np.nan_to_num(session[settle:])).max(axis=0) for session in sessions if len(session) > settle]
+    if not peaks:
+        raise DataError("no healthy session is longer than the start that is not watched: bring longer ones")
+    largest = np.sort(peaks, axis=0)[-min(EAGER, len(peaks))]
+    factors = (1.0 / np.maximum(largest, LEAST_GROSS)).astype(np.float32).astype(np.float64)
+    return Watch(spec.detector, np.zeros(len(factors)), factors)
 
 
 def _averaged(rows: Array, blocks: int) -> Array:
@@ -163,32 +188,35 @@ class BankSpec(DetectorSpec):
             raise DataError(f"rows of {channels} numbers; the watches see {bank.channels}")
         return bank
 
-    def white(self, rows: Array) -> Array:
-        """Rows as the bank takes them, of conditioned ones."""
-        return np.concatenate([watch(rows) for watch in self.watches], axis=1)
+    def white(self, rows: Array, gross: Array) -> Array:
+        """Rows as the bank takes them, of conditioned ones that are clipped and of those that are not."""
+        return np.concatenate([watch(gross if watch.own else rows) for watch in self.watches], axis=1)
 
 
-def scaled_alike(watches: Sequence[Watch], sessions: Sequence[Array], settle: int) -> tuple[Watch, ...]:
+def scaled_alike(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[Array]) -> tuple[Watch, ...]:
     """The watches with scales at which each is as eager: its third largest statistic of all healthy sessions.
 
     Args:
+        specs: options of the watches; their reserve is a factor of the scale.
         watches: with a scale of one.
-        sessions: conditioned rows of healthy sessions.
-        settle: blocks of the start of a session that are not watched.
+        sessions: white rows of healthy sessions as a bank of these watches takes them.
     """
-    result = []
-    for watch in watches:
+    result, first = [], 0
+    for spec, watch in zip(specs, watches, strict=True):
         peaks = []
-        for session in sessions:
-            detector, white = watch.detector.build(watch.directions), watch(session[settle:])
-            values = [float(detector.step(row[None])[0]) for row in white]
+        for white in sessions:
+            detector = watch.detector.build(watch.directions)
+            values = [float(detector.step(row[None])[0]) for row in white[:, first : first + watch.directions]]
             peaks.append(max(values, default=0.0))
+        first += watch.directions
         scale = float(np.sort(peaks)[-min(EAGER, len(peaks))]) if peaks else 1.0
-        result.append(Watch(watch.detector, watch.mean, watch.matrix, max(scale, 1e-9)))
+        result.append(Watch(watch.detector, watch.mean, watch.matrix, spec.reserve * max(scale, 1e-9)))
     return tuple(result)
 
 
 LEAST_ROWS = 16
 """Of averages that a covariance is taken of; the diagonal that is mixed in stands for what they do not tell."""
+LEAST_GROSS = 3.0
+"""Healthy deviations: a summary that never strayed further is not gross before that."""
 EAGER = 3
 """Of the largest statistics of healthy sessions, which one makes watches equal: near the limit, where tails differ."""

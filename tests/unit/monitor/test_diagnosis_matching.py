@@ -77,6 +77,17 @@ def test_each_fault_is_named_with_its_part_and_about_its_size(dictionary, owner,
     assert right >= 7
 
 
+@pytest.mark.parametrize("clip", [6.0, np.inf])
+@pytest.mark.parametrize(("owner", "times"), [(0, 2.0), (0, 4.0), (1, 6.0), (2, 5.0)])
+def test_a_fault_far_beyond_its_ladder_keeps_its_name(dictionary, owner, times, clip):
+    size = times * CLASSES[owner].sizes[-1]
+    for seed in range(4):
+        rows = np.clip(effect(owner, size, 40, np.random.default_rng([seed, owner])), -clip, clip)
+        cause = causes_of(dictionary, match(dictionary, rows))[0]
+        assert (cause.kind, cause.site) == (CLASSES[owner].kind, CLASSES[owner].site)
+        assert cause.size >= 1.2 * CLASSES[owner].sizes[-1]
+
+
 def test_causes_of_one_part_count_together(dictionary):
     found = match(dictionary, effect(0, 3.0, 40, np.random.default_rng(0)))
     shares = np.array([0.3, 0.25, 0.05, 0.3, 0.1])

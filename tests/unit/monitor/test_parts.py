@@ -6,12 +6,14 @@ import pytest
 from edp.errors import ConfigError
 from edp.monitor.adaptation import SlowDrift
 from edp.monitor.conditioning import fit_conditioning
-from edp.monitor.detectors import CusumSpec
+from edp.monitor.detectors import CusumSpec, SeparateCusumsSpec
 from edp.monitor.residuals import FitMaterial
 from edp.monitor.residuals.balances import BalancesSpec
 from edp.monitor.residuals.base import residuals_of
 from edp.monitor.residuals.look_ahead import LookAheadSpec
-from edp.monitor.watches import WatchSpec, fit_watch
+from edp.monitor.watches import LEAST_GROSS, BankSpec, WatchSpec, fit_watch, scaled_alike
+from edp.recording import Recording
+from edp.signals import VOCABULARY
 from edp.testing.monitor import rig_sessions
 
 
@@ -58,6 +60,47 @@ def test_a_view_of_averages_makes_them_of_one_size(view):
 def test_an_unknown_view_is_refused():
     with pytest.raises(ConfigError, match="white, adjusted"):
         WatchSpec(detector=CusumSpec(), view="blurred")
+
+
+def test_a_view_of_what_is_gross_measures_each_summary_by_itself():
+    rng = np.random.default_rng(4)
+    # The second summary has rare large values on healthy machines, too.
+    sessions = [np.stack([rng.normal(size=500), rng.standard_t(2.0, size=500)], axis=1) for _ in range(12)]
+    spec = WatchSpec(detector=SeparateCusumsSpec(), view="own")
+    watch = fit_watch(spec, sessions, 1.0, 0)
+    largest = np.sort([np.abs(session).max(axis=0) for session in sessions], axis=0)[-3]
+    np.testing.assert_allclose(1.0 / watch.matrix, np.maximum(largest, LEAST_GROSS), rtol=1e-6)
+    gross = np.array([[40.0, 0.0], [np.nan, 40.0]])
+    seen = BankSpec((watch,)).white(np.clip(gross, -6.0, 6.0), gross)
+    np.testing.assert_allclose(seen, np.nan_to_num(gross) * watch.matrix, rtol=1e-6)
+    assert seen[0, 0] > 8.0 > 4.0 > seen[1, 1]
+
+
+def test_a_reserve_keeps_a_view_away_from_the_limit():
+    rng = np.random.default_rng(5)
+    sessions = list(rng.normal(size=(6, 100, 2)))
+    specs = [WatchSpec(detector=CusumSpec(), reserve=reserve) for reserve in (1.0, 1.5)]
+    watch = fit_watch(specs[0], sessions, 1.0, 0)
+    near, far = scaled_alike(specs, [watch, watch], [np.tile(watch(rows), 2) for rows in sessions])
+    assert far.scale == pytest.approx(1.5 * near.scale)
+
+
+def test_a_temperature_that_jumps_is_seen_and_a_slow_one_is_not():
+    ticks = np.arange(6000)
+    rng = np.random.default_rng(6)
+    channels = (VOCABULARY["OilTemperature"], VOCABULARY["CylVels_1"])
+    values = np.stack([310.0 + ticks / 1000 + 0.1 * rng.normal(size=6000), rng.normal(size=6000)], axis=1)
+    sessions = [Recording(f"s{i}", channels, values.astype(np.float32), 100.0) for i in range(2)]
+    source = BalancesSpec().fit(FitMaterial(sessions[:1], sessions[1:], channels, 100.0))
+    assert source.names == ("balance:OilTemperature:10s",)
+    assert source.judged == (("OilTemperature",),)
+    rows = values[:, :1].astype(np.float32)
+    rows[3000:] += 5.0
+    residual = source.run(rows[None], source.initial_state(1))[0][0, :, 0]
+    # A rise of 6 K a minute stays below 1 K of ten seconds, a jump of 5 K is there at once and fades.
+    assert abs(residual[2000:3000].mean()) < 1.2
+    assert residual[3000:3010].mean() > 5.0
+    assert residual[5990:].mean() < 2.0
 
 
 def test_without_a_run_a_look_ahead_network_is_trained():

@@ -30,8 +30,6 @@ def description(parts: MonitorParts, name: str) -> dict[str, Any]:
         ],
         "residuals": list(parts.residuals),
         "summaries": [*SUMMARIES, *(f"drive{number + 1}" for number in range(len(chain.drivers)))],
-        "watches": [
-            {"detector": w.detector, "option": w.option, "directions": int(w.matrix.shape[1])} for w in chain.watches
-        ],
+        "watches": [{"detector": w.detector, "option": w.option, "directions": w.directions} for w in chain.watches],
         "limit": chain.limit,
     }

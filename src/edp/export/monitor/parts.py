@@ -93,7 +93,7 @@ class WatchPart:
         detector: ``cusum``, ``ewma``, ``glr`` or ``separate_cusums``.
         option: its slack, weight or window.
         mean: shape (summaries,).
-        matrix: shape (summaries, directions).
+        matrix: shape (summaries, directions), or (summaries,) where it sees each summary by itself.
         scale: of its statistic.
     """
 
@@ -102,6 +102,16 @@ class WatchPart:
     mean: Array
     matrix: Array
     scale: float
+
+    @property
+    def directions(self) -> int:
+        """Numbers that the detector sees."""
+        return int(self.matrix.shape[-1])
+
+    @property
+    def own(self) -> bool:
+        """Whether it sees each summary by itself, in rows that are not clipped."""
+        return self.matrix.ndim == 1
 
     @property
     def rows(self) -> int:
@@ -130,6 +140,7 @@ class ChainPart:
         usual: of each summary, shape (summaries, 1 + points); `wide` likewise.
         least: width of each summary, shape (summaries,).
         clip: of conditioned summaries.
+        gross: largest size of those that are not clipped.
         drift_step: most by which the slow drift changes in a block.
         drift_most: its limit.
         watches: side by side.
@@ -155,6 +166,7 @@ class ChainPart:
     wide: Array
     least: Array
     clip: float
+    gross: float
     drift_step: float
     drift_most: float
     watches: tuple[WatchPart, ...]

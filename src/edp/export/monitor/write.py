@@ -129,9 +129,10 @@ class MonitorFiles:
             tables.singles(f"mean_{index}", watch.mean)
             tables.singles(f"matrix_{index}", np.ascontiguousarray(watch.matrix.T))
             weight = watch.option if watch.detector == "ewma" else 1.0
-            sizes = f"{self.parts.summaries}u, {watch.matrix.shape[1]}u, {watch.rows}u"
+            sizes = f"{self.parts.summaries}u, {watch.directions}u, {watch.rows}u"
             options = ", ".join(map(double_number, (watch.option, (2.0 - weight) / weight, watch.scale)))
-            rows.append(f"    {{{DETECTORS[watch.detector]}, {sizes}, {options}, mean_{index}, matrix_{index}}}")
+            own = "true" if watch.own else "false"
+            rows.append(f"    {{{DETECTORS[watch.detector]}, {own}, {sizes}, {options}, mean_{index}, matrix_{index}}}")
         body = ",\n".join(rows)
         tables.text(f"static const edp_watch watches[{len(rows)}] = {{\n{body}\n}};")
         memories = np.cumsum([0, *map(_memory, self.parts.chain.watches)]).tolist()
@@ -149,6 +150,7 @@ class MonitorFiles:
             "IMPOSSIBLE": chain.impossible,
             "POINT_LIMIT": chain.point_limit,
             "CLIP": chain.clip,
+            "GROSS": chain.gross,
             "DRIFT_STEP": chain.drift_step,
             "DRIFT_MOST": chain.drift_most,
             "ALARM_LIMIT": chain.limit,
@@ -193,7 +195,7 @@ class MonitorFiles:
             "moving": len(chain.moving),
             "points": max(1, parts.points),
             "watches": len(chain.watches),
-            "widest": max(watch.matrix.shape[1] for watch in chain.watches),
+            "widest": max(watch.directions for watch in chain.watches),
             "memory": sum(map(_memory, chain.watches)),
             "slices": self.slices,
             "slices_per_tick": -(-self.slices // chain.block),
@@ -250,7 +252,7 @@ class MonitorFiles:
             ),
             "watch_enum": Code(
                 "\n".join(
-                    f"    {upper}_STAT_{i} = {i}, /* {watch.detector}, {watch.matrix.shape[1]} directions */"
+                    f"    {upper}_STAT_{i} = {i}, /* {watch.detector}, {watch.directions} directions */"
                     for i, watch in watches
                 )
             ),
@@ -284,12 +286,12 @@ class MonitorFiles:
 
 
 def _memory(watch: WatchPart) -> int:
-    return int(watch.matrix.shape[1]) * watch.rows
+    return watch.directions * watch.rows
 
 
 def _watch_slices(watch: WatchPart) -> int:
     """Centring, each direction, and the steps of the detector."""
-    return 1 + int(watch.matrix.shape[1]) + (watch.rows if watch.detector == "glr" else 1)
+    return 1 + watch.directions + (watch.rows if watch.detector == "glr" else 1)
 
 
 def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:

@@ -119,7 +119,8 @@ def _left_out(
         others = [fault for fault in faults if fault.draw != draw]
         if {fault.owner for fault in others} != set(range(len(classes))):
             continue
-        tried = candidates(_dictionary(summaries, classes, others, scatter, {}))
+        # Sizes of the ladder alone: what is strange is measured on them.
+        tried = candidates(_dictionary(summaries, classes, others, scatter, {}), further=False)
         for fault in faults:
             if fault.draw != draw or not _would_be_found(fault.change @ scatter.matrix, noise):
                 continue

@@ -20,7 +20,12 @@ Seen = tuple[Array, Array]
 GRID = 12
 """Sizes of a fault that are tried, evenly spread in their logarithm from the smallest of its ladder on."""
 BEYOND = 1.3
-"""Largest size that is tried, over the largest of the ladder: signatures are not followed further."""
+"""Largest size that is tried in small steps, over the largest of the ladder."""
+FURTHER = (2.0, 4.0, 8.0)
+"""Sizes beyond the ladder that are tried, over its largest: signatures go on as they changed towards it, and what is at
+its clip stays there."""
+MOST_SHARE = 100.0
+"""Of what is measured in shares: there is no more to lose."""
 LEAST_SIZE = 0.5
 """Smallest size that is tried, over the smallest of the ladder."""
 MOST_CAUSES = 8
@@ -88,9 +93,9 @@ class Candidates:
     firsts: NDArray[np.int64]
 
 
-def candidates(dictionary: Dictionary) -> Candidates:
-    """All that `match` compares with."""
-    parts = [_of_fault(dictionary, number, fault) for number, fault in enumerate(dictionary.classes)]
+def candidates(dictionary: Dictionary, further: bool = True) -> Candidates:
+    """All that `match` compares with; `further`: with sizes beyond the ladders."""
+    parts = [_of_fault(dictionary, number, fault, further) for number, fault in enumerate(dictionary.classes)]
     counts = np.array([len(sizes) for sizes, _ in parts])
     return Candidates(
         np.repeat(np.arange(len(parts)), counts),
@@ -131,7 +136,7 @@ def judged(tried: Candidates, logs: Array, misfits: Array, dictionary: Dictionar
     return Match((1.0 - none) * shares, tried.sizes[chosen], none, misfit)
 
 
-def _of_fault(dictionary: Dictionary, number: int, fault: FaultClass) -> tuple[Array, Array]:
+def _of_fault(dictionary: Dictionary, number: int, fault: FaultClass, beyond: bool) -> tuple[Array, Array]:
     """Sizes of a fault that are tried and their signatures, shapes (sizes,) and (2, sizes, features)."""
     rows = dictionary.rows_of(number)
     signatures = dictionary.signatures[:, rows]
@@ -140,12 +145,17 @@ def _of_fault(dictionary: Dictionary, number: int, fault: FaultClass) -> tuple[A
     away = np.abs(dictionary.sizes[rows] - fault.neutral)
     sign = -1.0 if fault.sizes[0] < fault.neutral else 1.0
     ends = abs(fault.sizes[0] - fault.neutral), abs(fault.sizes[-1] - fault.neutral)
-    tried = np.geomspace(LEAST_SIZE * ends[0], BEYOND * ends[1], GRID)
-    # From nothing at the neutral size; beyond the largest size that was simulated it stays as it was there.
+    within = np.geomspace(LEAST_SIZE * ends[0], BEYOND * ends[1], GRID)
+    most = (MOST_SHARE / ends[1] if fault.unit == "%" else np.inf) if beyond else 0.0
+    further = np.array([times for times in FURTHER if times <= most])
+    tried = np.concatenate([within, further * ends[1]])
+    # From nothing at the neutral size; a little beyond the largest size that was simulated it stays as it was there.
+    most_shares = np.where(np.arange(len(tried)) < GRID, 1.0, np.inf)
     simulated = np.concatenate([[0.0], away])
     values = np.concatenate([np.zeros((2, 1, signatures.shape[2])), signatures], axis=1)
     upper = np.clip(np.searchsorted(simulated, tried), 1, len(simulated) - 1)
-    share = np.clip((tried - simulated[upper - 1]) / (simulated[upper] - simulated[upper - 1]), 0.0, 1.0)[:, None]
+    share = (tried - simulated[upper - 1]) / (simulated[upper] - simulated[upper - 1])
+    share = np.clip(share, 0.0, most_shares)[:, None]
     between = (1.0 - share) * values[:, upper - 1] + share * values[:, upper]
     return fault.neutral + sign * tried, between
 

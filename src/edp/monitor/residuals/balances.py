@@ -1,4 +1,7 @@
-"""Physical balances: a position against the integral of its velocity, a velocity against that of its acceleration."""
+"""Physical balances: a position against the integral of its velocity, a velocity against that of its acceleration.
+
+What stores heat has no rate that is measured, but it cannot jump: a temperature is compared with itself some time ago.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +35,8 @@ RATE_OF = {
     Kind.VELOCITY: Kind.ACCELERATION,
 }
 """Kind of the rate of change, by kind."""
+SLOW = (Kind.TEMPERATURE,)
+"""Kinds that cannot jump: their rate counts as zero."""
 MATCH_S = 0.5
 """Time over which changes are compared to find which rate belongs to which level."""
 MOST_ROWS = 200_000
@@ -43,7 +48,8 @@ class Balances(ResidualSource):
 
     With d[t] = x[t] - x[t-1] - gain v[t] dt the residual is e[t] = left e[t-1] + d[t], left = 1 - dt / memory_s: a
     leaky sum has no drift, and a step of the level stays visible for `memory_s`. At a tick at which level or rate is
-    missing, or the level was missing at the tick before, d is 0: what happened meanwhile is not known.
+    missing, or the level was missing at the tick before, d is 0: what happened meanwhile is not known. A level that
+    cannot jump has no rate: itself stands in its place, with a gain of zero.
 
     Args:
         inputs: raw channels, SI units.
@@ -70,9 +76,10 @@ class Balances(ResidualSource):
         self.middle = np.asarray(middle, np.float32)
         both = [(self.inputs[level], self.inputs[rate]) for level, rate in pairs.tolist()]
         self.names = tuple(
-            f"balance:{level}-{rate}:{memory:g}s" for (level, rate), memory in zip(both, memories_s, strict=True)
+            f"balance:{level if level == rate else f'{level}-{rate}'}:{memory:g}s"
+            for (level, rate), memory in zip(both, memories_s, strict=True)
         )
-        self.judged = self.reads = tuple(both)
+        self.judged = self.reads = tuple(tuple(dict.fromkeys(pair)) for pair in both)
 
     def _start(self, streams: int) -> Any:
         # None until the first tick, which has no change.
@@ -136,6 +143,7 @@ class BalancesSpec(ResidualSpec):
     Attributes:
         memory_s: times after which the residual of a position has faded.
         rate_memory_s: the same of a velocity against its acceleration.
+        slow_memory_s: the same of a temperature against itself.
         match: correlation of changes, above which a rate belongs to a level.
 
     Raises:
@@ -145,14 +153,14 @@ class BalancesSpec(ResidualSpec):
     source: ClassVar[type[ResidualSource]] = Balances
     memory_s: tuple[float, ...] = (0.5, 3.0, 30.0)
     rate_memory_s: tuple[float, ...] = (0.5,)
+    slow_memory_s: tuple[float, ...] = (10.0,)
     match: float = 0.8
 
     def __post_init__(self) -> None:
-        for name in ("memory_s", "rate_memory_s"):
+        for name in ("memory_s", "rate_memory_s", "slow_memory_s"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        check_bounds(
-            "balances", self, memory_s=above(0.0, 3600.0), rate_memory_s=above(0.0, 3600.0), match=span(0.0, 1.0)
-        )
+        times = dict.fromkeys(("memory_s", "rate_memory_s", "slow_memory_s"), above(0.0, 3600.0))
+        check_bounds("balances", self, match=span(0.0, 1.0), **times)
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
@@ -162,6 +170,11 @@ class BalancesSpec(ResidualSpec):
             for level, rate, gain in matched_pairs(material.channels, material.train, material.rate_hz, self.match)
             for memory in (self.rate_memory_s if level.kind is Kind.VELOCITY else self.memory_s)
         ]
+        matches += [
+            (slow, slow, 0.0, max(memory, 2.0 / material.rate_hz))
+            for slow in slow_channels(material.channels, material.train)
+            for memory in self.slow_memory_s
+        ]
         if not matches:
             return None
         used = {channel.name for level, rate, _, _ in matches for channel in (level, rate)}
@@ -170,6 +183,15 @@ class BalancesSpec(ResidualSpec):
         gains, memories = (np.array([entry[index] for entry in matches]) for index in (2, 3))
         units = [KINDS[level.kind].si_unit for level, _, _, _ in matches]
         return Balances(inputs, pairs, gains, memories, material.rate_hz, mean_inputs(material, inputs), units)
+
+
+def slow_channels(channels: Sequence[Channel], sessions: Sequence[Recording]) -> list[Channel]:
+    """Channels that cannot jump and do change: of one that stands still there is nothing to tell."""
+    return [
+        channel
+        for channel in channels
+        if channel.kind in SLOW and any(np.ptp(session.column(channel.name)) > 0.0 for session in sessions)
+    ]
 
 
 def matched_pairs(

@@ -28,7 +28,7 @@ from edp.export.monitor import (
     write_monitor_ros2,
 )
 from edp.monitor.chain import MonitorChain
-from edp.monitor.conditioning import POINT_LIMIT
+from edp.monitor.conditioning import GROSS, POINT_LIMIT
 from edp.monitor.detectors import DETECTORS as REGISTERED
 from edp.monitor.monitor import IMPOSSIBLE, Monitor
 from edp.monitor.monitor_file import HEADER, load_monitor
@@ -246,6 +246,7 @@ def chain_part(chain: MonitorChain) -> ChainPart:
         wide=conditioning.spread,
         least=conditioning.floor,
         clip=conditioning.clip,
+        gross=GROSS,
         drift_step=chain.drift.step,
         drift_most=chain.drift.most,
         watches=tuple(map(_watch, chain.watches)),

@@ -273,7 +273,14 @@ void edp_watch_centre(const edp_watch *w, const double *z, float *centred) {
 }
 
 double edp_watch_white(const edp_watch *w, const float *centred, uint32_t direction) {
-    return (double)edp_dot(centred, &w->matrix[(size_t)direction * w->summaries], w->summaries);
+    double white;
+    if (w->own) {
+        const float product = centred[direction] * w->matrix[direction];
+        white = (double)product;
+    } else {
+        white = (double)edp_dot(centred, &w->matrix[(size_t)direction * w->summaries], w->summaries);
+    }
+    return white;
 }
 
 uint32_t edp_watch_steps(const edp_watch *w) { return (w->detector == EDP_GLR) ? w->rows : 1u; }

@@ -93,6 +93,7 @@ typedef enum { EDP_CUSUM = 0, EDP_EWMA = 1, EDP_GLR = 2, EDP_SEPARATE_CUSUMS = 3
 
 typedef struct {
     edp_detector detector;
+    bool own; /* whether it sees each summary by itself, in rows that are not clipped */
     uint32_t summaries;
     uint32_t directions;
     uint32_t rows;    /* of its memory, of `directions` each: of the likelihood ratio the lengths that are tried */
@@ -100,7 +101,7 @@ typedef struct {
     double factor;    /* of the weighted means */
     double scale;     /* over which statistics of all watches are compared with one limit */
     const float *mean;   /* (summaries) */
-    const float *matrix; /* (directions, summaries) */
+    const float *matrix; /* (directions, summaries); its own: (summaries) */
 } edp_watch;
 
 /* Summaries less their mean; a missing one counts as healthy. */
