@@ -79,7 +79,7 @@ class PredictiveControl:
     trust_m_s: float = 0.1
     window_s: float = 0.2
     smoothing: float = 0.02
-    load: float = 0.0
+    load: float = 0.15
     fallback: bool = True
 
     def __post_init__(self) -> None:

@@ -87,7 +87,7 @@ class TwinModel:
             return
         state, row, _ = self._past[0]
         commands = np.array([command for _, _, command in self._past])
-        answers = self._runner.branches(commands[None], state, row, self._alone)
+        answers = self._runner.neighbours(commands[None], state, row, self._alone)
         missed = self.row(measured)[self._strokes] - answers[0, -1, self._strokes]
         speed = missed * self.plant.rate_hz / self.window
         speed = np.where(np.isfinite(speed), speed, self.disturbance)

@@ -24,7 +24,7 @@ def _demand(demands: Array, past: Array, t: int, j: int, delay: float) -> float:
     part = ticks - whole
     newer = demands[t - whole, j] if whole <= t else past[whole - t - 1, j]
     older = demands[t - whole - 1, j] if whole < t else past[whole - t, j]
-    return newer + part * (older - newer)
+    return float(newer + part * (older - newer))
 
 
 @inner
@@ -160,4 +160,4 @@ def centre(x: Array, m: int, q: Array, valve_pump: IntArray, pump: int) -> float
         if valve_pump[j] == m:
             left = max(1.0 - abs(x[j]) * closed, 0.0)
             area *= left * left
-    return area
+    return float(area)

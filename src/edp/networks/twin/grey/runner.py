@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from edp.networks.twin.greybox import GreyTwin
 
 Doubles = NDArray[np.float64]
-SINGLE_TICKS = 10
+SINGLE_TICKS = 4
 """Of a plan, that have steps of their own: behind them, where levers change block by block, a step takes two ticks."""
 LONGEST_S = 0.0205
 """Of such a step: the fastest swing of a load still has ten of them."""
@@ -76,5 +76,6 @@ class GreyRunner(TwinRunner):
         resistance = np.ascontiguousarray(1e-6 * forces[self._speeds])
         row = measured / self._units
         singles = ticks if single is None or not self._double else max(1, single)
-        run_near(self._grey.demands(commands), row, first, now, resistance, *self._parts, singles, answers)
+        rest: tuple[Any, ...] = (*self._parts, singles, answers)
+        run_near(self._grey.demands(commands), row, first, now, resistance, *rest)
         return answers, now
