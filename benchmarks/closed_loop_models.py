@@ -1,22 +1,29 @@
-"""Recordings and models of the closed-loop benchmark: a twin of M22, its rivals, and twins that go on with C14."""
+"""Recordings and models of the closed-loop benchmark: twins of M22, their rivals, and twins that go on with C14."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 from common import table
 from edp.config.twin import load_twin_experiment
-from edp.evaluation.ahead import look_ahead
+from edp.control.nmpc.load import LoadEstimate
+from edp.data.series import Series
+from edp.evaluation.ahead import EACH, look_ahead
 from edp.logs.source import DataSource
+from edp.networks.twin import Twin
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training.twin_bundle import load_twin
 from edp.workflows.twin import train_twin
 from edp.workflows.twin.prepare_twin import prepare_twin
+from twin import WRONG
 
 MIX: Mapping[str, float] = {
     "isolated": 0.15,
@@ -43,6 +50,27 @@ ONE_STEP = (
     *("training.measured_share=0.99", "training.mixed_share=0.0"),
 )
 """A network that is trained on measured feedback all but alone."""
+
+
+@dataclass(frozen=True)
+class GreySize:
+    """How much a grey box of M22 in free air is fitted to.
+
+    Attributes:
+        minutes: of logs.
+        recordings: of them.
+        fit: settings.
+    """
+
+    minutes: float
+    recordings: int
+    fit: tuple[str, ...]
+
+
+GREY = GreySize(45.0, 15, ("twin.fit.ticks=8000", "twin.fit.starts=1"))
+QUICK_GREY = GreySize(
+    *(6.0, 6, ("twin.fit.ticks=1000", "twin.fit.starts=1", "twin.fit.lengths_s=[0.1,0.3]", "twin.fit.rounds=[1,1]"))
+)
 
 
 @dataclass(frozen=True)
@@ -103,6 +131,19 @@ class Models:
         """The twin of M22."""
         return self._twin(self.recordings(), "good_twin", self.size.twin)
 
+    def grey(self, size: GreySize) -> Path:
+        """The grey box of M22, told its linkage beside bodies that are 10 to 50 % off; its logs are in free air."""
+        order = SimulationOrder(
+            minutes=size.minutes, recordings=size.recordings, seed=self.seed + 31, mix=MIX, materials={"air": 1.0}
+        )
+        source, guess = self._simulated("air", order), self.folder / "guess.toml"
+        machine = tomllib.loads((resources.files("edp.sim") / "machines" / "m22.toml").read_text(encoding="utf-8"))
+        for key, factors in WRONG.items():
+            bodies = machine["bodies"]
+            bodies[key] = [value * factor for value, factor in zip(bodies[key], factors, strict=True)]
+        guess.write_text(tomli_w.dumps(machine), encoding="utf-8")
+        return self._twin(source, "grey_twin", ("twin.kind=greybox", f"twin.linkage={guess}", *size.fit))
+
     def beside(self, name: str) -> Path:
         """A model that stands beside it: ``static``, ``arx`` or ``one_step``."""
         settings = self.size.one_step if name == "one_step" else (f"twin.kind={name}",)
@@ -136,9 +177,15 @@ def _training(settings: Sequence[str]) -> list[str]:
     return [change for change in settings if not change.startswith("twin.")]
 
 
-def ahead_errors(models: Models, run: Path) -> dict[str, Any]:
-    """Errors of the velocities, mm/s, ahead of measured ports on held-out recordings, told the commands."""
-    experiment = load_twin_experiment(run / "config.toml")
+def ahead_errors(models: Models, run: Path, load: float = 0.0) -> dict[str, Any]:
+    """Errors of the velocities, mm/s, ahead of measured ports on held-out recordings, told the commands.
+
+    Args:
+        models: of the benchmark.
+        run: of the twin.
+        load: where not zero, what is ahead is also asked with forces estimated as `nmpc` does.
+    """
+    experiment = load_twin_experiment(None, ("twin.kind=recurrent",))
     _, data = prepare_twin(models.recordings(), experiment)
     twin = load_twin(run).twin
     parts = {
@@ -152,11 +199,34 @@ def ahead_errors(models: Models, run: Path) -> dict[str, Any]:
     for part, series in parts.items():
         if series:
             rows[part] = {str(ticks): _velocity_error(look_ahead(twin, series, ticks)) for ticks in AHEAD}
+            if load:
+                rows[f"{part}, load estimated"] = _with_load(twin, series, load)
     table(
         ["velocities ahead, mm/s", *(f"{n} ticks" for n in AHEAD)],
         [[name, *row.values()] for name, row in rows.items()],
     )
     return rows
+
+
+def _with_load(twin: Twin, series: Sequence[Series], share: float) -> dict[str, float]:
+    """Errors as those of `look_ahead`, at its moments, where forces are estimated from all ticks before."""
+    count, longest = len(twin.channels.velocities), max(AHEAD)
+    errors: dict[int, list[Any]] = {ticks: [] for ticks in AHEAD}
+    for part in series:
+        runner, first = twin.runner(), np.zeros(1, np.int64)
+        estimate = LoadEstimate(runner, np.arange(count), share)
+        state = twin.reset(part.inputs[None, : twin.prefix_ticks], part.targets[None, : twin.prefix_ticks])
+        moments = np.linspace(twin.prefix_ticks, part.samples - longest - 1, EACH).astype(np.int64)
+        for tick in range(twin.prefix_ticks, int(moments[-1]) + 1):
+            row = part.targets[tick]
+            estimate.update(row[:count].astype(float))
+            if tick in moments:
+                answers = runner.branches(part.inputs[None, tick : tick + longest], state, row, first)[0, :, :count]
+                for ticks in AHEAD:
+                    errors[ticks].append(np.abs(answers[ticks - 1] - part.targets[tick + ticks, :count]))
+            before, state = state, runner.step(part.inputs[tick], state, row)
+            estimate.expect(part.inputs[tick], row, before, state)
+    return {str(ticks): 1e3 * float(np.mean(values)) for ticks, values in errors.items()}
 
 
 def _velocity_error(ahead: Any) -> float:

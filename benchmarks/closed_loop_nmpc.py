@@ -118,14 +118,24 @@ def tuned_pi(folder: Path, machine: str, size: LoopSize, seed: int) -> Controlle
     return tune_gains(experiment, run, plant, plant, spec).best
 
 
-def loops(models: Models, size: LoopSize, seed: int) -> dict[str, dict[str, Any]]:
-    """Figures by variant and controller."""
+def loops(
+    models: Models, size: LoopSize, seed: int, nmpc: ControllerSpec, own: Path | None = None
+) -> dict[str, dict[str, Any]]:
+    """Figures by variant and controller.
+
+    Args:
+        models: of the benchmark.
+        size: how much is run.
+        seed: of the tuning of the PI loop.
+        nmpc: predictive controller.
+        own: run folder of the twin of M22 in place of the recurrent one; the other machine has none then.
+    """
     folder, rows = models.folder, {}
-    nmpc = CONTROLLERS["nmpc"](blocks=PLAN)
+    named = list(variants(folder).items())[: 5 if own else 6]
     # The last ones: the other machine is always among them.
-    for name, variant in [AS_IT_WAS, *list(variants(folder).items())[1 - size.variants :]]:
+    for name, variant in [AS_IT_WAS, *named[1 - size.variants :]]:
         machine = OTHER if variant.other else MACHINE
-        twin = models.other_twin(models.size.other[0]) if variant.other else models.twin()
+        twin = models.other_twin(models.size.other[0]) if variant.other else own or models.twin()
         experiment = ControlExperiment(task=TASKS["grade"](), controller=nmpc, machine=machine, loops=1)
         known = ControlBench(experiment, ControlSources(twin=twin)).models
         contenders = {"pi": (tuned_pi(folder, machine, size, seed), known), "nmpc": (nmpc, known)}
@@ -142,12 +152,24 @@ def judged(
     """Figures of a controller on a variant, a list entry a line; draws that are in the folder already are read."""
     figures: dict[str, Any] = {}
     for first in DRAWS[: size.draws]:
-        key = hashlib.blake2b(repr((variant, size.lines, spec, first)).encode(), digest_size=8).hexdigest()
+        told = (variant, size.lines, spec, first, _fingerprint(models))
+        key = hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
         path = make_folder(folder / "loops") / f"{CONTROLLERS.name_of(spec)}_{key}.json"
         for name, values in kept(path, lambda first=first: drawn(variant, size, spec, models, first)).items():
             figures[name] = figures.get(name, type(values)()) + values
     times = figures.pop("step_ms")
     return figures | {"step_ms": {"median": float(np.median(times)), "p99": float(np.percentile(times, 99.0))}}
+
+
+def _fingerprint(models: ControlModels) -> str:
+    """Of the numbers of valve map and twin: loops of other models are other loops."""
+    state = hashlib.blake2b(digest_size=8)
+    arrays = {} if models.twin is None else models.twin.arrays()
+    if models.valve_map is not None:
+        arrays = arrays | {"speeds": models.valve_map.speeds, "levers": models.valve_map.levers}
+    for name, values in sorted(arrays.items()):
+        state.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    return state.hexdigest()
 
 
 def drawn(variant: Variant, size: LoopSize, spec: ControllerSpec, models: ControlModels, first: int) -> dict[str, Any]:
@@ -215,12 +237,10 @@ class Stopwatch:
         return levers
 
 
-def solve_times(models: Models, lines: int) -> dict[str, float]:
-    """Processor time of a tick of the predictive controller, ms."""
-    experiment = ControlExperiment(
-        task=TASKS["grade"](), controller=CONTROLLERS["nmpc"](blocks=PLAN), machine=MACHINE, loops=lines
-    )
-    bench = ControlBench(experiment, ControlSources(twin=models.twin()))
+def solve_times(twin: Path, spec: ControllerSpec, lines: int) -> dict[str, float]:
+    """Processor time of a tick of the predictive controller on a twin, ms."""
+    experiment = ControlExperiment(task=TASKS["grade"](), controller=spec, machine=MACHINE, loops=lines)
+    bench = ControlBench(experiment, ControlSources(twin=twin))
     ticks = max(task.reference.ticks for task in bench.tasks) + 1
     env = plant_of(MACHINE, ticks / experiment.rate_hz, experiment.rate_hz)
     watches = []

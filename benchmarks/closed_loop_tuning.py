@@ -53,6 +53,18 @@ def tuning(models: Models, size: TuningSize, seed: int) -> dict[str, dict[str, A
     return rows
 
 
+def tuning_on(run: Path, size: TuningSize, seed: int) -> dict[str, Any]:
+    """The same settings and lines on one twin."""
+    experiment = ControlExperiment(
+        task=TASKS["grade"](), controller=CONTROLLERS["pi"](), machine=MACHINE, loops=size.lines, seed=SEED
+    )
+    plant = ControlBench(experiment, ControlSources())
+    settings = drawn_settings(experiment.controller, TransferSpec(size.settings, seed))
+    row = _row(costs_on(run, experiment, plant.models, settings), costs_of(plant, settings))
+    show("gains of pi, M22 in free air", {"twin": row})
+    return row
+
+
 def tuning_other(models: Models, size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
     """C14 in soil, on twins of M22 that went on with minutes of its logs; they know no soil but that of their logs."""
     experiment = ControlExperiment(
@@ -110,11 +122,13 @@ def show(title: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
 
 def tuning_verdicts(rows: Mapping[str, Mapping[str, Any]], quick: bool) -> list[Verdict]:
     ours = rows["twin"]
-    best = max(row["rank_correlation"] for name, row in rows.items() if name in ("static", "arx", "one_step"))
+    rivals = [row["rank_correlation"] for name, row in rows.items() if name in ("static", "arx", "one_step")]
     name = "o4: cost on the plant of the gains that the twin calls best, over the least cost"
-    return [
+    verdicts = [
         verdict("o4: rank correlation of costs on the twin", ours["rank_correlation"], 1.0, ">= 0.9", "1", quick),
         verdict(name, ours["regret"], 1.0, "<= 1.15", "1", quick),
-        verdict("o4: rank correlation against the best of static, arx, one step", ours["rank_correlation"], best,
-                ">= 1", "1", quick),
-    ]  # fmt: skip
+    ]
+    if rivals:
+        name = "o4: rank correlation against the best of static, arx, one step"
+        verdicts.append(verdict(name, ours["rank_correlation"], max(rivals), ">= 1", "1", quick))
+    return verdicts

@@ -39,7 +39,10 @@ class VelocityModel(ABC):
 
     @abstractmethod
     def ahead(self, measured: Array, commands: Array) -> Array:
-        """Velocities (m/s), shape (candidate, 3), of candidate commands (Pa), shape (candidate, 12); memory stays."""
+        """Velocities (m/s), shape (candidate, 3), of candidate commands (Pa), shape (candidate, 12); memory stays.
+
+        The first candidate is the one that a model may be made linear about.
+        """
 
     @abstractmethod
     def advance(self, measured: Array, command: Array) -> None:
@@ -129,7 +132,7 @@ class TwinAhead(VelocityModel):
         for name, options in [(v, names) for v in VELOCITIES] + [(c.name, PILOTS) for c in twin.channels.commands]:
             if name not in options:
                 raise ConfigError(f"the twin is not one of an excavator's levers: '{name}'{closest(name, options)}")
-        self.twin, self.ticks = twin, ticks
+        self.twin, self.ticks, self._runner = twin, ticks, twin.runner()
         self.reads = tuple(name for name in names if name in measured)
         self._ports = [names.index(name) for name in self.reads]
         self._velocities = [names.index(name) for name in VELOCITIES]
@@ -145,19 +148,16 @@ class TwinAhead(VelocityModel):
         self._state = self.twin.reset(commands, rows)
 
     def ahead(self, measured: Array, commands: Array) -> Array:
-        """Candidates are lanes; the first tick reads what is measured, the others run free."""
-        count = len(commands)
+        """Candidates are runs; the first tick reads what is measured, the others run free."""
         lasting = np.repeat(commands[:, None, self._pilots], self.ticks, axis=1).astype(np.float32)
-        ports = np.full((count, self.ticks, len(self.twin.channels.answers)), np.nan, np.float32)
-        ports[:, 0] = self._row(measured)
-        lanes = {name: np.repeat(values, count, axis=0) for name, values in self._state.items()}
-        answers, _ = self.twin.rollout(lasting, lanes, ports)
+        first = np.zeros(len(commands), np.int64)
+        answers = self._runner.neighbours(lasting, self._state, self._row(measured), first)
         return np.asarray(answers[:, -1, self._velocities], float)
 
     def advance(self, measured: Array, command: Array) -> None:
         """One tick that reads what was measured."""
         pilots = np.asarray(command[self._pilots], np.float32)
-        _, self._state = self.twin.step(pilots[None], self._state, self._row(measured)[None])
+        self._state = self._runner.step(pilots, self._state, self._row(measured))
 
     def _row(self, measured: Array) -> NDArray[np.float32]:
         """Values of all ports, NaN where one is free."""

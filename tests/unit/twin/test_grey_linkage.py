@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from edp.config.twin import load_twin_experiment, twin_toml
+from edp.control.nmpc.load import LoadEstimate
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
@@ -17,6 +18,7 @@ from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
 from edp.networks.twin.grey.elements import CylinderElement, MotorElement, PumpElement, ValveElement
 from edp.networks.twin.grey.known_linkage import BODY_NAMES
 from edp.networks.twin.grey.linkage import balance_by_base, base_of, load_at
+from edp.networks.twin.grey.runner import SINGLE_TICKS
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.signals import Channel, Kind
 from edp.sim.machine import layout as sim
@@ -370,3 +372,85 @@ def test_balance_by_base_is_inertia_times_acceleration_and_the_forces(twin):
     balance_by_base(strokes, speeds, pulls, twin.table.linkage, out)
     force, _, _, _, mass, _, _, _ = loads_of(twin, twin.numbers, strokes[0], speeds[0])
     np.testing.assert_allclose(out[0] @ base_numbers(twin, twin.numbers), mass @ pulls[0] + force, rtol=1e-10)
+
+
+def near(twin, runs=7, ticks=30, seed=3):
+    """Commands of a run and of others that go a little farther from a tick on, a state, a row, and where they part."""
+    rng = np.random.default_rng(seed)
+    base = np.repeat(rng.uniform(-0.8, 0.8, (ticks // 10, 3)), 10, axis=0).astype(np.float32)
+    first = np.array([0, *np.repeat([0, 8], 3)])[:runs]
+    commands = np.repeat(base[None], runs, axis=0)
+    for run in range(1, runs):
+        commands[run, first[run] :, (run - 1) % 3] *= 1.03
+    middle = 0.5 * (twin.scales.low + twin.scales.high)
+    row = np.where(twin.wiring.ports[:, 0] == 0, 0.0, middle).astype(np.float32)
+    rows = np.repeat(row[None, None], PREFIX, axis=1)
+    state = twin.reset(np.repeat(base[None, :1], PREFIX, axis=1), rows)
+    row[-1] = np.nan
+    return commands, state, row, first
+
+
+def test_runs_near_a_run_differ_from_it_as_runs_of_their_own_do(twin):
+    commands, state, row, first = near(twin)
+    runner, width = twin.runner(), twin.scales.answer_width
+    own, told = (call(commands, state, row, first) / width for call in (twin.branches, runner.neighbours))
+    # Ticks with steps of their own are the twin's, those behind them nearly so.
+    assert np.abs((told - own)[0, :SINGLE_TICKS]).max() < 1e-4
+    assert np.abs((told - own)[0]).max() < 0.1
+    apart, expected = told[1:] - told[:1], own[1:] - own[:1]
+    for columns in (slice(0, 3), slice(3, 6), slice(6, 13)):
+        size = np.sqrt((expected[..., columns] ** 2).mean())
+        assert size > 1e-5
+        assert np.sqrt(((apart - expected)[..., columns] ** 2).mean()) < 0.15 * size
+    # Before it branches off, a run is the first one.
+    assert np.array_equal(told[4:, :8], np.repeat(told[:1, :8], 3, axis=0))
+
+
+def test_a_step_of_a_runner_is_one_of_the_twin(twin):
+    commands, state, row, _ = near(twin)
+    before = {name: values.copy() for name, values in state.items()}
+    _, expected = twin.step(commands[:1, 0], state, row[None])
+    after = twin.runner().step(commands[0, 0], state, row)
+    assert after.keys() == expected.keys()
+    for name, values in expected.items():
+        assert after[name].shape == values.shape
+        assert after[name] == pytest.approx(values, rel=1e-4, abs=1e-5), name
+        assert np.array_equal(state[name], before[name])
+
+
+def test_a_resistance_slows_the_cylinder_that_it_acts_on(twin):
+    commands, state, row, _ = near(twin, runs=1)
+    runner = twin.runner()
+    free = runner.branches(commands, state, row, np.zeros(1, np.int64))
+    for which in range(3):
+        runner.resistance = 2e4 * (np.arange(3) == which)
+        held = runner.branches(commands, state, row, np.zeros(1, np.int64))
+        assert held[0, 0, which] < free[0, 0, which]
+
+
+def test_forces_that_the_model_does_not_know_of_are_found_from_velocities(twin):
+    commands, state, row, _ = near(twin, runs=1, ticks=60)
+    plant, model = twin.runner(), twin.runner()
+    plant.resistance = np.array([3e4, -2e4, 1e4])
+    estimate, free = LoadEstimate(model, np.arange(3), 0.2), np.full(len(row), np.nan, np.float32)
+    now = state
+    for command in commands[0]:
+        estimate.update(row[:3].astype(float))
+        before, now = now, model.step(command, now, row)
+        estimate.expect(command, row, before, now)
+        state = plant.step(command, state, free)
+        row = state["answer"][0].astype(np.float32)
+    assert model.resistance == pytest.approx(plant.resistance, rel=0.15, abs=2e3)
+    estimate.begin()
+    assert not model.resistance.any()
+
+
+def test_a_missing_velocity_leaves_an_estimate_of_forces_as_it_is(twin):
+    commands, state, row, _ = near(twin, runs=1)
+    runner = twin.runner()
+    estimate = LoadEstimate(runner, np.arange(3), 0.2)
+    estimate.expect(commands[0, 0], row, state, runner.step(commands[0, 0], state, row))
+    estimate.update(np.array([0.1, np.nan, 0.0]))
+    assert not runner.resistance.any()
+    estimate.update(np.array([0.1, 0.0, 0.0]))
+    assert runner.resistance.any()

@@ -137,7 +137,8 @@ class InversionController(Controller):
         width = tried.shape[1]
         for axis in range(AXES):
             candidates[axis * width : (axis + 1) * width, axis] = tried[axis]
-        answers = self.model.ahead(row, self.plant.commands(candidates))
+        tried_first = np.concatenate((self._solution[None], candidates))
+        answers = self.model.ahead(row, self.plant.commands(tried_first))[1:]
         solution = np.empty(AXES)
         for axis in range(AXES):
             # A lever that goes farther never gives less; what a model says otherwise is its error.

@@ -59,6 +59,7 @@ class PredictiveControl:
         trust_m_s: most by which a tick may change a speed of the plan: linear models hold near it only.
         window_s: time over which the twin's predictions are compared with what came, for the disturbance.
         smoothing: share of a new error that the disturbance takes over in a tick; 0: offsets stay.
+        load: the same of forces against the cylinders, which a twin with a load (`greybox`) is told of; others are not.
         fallback: whether a PI loop answers where the program has no solution, or a guard asks for it; otherwise the
             levers go to neutral.
     """
@@ -78,6 +79,7 @@ class PredictiveControl:
     trust_m_s: float = 0.1
     window_s: float = 0.2
     smoothing: float = 0.02
+    load: float = 0.15
     fallback: bool = True
 
     def __post_init__(self) -> None:
@@ -93,6 +95,7 @@ class PredictiveControl:
             trust_m_s=above(0.0, 100.0),
             window_s=above(0.0, 10.0),
             smoothing=span(0.0, 1.0),
+            load=span(0.0, 1.0),
         )
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
@@ -102,7 +105,7 @@ class PredictiveControl:
             ConfigError: one of them is missing or does not fit, or DAQP is not installed.
         """
         window = max(1, round(self.window_s * plant.rate_hz))
-        model = TwinModel(models.needed_twin("nmpc"), plant, window, self.smoothing)
+        model = TwinModel(models.needed_twin("nmpc"), plant, window, self.smoothing, self.load)
         valves = models.needed_map("nmpc")
         fallback = PiController(ProportionalIntegral(), plant, limits, valves) if self.fallback else None
         return NmpcController(self, limits, model, SpeedToLever(valves, limits), fallback)

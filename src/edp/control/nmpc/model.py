@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.control.geometry import AXES
+from edp.control.nmpc.load import LoadEstimate
 from edp.control.plant import PILOTS, STROKES, VELOCITIES, PlantInterface
 from edp.errors import ConfigError, closest
 from edp.networks.twin import Twin
@@ -28,6 +29,7 @@ class TwinModel:
         plant: that is controlled.
         window: ticks over which predictions are compared with what was measured.
         smoothing: share of an error that the disturbance takes over in a tick; 0: no disturbance.
+        load: the same of forces that the model is told of, where its formulation has a load.
 
     Attributes:
         reads: channels of the plant that it reads, in the order of the twin's answers.
@@ -38,7 +40,7 @@ class TwinModel:
         ConfigError: another rate, other commands, or strokes or velocities that either does not have.
     """
 
-    def __init__(self, twin: Twin, plant: PlantInterface, window: int, smoothing: float) -> None:
+    def __init__(self, twin: Twin, plant: PlantInterface, window: int, smoothing: float, load: float = 0.0) -> None:
         answers = [channel.name for channel in twin.channels.answers]
         commands = [channel.name for channel in twin.channels.commands]
         _check(twin, plant, answers, commands)
@@ -49,6 +51,8 @@ class TwinModel:
         self._ports = np.array([answers.index(name) for name in self.reads])
         self._pilots = np.array([PILOTS.index(name) for name in commands])
         self._strokes = _columns([answers.index(name) for name in STROKES])
+        velocities = np.array([answers.index(name) for name in VELOCITIES])
+        self._velocities, self._load = velocities, LoadEstimate(self._runner, velocities, load)
         self._pressures = _columns([n for n, name in enumerate(answers) if name.startswith("CylPressures_")])
         self.pressures = sum(name.startswith("CylPressures_") for name in answers)
         self._free = np.full(len(answers), np.nan, np.float32)
@@ -67,6 +71,7 @@ class TwinModel:
         rows = np.repeat(row[None, None], ticks, axis=1)
         self._state = self.twin.reset(np.repeat(command[None, None], ticks, axis=1), rows)
         self.disturbance = np.zeros(AXES)
+        self._load.begin()
         self._past.clear()
 
     def row(self, measured: Array) -> NDArray[np.float32]:
@@ -76,12 +81,13 @@ class TwinModel:
         return row
 
     def look_back(self, measured: Array) -> None:
-        """Bring the disturbance up to date with this row of `reads`; where a stroke is NaN, its part stays."""
+        """Bring disturbance and load up to date with this row of `reads`; where a stroke is NaN, its part stays."""
+        self._load.update(self.row(measured)[self._velocities].astype(float))
         if len(self._past) < self.window or not self.smoothing:
             return
         state, row, _ = self._past[0]
         commands = np.array([command for _, _, command in self._past])
-        answers = self._runner.branches(commands[None], state, row, self._alone)
+        answers = self._runner.neighbours(commands[None], state, row, self._alone)
         missed = self.row(measured)[self._strokes] - answers[0, -1, self._strokes]
         speed = missed * self.plant.rate_hz / self.window
         speed = np.where(np.isfinite(speed), speed, self.disturbance)
@@ -99,7 +105,7 @@ class TwinModel:
             Strokes (m) after each tick, shape (run, tick, 3), and cylinder pressures (Pa), shape (run, tick, pressure).
         """
         commands = np.asarray(self.plant.commands(levers)[..., self._pilots], np.float32)
-        answers = self._runner.branches(commands, self._state, self.row(measured), first)
+        answers = self._runner.neighbours(commands, self._state, self.row(measured), first)
         ticks = np.arange(1, levers.shape[1] + 1)[:, None]
         strokes = answers[..., self._strokes] + ticks * (self.disturbance / self.plant.rate_hz)
         return strokes, answers[..., self._pressures].astype(float)
@@ -109,7 +115,9 @@ class TwinModel:
         row = self._free if measured is None else self.row(measured)
         command = np.asarray(self.plant.commands(levers)[self._pilots], np.float32)
         self._past.append((self._state, row, command))
-        self._state = self._runner.step(command, self._state, row)
+        before = self._state
+        self._state = self._runner.step(command, before, row)
+        self._load.expect(command, row, before, self._state)
 
 
 def _columns(indices: list[int]) -> slice | NDArray[np.int64]:

@@ -256,14 +256,27 @@ class TwinRunner:
 
     Args:
         twin: that runs; later changes of its numbers may or may not show.
+
+    Attributes:
+        resistance: forces against each velocity (N, or N m) that the load does not know of; None where the twin's
+            equations have no load.
     """
 
     def __init__(self, twin: Twin) -> None:
         self.twin = twin
+        self.resistance: NDArray[np.float64] | None = None
 
     def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
         """See `Twin.branches`."""
         return self.twin.branches(commands, state, measured, first)
+
+    def neighbours(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
+        """`branches` whose commands are near those of the first run: what derivatives of a plan are made of.
+
+        Where it is far cheaper, the load of the machine follows them to first order: the first run is exact, and what
+        the others differ from it by is small against what they move.
+        """
+        return self.branches(commands, state, measured, first)
 
     def step(self, command: Array, state: TwinState, measured: Array) -> TwinState:
         """State after one tick.

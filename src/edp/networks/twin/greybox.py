@@ -12,7 +12,7 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, closest
 from edp.ir import Builder
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinRunner, TwinState
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
 from edp.networks.twin.grey.connections import check_elements
@@ -31,6 +31,7 @@ from edp.networks.twin.grey.lowering import add_layer
 from edp.networks.twin.grey.numbers import LEFT_OUT, NumberTable, finer_values, number_table
 from edp.networks.twin.grey.plausible import STRETCHES, Travel
 from edp.networks.twin.grey.run import run_lanes
+from edp.networks.twin.grey.runner import GreyRunner
 from edp.networks.twin.grey.start import load_start
 from edp.networks.twin.grey.wiring import Wiring, turning_scales
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
@@ -360,6 +361,9 @@ class GreyTwin(Twin):
             self.table.places, self.table.exponents, self.time, judged.full, nothing if answers is None else answers,
             judged.normal, *network,
         )  # fmt: skip
+
+    def runner(self) -> TwinRunner:
+        return GreyRunner(self, STATES)
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
         return add_layer(build, self, fed)

@@ -16,7 +16,7 @@ from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, Dense, ScaleShift
 from edp.ir.memory import Gru
-from edp.networks.twin.base import TWINS, TwinState, solved_columns
+from edp.networks.twin.base import TWINS, TwinRunner, TwinState, solved_columns
 from edp.networks.twin.grey.correction import Cell, Trace, run_back
 from edp.networks.twin.greybox import Doubles, GreyBox, GreyTwin
 from edp.networks.twin.recurrent_cell import CellWeights, weight_gradients
@@ -158,6 +158,10 @@ class ResidualTwin(GreyTwin):
         fed = np.where(port.numpy() > 0, fed, np.float32(np.nan)).swapaxes(0, 1)
         result = _Corrected.apply(projected, *network.looped, self, inputs, fed, port.numpy())  # type: ignore[no-untyped-call]
         return torch.as_tensor(result)
+
+    def runner(self) -> TwinRunner:
+        # That of the grey box knows nothing of the network.
+        return TwinRunner(self)
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
         solved, scales = solved_columns(self.channels), self.scales

@@ -16,7 +16,7 @@ IntArray = NDArray[np.int64]
 
 
 @inner
-def _work(
+def work_arrays(
     n: int, nodes: int, pumps: int, valves: int, numbers: int, columns: int, terms: int, degree: int
 ) -> tuple[tuple[Array, ...], ...]:
     """Arrays that a tick writes: network sums, rows, load, monomials, vectors, matrices; and tangents."""
@@ -83,7 +83,7 @@ def _follow(
 
 
 @inner
-def _bound(
+def hold_bounds(
     y: Array, s: Array, before: tuple[Array, Array], ports: IntArray, limits: tuple[Array, ...], tick_s: float
 ) -> None:
     """Hold what is answered within its bounds: velocities first, strokes by them, no velocity into an end stop."""
@@ -105,7 +105,7 @@ def _bound(
 
 
 @inner
-def _feed(
+def feed(
     measured: Array,
     answer: Array,
     fed_back: bool,
@@ -215,7 +215,9 @@ def run_lanes(
     nodes, judged, traced = unknown - n, len(truth) > 0, len(trace[0]) > 0
     numbers = len(q) if full or traced else 0
     columns = trace[5].shape[2] if traced else numbers
-    work = _work(n, nodes, state[4].shape[1], state[5].shape[1], numbers, columns, len(exponents), exponents.max())
+    work = work_arrays(
+        n, nodes, state[4].shape[1], state[5].shape[1], numbers, columns, len(exponents), exponents.max()
+    )
     scratch = (work[0], work[1], work[2], work[3], work[4], work[5])
     own = np.zeros((state[5].shape[1], at.VALVE_STATES, at.OWN))
     t_y, t_s = work[6][0], work[6][1]
@@ -232,7 +234,7 @@ def run_lanes(
         own[:] = 0.0
         loss, used, by_weights = 0.0, 0, False
         for t in range(ticks):
-            _feed(measured[row, t], state[0][row], not judged, ports, (y, s), (t_y, t_s), full)
+            feed(measured[row, t], state[0][row], not judged, ports, (y, s), (t_y, t_s), full)
             for k in range(len(history) - 1, 0, -1):
                 history[k] = history[k - 1]
             history[0] = demands[row, t]
@@ -293,7 +295,7 @@ def _answer(
     y, s, nodes = lane[0], lane[1], len(lane[0]) - len(lane[1])
     if cell[1].shape[1] > 0:
         correct(now, y, s, before[2], ports, cell, trace, before[3])
-    _bound(y, s, (before[0], before[1]), ports, limits, tick_s)
+    hold_bounds(y, s, (before[0], before[1]), ports, limits, tick_s)
     if len(trace[0]) > 0:
         note_bounds(now, y, s, ports, limits, trace, before[3])
     _rounded(lane, history)

@@ -310,8 +310,9 @@ def newton(
     knots: Array,
     sums: tuple[Array, ...],
     out: tuple[Array, ...],
+    tolerance: float,
 ) -> int:
-    """Solve the stage in index of y, from a guess; returns the iterations."""
+    """Solve the stage in index of y, from a guess, until it moves by less than `tolerance`; returns the iterations."""
     y = now[0]
     nodes = len(y) - len(strokes)
     residual, by_y = out[0], out[1]
@@ -339,6 +340,6 @@ def newton(
                 y[k] = max(y[k] - change, 0.25 * (y[k] + at.ATMOSPHERE) - at.ATMOSPHERE)
             else:
                 y[k] -= change
-        if abs(largest) < TOLERANCE:
+        if abs(largest) < tolerance:
             return iteration + 1
     return ITERATIONS

@@ -11,7 +11,7 @@ from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.jit import inner
 from edp.networks.twin.grey.linkage import freeze_linkage
 from edp.networks.twin.grey.motion import basis, bristle_slopes, freeze_load, friction
-from edp.networks.twin.grey.stage import assemble, content, factorise, newton, solve
+from edp.networks.twin.grey.stage import TOLERANCE, assemble, content, factorise, newton, solve
 from edp.networks.twin.grey.valve import advance_valves, displace, own_places
 
 Array = NDArray[np.float64]
@@ -131,7 +131,7 @@ def bristles(
 
 
 @inner
-def _contents(
+def fill_contents(
     y: Array, t_y: Array, nodes: int, q: Array, circuit: int, contents: Array, t_contents: Array, columns_by: int
 ) -> None:
     """What pressures and velocities hold: oil and the velocities themselves; with their tangents."""
@@ -191,11 +191,11 @@ def tick(
     t_speed, t_stroke = t_y[nodes:].copy(), t_s.copy()
     for _ in range(time[1]):
         before_v[:] = y[nodes:]
-        _freeze(s, (t_y, t_s), model, places, exponents, step, work, columns_by)
+        freeze(s, (t_y, t_s), model, places, exponents, step, work, columns_by)
         load = (loads[8], loads[3], loads[4], loads[5])
         small = (loads[0], loads[1], loads[8], loads[9], terms[0], loads[10], loads[11])
         start[:], zs[:], base_z[:] = y, z, z
-        _contents(y, t_y, nodes, q, circuit, base, t_base, columns_by)
+        fill_contents(y, t_y, nodes, q, circuit, base, t_base, columns_by)
         if columns_by:
             t_first[:], t_start_z[:], t_base_z[:] = t_y, t_z, t_z
         h = GAMMA * step
@@ -209,7 +209,7 @@ def tick(
             stroke = (s, before_v, 0.5 * (h if which == 0 else step))
             now = (y, base, h)
             x = valves[:, at.SPOOL].copy()
-            spent += newton(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out)
+            spent += newton(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out, TOLERANCE)
             if columns_by:
                 assemble(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out, True)
                 state, bases = (t_first, t_s, t_z, t_d, t_valves), (base_z, t_base_z)
@@ -218,20 +218,20 @@ def tick(
                 )
             bristles(y, base_z, h, q, form[3], z, (t_z, t_base_z, t_y), columns_by)
             if which == 0:
-                _contents(y, t_y, nodes, q, circuit, reached, t_reached, columns_by)
+                fill_contents(y, t_y, nodes, q, circuit, reached, t_reached, columns_by)
                 base[:] += AHEAD * (reached - base)
                 base_z[:] = zs + AHEAD * (z - zs)
                 if columns_by:
                     t_base[:] += AHEAD * (t_reached - t_base)
                     t_base_z[:] = t_start_z + AHEAD * (t_z - t_start_z)
-        _move(s, t_s, s, t_s, (before_v, t_first[nodes:]), (y[nodes:], t_y[nodes:]), 0.5 * step, scale, columns_by)
+        move(s, t_s, s, t_s, (before_v, t_first[nodes:]), (y[nodes:], t_y[nodes:]), 0.5 * step, scale, columns_by)
     # What a twin promises: a stroke is the trapezoidal integral of the velocities that it answers, one a tick.
-    _move(s, t_s, s_start, t_stroke, (at_start, t_speed), (y[nodes:], t_y[nodes:]), 0.5 * time[0], scale, columns_by)
+    move(s, t_s, s_start, t_stroke, (at_start, t_speed), (y[nodes:], t_y[nodes:]), 0.5 * time[0], scale, columns_by)
     return spent
 
 
 @inner
-def _move(
+def move(
     s: Array,
     t_s: Array,
     start: Array,
@@ -253,7 +253,7 @@ def _move(
 
 
 @inner
-def _freeze(
+def freeze(
     s: Array,
     tangents: tuple[Array, Array],
     model: tuple[Array, ...],

@@ -1,0 +1,79 @@
+"""Forces on the machine that its model does not know of, as soil makes them, from velocities that were measured."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.base import TwinRunner, TwinState
+
+Array = NDArray[np.float64]
+PROBE_N = 1e4
+"""By which a force is changed to see its effect on the velocities a tick later."""
+RENEWED_TICKS = 10
+"""After how many ticks that effect is asked for anew: it changes with pose and opening of the valves."""
+MOST_N = 5e5
+"""Of an estimate: about what a cylinder of a 22 t excavator can hold."""
+
+
+class LoadEstimate:
+    """Resistance against each cylinder, from velocities one tick ahead.
+
+    In a tick chambers hardly give way, so that what a velocity differs by from what the model expects is a force on
+    what it moves. What the model knows wrongly of friction or gravity counts as one, too.
+
+    Args:
+        runner: of a model with a load; its `resistance` is written.
+        velocities: columns of its answers, which begin with all velocities.
+        share: of a new error that the estimate takes over in a tick; 0: none.
+    """
+
+    def __init__(self, runner: TwinRunner, velocities: NDArray[np.int64], share: float) -> None:
+        self._runner, self._velocities, self._share = runner, velocities, share
+        self._slopes, self._age = np.zeros((len(velocities), len(velocities))), 0
+        self._expected: Array | None = None
+        self.acts = share > 0.0 and runner.resistance is not None
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was estimated."""
+        self._expected, self._age = None, 0
+        if self._runner.resistance is not None:
+            self._runner.resistance = np.zeros_like(self._runner.resistance)
+
+    def expect(
+        self, command: NDArray[np.float32], row: NDArray[np.float32], before: TwinState, after: TwinState
+    ) -> None:
+        """Note what the model says of a tick.
+
+        Args:
+            command: of it ``(command,)``.
+            row: that its ports read ``(answer,)``.
+            before: state before it.
+            after: state after it.
+        """
+        resistance = self._runner.resistance
+        if not self.acts or resistance is None:
+            return
+        self._expected = np.asarray(after["answer"][0, self._velocities], float)
+        if self._age % RENEWED_TICKS == 0:
+            for axis, which in enumerate(self._velocities):
+                self._runner.resistance = resistance + PROBE_N * (np.arange(len(resistance)) == which)
+                moved = self._runner.step(command, before, row)["answer"][0, self._velocities]
+                self._slopes[:, axis] = (moved - self._expected) / PROBE_N
+            self._runner.resistance = resistance
+        self._age += 1
+
+    def update(self, measured: Array) -> None:
+        """Bring the estimate up to date with velocities that are measured now; NaN leaves it as it is."""
+        resistance, expected = self._runner.resistance, self._expected
+        if expected is None or resistance is None or not np.isfinite(measured).all():
+            return
+        try:
+            forces = np.linalg.solve(self._slopes, measured - expected)
+        except np.linalg.LinAlgError:
+            return
+        if np.isfinite(forces).all():
+            changed = resistance.copy()
+            changed[self._velocities] += self._share * forces
+            self._runner.resistance = np.clip(changed, -MOST_N, MOST_N)

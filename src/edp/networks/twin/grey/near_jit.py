@@ -1,0 +1,16 @@
+"""Compiled code of plans on grey boxes, kept on disk apart: no fit waits for it, and it for no fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from edp.networks.twin.grey.jit import compiler as whole
+from edp.storage.machine_code import Compiler, files_with
+
+_FOLDER = Path(__file__).parent
+compiler = Compiler(
+    "grey_near",
+    lambda: (*whole.sources(), *files_with(_FOLDER, "from edp.networks.twin.grey.near_jit import")),
+    whole.options,
+)
+compiled, inner = compiler.compiled, compiler.inner

@@ -1,0 +1,81 @@
+"""A grey box for one machine tick by tick, with everything that does not change laid out for its compiled code."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.base import TwinRunner, TwinState
+from edp.networks.twin.grey.near_runs import run_near
+from edp.networks.twin.grey.plausible import KNOTS
+from edp.networks.twin.scales import Array
+
+if TYPE_CHECKING:
+    from edp.networks.twin.greybox import GreyTwin
+
+Doubles = NDArray[np.float64]
+SINGLE_TICKS = 4
+"""Of a plan, that have steps of their own: behind them, where levers change block by block, a step takes two ticks."""
+LONGEST_S = 0.0205
+"""Of such a step: the fastest swing of a load still has ten of them."""
+
+
+class GreyRunner(TwinRunner):
+    """See `TwinRunner`; states that it makes are in double precision.
+
+    Args:
+        twin: that runs.
+        names: of the parts of its state, as compiled code orders them.
+    """
+
+    def __init__(self, twin: GreyTwin, names: tuple[str, ...]) -> None:
+        super().__init__(twin)
+        self._grey, self._names, self._units = twin, names, twin.units
+        table, wiring, units = twin.table, twin.wiring, twin.units
+        limits = (twin.scales.low / units, twin.scales.high / units, units)
+        self._parts: tuple[Any, ...] = (
+            tuple(np.ascontiguousarray(values, dtype=np.float64) for values in limits),
+            (twin.numbers, KNOTS, *wiring.z_of, table.linkage),
+            twin.form,
+            wiring.ports,
+            table.places,
+            table.exponents,
+            twin.time,
+        )
+        self._double = twin.time[1] == 1 and 2.0 * twin.time[0] <= LONGEST_S
+        self._speeds = np.array([speed for speed, _, _, _ in wiring.columns])
+        self.resistance = np.zeros(len(wiring.columns))
+
+    def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
+        if len(commands) > 1:
+            return super().branches(commands, state, measured, first)
+        return self._run(commands, state, measured, first)[0]
+
+    def neighbours(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
+        return self._run(commands, state, measured, first, SINGLE_TICKS)[0]
+
+    def step(self, command: Array, state: TwinState, measured: Array) -> TwinState:
+        answers, after = self._run(command[None, None], state, measured, np.zeros(1, np.int64))
+        return {"answer": answers[0]} | {name: values[None] for name, values in zip(self._names, after, strict=True)}
+
+    def _run(
+        self,
+        commands: Array,
+        state: TwinState,
+        measured: Array,
+        first: NDArray[np.int64],
+        single: int | None = None,
+    ) -> tuple[Array, tuple[Doubles, ...]]:
+        """Answers ``(run, tick, answer)``, and the state of the first run after them; see `run_near` for `single`."""
+        ticks = commands.shape[1]
+        now = tuple(np.array(state[name][0], np.float64, order="C") for name in self._names)
+        answers = np.empty((*commands.shape[:2], len(self._units)))
+        forces = np.zeros(len(self._speeds)) if self.resistance is None else self.resistance
+        resistance = np.ascontiguousarray(1e-6 * forces[self._speeds])
+        row = measured / self._units
+        singles = ticks if single is None or not self._double else max(1, single)
+        rest: tuple[Any, ...] = (*self._parts, singles, answers)
+        run_near(self._grey.demands(commands), row, first, now, resistance, *rest)
+        return answers, now
