@@ -43,8 +43,9 @@ RATE, RISE, DECAY = 6e-3, 0.1, 1e-4
 """Largest learning rate of SOAP, the share of the updates over which it rises, and its weight decay: there is no noise
 that weights should be held down for. On left-out rows the students of the EMPS axis came nearer to their teacher in
 2,000 of its updates than in 4,000 of AdamW at 3e-3, 0.58 in place of 0.84 of the error that the teacher promised."""
-POINTS, POINTS_PER_ROW = 40_000, 8
-"""Points of lines through rows: at most, and for each recorded row."""
+POINTS = 40_000
+"""Points of lines through rows. Eight for each row instead, 6,000 on the tanks, left the student 6 % further from its
+teacher on left-out rows."""
 REACH = 30
 """Rows that a point's two ends lie apart at most: between rows that follow one another the machine passes through."""
 BEYOND = 0.5
@@ -245,10 +246,9 @@ class _Perceptrons:
 
 def _on_lines(rows: Tensor, draw: torch.Generator) -> Tensor:
     """Points on lines through rows that lie at most `REACH` apart, ``(point, column)``."""
-    count = min(POINTS, POINTS_PER_ROW * len(rows))
-    first = torch.randint(len(rows), (count,), generator=draw)
-    second = (first + torch.randint(-REACH, REACH + 1, (count,), generator=draw)).clamp(0, len(rows) - 1)
-    share = (1.0 + 2.0 * BEYOND) * torch.rand(count, 1, generator=draw) - BEYOND
+    first = torch.randint(len(rows), (POINTS,), generator=draw)
+    second = (first + torch.randint(-REACH, REACH + 1, (POINTS,), generator=draw)).clamp(0, len(rows) - 1)
+    share = (1.0 + 2.0 * BEYOND) * torch.rand(POINTS, 1, generator=draw) - BEYOND
     return torch.lerp(rows[first], rows[second], share)
 
 
