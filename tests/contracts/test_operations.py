@@ -45,7 +45,7 @@ def cost(rows):
 
 
 # Parts whose work counts once per prediction; pooling is left out of windowed counts, as in the thesis's tables.
-ONCE = ("backbone.extras", "backbone.groups", "backbone.radial", "gate", "heads", "bypass", "physics")
+ONCE = ("backbone.extras", "backbone.groups", "backbone.radial", "backbone.near", "gate", "heads", "bypass", "physics")
 LEFT_OUT = "backbone.pooling"
 
 

@@ -287,6 +287,10 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     assert CANDIDATES["recurrent"].tables(replace(amount, rows=5000)) is None
     assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140)) is not None
     assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140, horizon=100)) is None
+    parts = CANDIDATES["committee"].tables(amount)["model"]["backbone"]
+    assert parts["near"] == []
+    parts = CANDIDATES["committee"].tables(replace(amount, rows=5000, shortest=40))["model"]["backbone"]
+    assert (parts["lags"], parts["near"]) == ([1, 2, 3, 4], [0, 1, 2, 4])
     steps = [
         CANDIDATES["committee"].tables(replace(amount, minutes=minutes))["training"]["bagging"]["steps"]
         for minutes in (0.01, 1.0, 100.0)

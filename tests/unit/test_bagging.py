@@ -18,6 +18,7 @@ from edp.networks.backbones import CommitteeSpec, HybridSpec
 from edp.networks.heads import LinearHead, MlpHead
 from edp.networks.lag_bank import LagBank
 from edp.networks.predictor import ModelSpec
+from edp.networks.radial import RadialFeatures
 from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.signals import Channel, Kind
@@ -84,6 +85,7 @@ def test_the_network_predicts_the_test_part_as_well_as_it_promised(bagged):
 PARTS = {
     "perceptrons of two losses": ({"members": 8}, {"robust_width": 0.1}),
     "radial": ({"activations": (), "centres": 100}, {}),
+    "radial on few columns": ({"activations": (), "centres": 100, "near": (0, 1)}, {}),
     "trees": ({"activations": (), "trees": 60}, {}),
     "trees that leave out two folds at a time": ({"activations": (), "trees": 60}, {"tree_folds": 2}),
     "deep trees of few leaves": ({"activations": (), "trees": 60, "tree_depth": 7}, {"tree_leaves": 12}),
@@ -116,15 +118,18 @@ def test_every_kind_of_learner_lowers_the_error_and_keeps_its_promise(name):
 def test_the_network_computes_the_weighted_sum_of_its_learners():
     """On rows that all models were fitted to: the linear model, the centres and the trees, put together by hand."""
     data = data_of(recording(), horizons=(1,), mode=TargetMode.ABSOLUTE)
-    model = committee(activations=(), centres=40, trees=20)
+    model = committee(activations=(), centres=40, near=(2,), trees=20)
     outcome = fit_bagged(data, model, spec())
     net, table = outcome.fitted.predictor, outcome.table
     backbone, columns = net.backbone, torch.from_numpy(table.columns)
     weights = net.heads.weights[0].detach().double().numpy()[0, :, 0]
-    situation = columns * backbone.radial.gain
-    near = torch.sigmoid(-(torch.cdist(situation, backbone.radial.weight[:, :-1].detach()) ** 2) / 2).double().numpy()
+    near = []
+    for functions, read in ((backbone.radial, range(10)), (backbone.near[0], [0, 1, 4, 5])):  # lags 1, 2, 4, 8 of two
+        situation = columns[:, list(read)] * functions.gain
+        distance = torch.cdist(situation, functions.weight[:, :-1].detach())
+        near.append(torch.sigmoid(-(distance**2) / 2).double().numpy())
     sums = backbone.trees(columns[None], ())[0][0].double().numpy()
-    by_hand = np.concatenate([table.columns, near, sums], axis=1) @ weights + float(net.heads.biases[0][0, 0].detach())
+    by_hand = np.concatenate([table.columns, *near, sums], axis=1) @ weights + float(net.heads.biases[0][0, 0].detach())
     part = data.train[0]
     (predicted,) = stream_predictions(net, [part])
     count = part.samples - 1 - table.starts[0][1]
@@ -132,6 +137,43 @@ def test_the_network_computes_the_weighted_sum_of_its_learners():
         0, 0
     ]
     np.testing.assert_allclose(scaled, by_hand[:count], atol=2e-3)
+
+
+def test_where_rows_are_few_what_reads_few_columns_errs_less():
+    """What a line leaves depends on the present input alone; ten columns of 600 rows hide it from what reads all."""
+    rng = np.random.default_rng(5)
+    u = rng.uniform(-2, 2, 600)
+    y = np.concatenate([[0.0], np.sin(3 * u[:-1])]) + 0.02 * rng.normal(size=600)
+    values = np.stack([u, y], axis=1).astype(np.float32)
+    log = Recording(name="log", rate_hz=RATE, channels=CHANNELS, values=values, source="test")
+    data = data_of(log, horizons=(1,), mode=TargetMode.ABSOLUTE)
+    errors = []
+    for near in ((), (0,)):
+        outcome = fit_bagged(data, committee(activations=(), centres=100, near=near), spec())
+        (predicted,) = stream_predictions(outcome.fitted.predictor, data.test)
+        errors.append(np.square(predicted[10:-1, 0, 0] - data.test[0].targets[11:, 0]).mean() ** 0.5)
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_basis_functions_on_few_columns_read_no_others():
+    functions, x = RadialFeatures(6, 3, (1, 4)), torch.randn(1, 5, 6)
+    functions.set_centres(torch.randn(3, 2))
+    other, own = x.clone(), x.clone()
+    other[..., [0, 2, 3, 5]] += 1.0
+    own[..., 4] += 1.0
+    assert torch.equal(functions(other, ())[0], functions(x, ())[0])
+    assert not torch.equal(functions(own, ())[0], functions(x, ())[0])
+
+
+@pytest.mark.parametrize("near", [(3,), (2, 1), (0, 0), (-1,)])
+def test_impossible_spans_of_few_columns_are_refused(near):
+    with pytest.raises(ConfigError, match="near"):
+        CommitteeSpec(lags=(1, 2, 4), centres=10, near=near)
+
+
+def test_few_columns_without_centres_are_refused():
+    with pytest.raises(ConfigError, match="centres = 0"):
+        CommitteeSpec(near=(0,))
 
 
 def test_trees_that_predict_the_target_take_their_share_from_the_linear_model():

@@ -21,7 +21,7 @@ from edp.networks.convolution import ConvolutionStack, receptive_field
 from edp.networks.initial import InitialSpec, ZeroState
 from edp.networks.lag_bank import LagBank, check_lags, check_smoothed
 from edp.networks.pooling import AttentionPooling
-from edp.networks.radial import MOST_CENTRES, RadialFeatures
+from edp.networks.radial import MOST_CENTRES, RadialFeatures, check_near
 from edp.networks.streaming import Chain, Cost, State, Streaming
 from edp.networks.trees import MOST_DEPTH, MOST_TREES, Trees
 from edp.registry import Registry
@@ -252,7 +252,9 @@ class CommitteeSpec:
         layers: hidden layers of a member.
         activations: ``tanh``, ``relu`` or both; each has its own group of members. None leaves the linear model.
         dropout: rate after each hidden layer, in training.
-        centres: radial basis functions; a training on folds places them.
+        centres: radial basis functions on all columns; a training on folds places them.
+        near: of as many more for each entry, the span among `lags` whose changes they read beside the present values;
+            0 for present values alone. Where rows are few, what reads few columns learns more from them.
         trees: regression trees for each predicted number; their sums join the representation. A training on folds
             fits them.
         tree_depth: comparisons from the root of a tree to a leaf.
@@ -267,6 +269,7 @@ class CommitteeSpec:
     activations: tuple[str, ...] = ("tanh", "relu")
     dropout: float = 0.0
     centres: int = 0
+    near: tuple[int, ...] = ()
     trees: int = 0
     tree_depth: int = 4
 
@@ -278,6 +281,7 @@ class CommitteeSpec:
         check_bounds("backbone", self, members=integer(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
         check_bounds("backbone", self, trees=integer(0, MOST_TREES), tree_depth=integer(1, MOST_DEPTH))
         check_bounds("backbone", self, centres=integer(0, MOST_CENTRES))
+        check_near(self.near, self.lags, self.centres)
         for name in self.activations:
             if name not in NON_LINEAR or self.activations.count(name) > 1:
                 raise ConfigError(
@@ -301,7 +305,7 @@ class CommitteeSpec:
 
     def parts(self) -> tuple[str, ...]:
         """The members and the radial basis functions; changes and trees have no weights that a gradient trains."""
-        return ("groups", "radial") if self.centres else ("groups",)
+        return ("groups", *(["radial"] if self.centres else []), *(["near"] if self.near else []))
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """The bank of changes, and the members and trees on it."""
@@ -312,7 +316,8 @@ class CommitteeSpec:
         ]
         trees = Trees(bank.columns, outputs, self.trees, self.tree_depth) if self.trees else None
         radial = RadialFeatures(bank.columns, self.centres) if self.centres else None
-        net = Committee(bank, groups, radial, trees)
+        near = [RadialFeatures(bank.columns, self.centres, bank.columns_over(span)) for span in self.near]
+        net = Committee(bank, groups, radial, near, trees)
         return net, net.width
 
 

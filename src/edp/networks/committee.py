@@ -81,7 +81,7 @@ class Members(Streaming):
 
 
 class Committee(Streaming):
-    """``[bank ; members' hidden units ; radial basis functions ; trees' sums]``.
+    """``[bank ; members' hidden units ; radial basis functions ; those on few columns ; trees' sums]``.
 
     A linear head on it is a linear model plus a weighted mean of perceptrons, a kernel machine and sums of trees.
 
@@ -89,34 +89,48 @@ class Committee(Streaming):
         bank: gives what the others read.
         groups: of perceptrons.
         radial: nearness to typical rows; None for none.
+        near: nearness in few columns, each one to typical rows.
         trees: for each predicted number, horizons times targets; None for none.
     """
 
     def __init__(
-        self, bank: LagBank, groups: Sequence[Members], radial: RadialFeatures | None = None, trees: Trees | None = None
+        self,
+        bank: LagBank,
+        groups: Sequence[Members],
+        radial: RadialFeatures | None = None,
+        near: Sequence[RadialFeatures] = (),
+        trees: Trees | None = None,
     ) -> None:
         super().__init__()
         self.bank = bank
         self.groups = nn.ModuleList(groups)
         self.radial = radial
+        self.near = nn.ModuleList(near)
         self.trees = trees
 
     @property
     def width(self) -> int:
         """Numbers of the representation."""
         hidden = sum(group.members * group.units for group in self.members)
-        near = 0 if self.radial is None else self.radial.count
-        return self.bank.columns + hidden + near + (0 if self.trees is None else self.trees.outputs)
+        radial = sum(functions.count for functions in self.radials)
+        return self.bank.columns + hidden + radial + (0 if self.trees is None else self.trees.outputs)
 
     @property
     def members(self) -> list[Members]:
         """The groups of perceptrons."""
         return [group for group in self.groups if isinstance(group, Members)]
 
+    @property
+    def radials(self) -> list[RadialFeatures]:
+        """The radial basis functions, those on all columns first."""
+        parts = (self.radial, *self.near)
+        return [functions for functions in parts if isinstance(functions, RadialFeatures)]
+
     def readers(self) -> dict[str, Streaming]:
         """What reads the bank, by name, in the order of the representation."""
         readers: dict[str, Streaming] = {f"group{at}": group for at, group in enumerate(self.members)}
-        further = {"radial": self.radial, "trees": self.trees}
+        near = {f"near{at}": part for at, part in enumerate(self.near) if isinstance(part, RadialFeatures)}
+        further = {"radial": self.radial, **near, "trees": self.trees}
         return readers | {name: part for name, part in further.items() if part is not None}
 
     def initial_state(self, batch: int, like: Tensor) -> State:

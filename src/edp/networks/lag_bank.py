@@ -85,6 +85,12 @@ class LagBank(Streaming):
         """Ticks that the oldest value which a column reads lies back."""
         return max(self.lags[-1], *(2 * span - 1 for span in self.smoothed), 1)
 
+    def columns_over(self, span: int) -> list[int]:
+        """Columns of the present values and of their changes over one of `lags`, or of the former alone for span 0."""
+        present = range(self.width)
+        first = 0 if span == 0 else self.width * (1 + self.lags.index(span))
+        return [*present, *(range(first, first + self.width) if span else ())]
+
     def _means(self) -> list[StreamingTrailingMean]:
         """Means of changes, then means of some of these."""
         return [mean for mean in (*self.means, *self.means_of_means) if isinstance(mean, StreamingTrailingMean)]

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
+from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.ir.layers import Activate, BinaryOperation, Dense, Function, ScaleShift
 from edp.networks.streaming import Cost, Operation, State, Streaming
+from edp.settings.bounds import shown
 
 MOST_CENTRES = 4096
+
+
+def check_near(near: Sequence[int], lags: Sequence[int], centres: int) -> None:
+    """Refuse spans of radial basis functions on few columns that a committee cannot have.
+
+    Raises:
+        ConfigError: one that is neither 0 nor among `lags`, spans that do not rise, or no centres for them.
+    """
+    if list(near) != sorted(set(near)) or any(span != 0 and span not in lags for span in near):
+        raise ConfigError(
+            f"near: {shown(near)}; spans that rise, each 0 for present values alone or among lags = {shown(lags)}, "
+            "must hold"
+        )
+    if near and not centres:
+        raise ConfigError(f"near: {shown(near)} with centres = 0, which makes no basis functions; give centres as well")
 
 
 class RadialFeatures(Streaming):
@@ -21,12 +40,14 @@ class RadialFeatures(Streaming):
     of the features is its intercept alone.
 
     Args:
-        width: columns that it reads.
+        width: columns of its input.
         centres: how many.
+        columns: those that it reads, in their order; None for all of them.
 
     Attributes:
-        gain: what each column is multiplied by, one over the product of length and spread, ``(width,)``.
-        weight: ``(centre, width + 1)``; at first all centres are at the origin.
+        columns: that it reads.
+        gain: what each of these is multiplied by, one over the product of length and spread, ``(column,)``.
+        weight: ``(centre, column + 1)``; at first all centres are at the origin.
         bias: ``(centre,)``.
     """
 
@@ -35,17 +56,19 @@ class RadialFeatures(Streaming):
     operations = frozenset({Operation.LINEAR, Operation.SIGMOID})
     matrices = (("weight", (0,)),)
 
-    def __init__(self, width: int, centres: int) -> None:
+    def __init__(self, width: int, centres: int, columns: Sequence[int] | None = None) -> None:
         super().__init__()
         self.width, self.count = width, centres
-        self.register_buffer("gain", torch.ones(width))
-        self.register_buffer("minus_half", torch.full((1, width), -0.5), persistent=False)
-        self.weight = nn.Parameter(torch.zeros(centres, width + 1))
+        self.columns = tuple(range(width)) if columns is None else tuple(columns)
+        read = len(self.columns)
+        self.register_buffer("gain", torch.ones(read))
+        self.register_buffer("minus_half", torch.full((1, read), -0.5), persistent=False)
+        self.weight = nn.Parameter(torch.zeros(centres, read + 1))
         self.bias = nn.Parameter(torch.zeros(centres))
-        self.set_centres(torch.zeros(centres, width))
+        self.set_centres(torch.zeros(centres, read))
 
     def set_centres(self, centres: Tensor) -> None:
-        """Put the centres ``(centre, width)``, in units of length and spread, where the basis functions are largest."""
+        """Put the centres ``(centre, column)``, in lengths times spreads, where the basis functions are largest."""
         with torch.no_grad():
             self.weight.copy_(torch.cat([centres, torch.ones_like(centres[:, :1])], dim=1))
             self.bias.copy_(-0.5 * centres.square().sum(dim=1))
@@ -54,11 +77,13 @@ class RadialFeatures(Streaming):
         return ()
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        z = x * self.gain
+        # Indexing copies; all columns in order need no copy.
+        z = (x if len(self.columns) == self.width else x[..., self.columns]) * self.gain
         norm = nn.functional.linear(z * z, self.minus_half)
         return torch.sigmoid(nn.functional.linear(torch.cat([z, norm], dim=-1), self.weight, self.bias)), state
 
     def lower(self, build: Builder, x: str) -> str:
+        x = build.pick("read", x, self.columns)
         z = build.add(ScaleShift, "situation", x, gain=self.gain, shift=torch.zeros_like(self.gain))
         square = build.combine("square", BinaryOperation.MULTIPLY, z, z)
         norm = build.add(Dense, "norm", square, weight=self.minus_half, bias=torch.zeros(1))
@@ -69,9 +94,9 @@ class RadialFeatures(Streaming):
     def costs(self) -> list[Cost]:
         return [
             Cost(
-                f"{self.count} radial basis functions of {self.width} columns",
+                f"{self.count} radial basis functions of {len(self.columns)} columns",
                 self.weight.numel() + self.bias.numel(),
-                per_prediction=self.width + self.weight.numel(),
+                per_prediction=len(self.columns) + self.weight.numel(),
                 width_in=self.width,
                 width_out=self.count,
                 per_time_step=False,

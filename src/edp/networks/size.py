@@ -14,7 +14,7 @@ MOST_PARAMETERS = 50_000_000
 MOST_STATE = 100_000_000
 NO_WIDTHS = (
     *("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations"),
-    *("lags", "smoothed"),
+    *("lags", "smoothed", "near"),
 )
 """Options that are integers, but not the width of anything."""
 
@@ -60,8 +60,11 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
     )
     # A tree has two numbers a node and one a leaf.
     tables = targets * len(task.horizons) * max(0, most("trees")) * 3 * 2 ** most("tree_depth") if spans else 0
+    # Those on few columns read twice the features at most, and every output reads each of them.
+    near = sum(key == "near" for key, _ in options) * most("centres") * (2 * features + 2 + targets * values)
     spans_state = sum(2 * entry.ticks(task.rate_hz) for entry in task.features.derived)
-    return squares * width**2 + ends + small + tables, spans_state + 4 * reach * stacks * (levels + layers + 2) * width
+    parameters = squares * width**2 + ends + small + tables + near
+    return parameters, spans_state + 4 * reach * stacks * (levels + layers + 2) * width
 
 
 def _integers(parts: tuple[Any, ...] | list[Any], name: str = "") -> Iterator[tuple[str, int]]:

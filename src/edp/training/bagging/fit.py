@@ -121,8 +121,7 @@ def _learners(work: FoldFit) -> list[Learner]:
     learners: list[Learner] = []
     if committee.members:
         learners.append(PerceptronLearner(work, committee.members))
-    if committee.radial is not None:
-        learners.append(RadialLearner(work, committee.radial))
+    learners += [RadialLearner(work, functions) for functions in committee.radials]
     if committee.trees is not None:
         learners.append(TreeLearner(work, committee.trees))
     return learners

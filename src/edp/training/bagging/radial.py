@@ -54,11 +54,13 @@ class RadialLearner:
 
     def __init__(self, work: FoldFit, features: RadialFeatures) -> None:
         self.work, self.features = work, features
-        table = work.table
-        count = min(features.count, len(table.columns))
-        chosen = np.random.default_rng(work.spec.seed).choice(len(table.columns), count, replace=False)
-        self.centres = table.columns[np.sort(chosen)].astype(np.float64)
-        spread = table.columns.std(axis=0, dtype=np.float64)
+        columns = work.table.columns
+        # A view where all columns are read: a copy of them would double the memory of the table.
+        self.columns = columns if len(features.columns) == features.width else columns[:, features.columns]
+        count = min(features.count, len(columns))
+        chosen = np.random.default_rng(work.spec.seed).choice(len(columns), count, replace=False)
+        self.centres = self.columns[np.sort(chosen)].astype(np.float64)
+        spread = self.columns.std(axis=0, dtype=np.float64)
         self.spread = np.where(spread > 0, spread, 1.0)
         self.best: _Kernel | None = None
 
@@ -82,7 +84,7 @@ class RadialLearner:
 
     def _kernel(self, length: float, targets: DoubleArray, stride: int) -> _Kernel:
         """A fit on every `stride`-th row; targets are those of the folds, ``(fold, row, output)``."""
-        columns, folds = self.work.table.columns[::stride], self.work.table.folds
+        columns, folds = self.columns[::stride], self.work.table.folds
         scale = length * np.sqrt(columns.shape[1]) * self.spread
         centres = self.centres / scale
         values, vectors = np.linalg.eigh(np.exp(_arguments(centres, centres)))

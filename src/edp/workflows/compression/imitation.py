@@ -2,8 +2,9 @@
 
 A committee has no memory but its bank of changes, so a row of the bank is all that it reads. The teacher's prediction
 is therefore known at every point of that space, not only where something was recorded. The student learns it on
-recorded rows and on points between rows that follow one another closely (synthetic rows: Bucila, Caruana and
-Niculescu-Mizil, "Model compression", 2006): it has as many examples as it needs, without noise.
+recorded rows and on points of lines through rows that follow one another closely, between them and somewhat beyond
+(synthetic rows: Bucila, Caruana and Niculescu-Mizil, "Model compression", 2006): it has as many examples as it needs,
+without noise, and knows what its teacher says where a machine goes further than it was recorded.
 """
 
 from __future__ import annotations
@@ -29,22 +30,26 @@ from edp.networks.predictor import ModelSpec, Predictor
 from edp.signals import KINDS
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.table import bank_rows
-from edp.training.eager import EagerAdamW
+from edp.training.optimizers import Soap
 from edp.training.outcome import Diverged, Fitted, TrainingProgress
 from edp.training.spec import TrainingSpec
 from edp.training.validation import standard_targets
 from edp.workflows.compression.committee import committee_start
 
-STEPS, CHECKS, BATCH = 10_000, 10, 256
-"""Updates, how often they are reported, and recorded rows of each; as many points between rows come with them. A third
-of the updates left 1.6 times the difference between student and teacher on the EMPS axis."""
-RATE, RISE, DECAY = 3e-3, 0.1, 1e-4
-"""Largest learning rate of AdamW, the share of the updates over which it rises, and its weight decay: there is no noise
-that weights should be held down for."""
-POINTS, POINTS_PER_ROW = 40_000, 8
-"""Points between rows: at most, and for each recorded row."""
+STEPS, CHECKS, BATCH = 5_000, 10, 256
+"""Updates, how often they are reported, and recorded rows of each; as many points of lines through rows come with
+them."""
+RATE, RISE, DECAY = 6e-3, 0.1, 1e-4
+"""Largest learning rate of SOAP, the share of the updates over which it rises, and its weight decay: there is no noise
+that weights should be held down for. On left-out rows the students of the EMPS axis came nearer to their teacher in
+2,000 of its updates than in 4,000 of AdamW at 3e-3, 0.58 in place of 0.84 of the error that the teacher promised."""
+POINTS = 40_000
+"""Points of lines through rows. Eight for each row instead, 6,000 on the tanks, left the student 6 % further from its
+teacher on left-out rows."""
 REACH = 30
 """Rows that a point's two ends lie apart at most: between rows that follow one another the machine passes through."""
+BEYOND = 0.5
+"""How far points lie beyond the two rows of their line at most, in distances between these."""
 PIECE = 4096
 """Rows that a network predicts in one call."""
 
@@ -131,7 +136,7 @@ class CommitteeImitation:
             raise TypeError("imitation trains a committee; `imitates` refuses any other student")
         draw = torch.Generator().manual_seed(spec.seed)
         rows, truth = self._rows(data)
-        points = _between(rows, draw)
+        points = _on_lines(rows, draw)
         beyond = [predict_rows(self.teacher, x) - predict_rows(net, x) for x in (rows, points)]
         spread = beyond[0].std(dim=0, correction=0)
         spread[spread <= 1e-9] = 1.0  # a teacher that is a line leaves nothing
@@ -203,8 +208,8 @@ class _Perceptrons:
                 group.weights[0][:, still] = 0.0
         hidden = sum(group.members * group.units for group in self.groups)
         self.last = nn.Parameter(torch.zeros(hidden + 1, targets[0].shape[1]))  # and a bias
-        learned = [self.last, *(parameter for group in self.groups for parameter in group.parameters())]
-        self.optimizer = EagerAdamW(learned, lr=RATE, weight_decay=DECAY)
+        layers = [named for group in self.groups for named in group.named_parameters()]
+        self.optimizer = Soap(learning_rate=RATE, weight_decay=DECAY).build([("last", self.last), *layers])
 
     def advance(self, start: int, stop: int) -> float:
         """Updates from one number to another; their mean loss.
@@ -239,12 +244,11 @@ class _Perceptrons:
         return mean
 
 
-def _between(rows: Tensor, draw: torch.Generator) -> Tensor:
-    """Points on lines between rows that lie at most `REACH` apart, ``(point, column)``."""
-    count = min(POINTS, POINTS_PER_ROW * len(rows))
-    first = torch.randint(len(rows), (count,), generator=draw)
-    second = (first + torch.randint(-REACH, REACH + 1, (count,), generator=draw)).clamp(0, len(rows) - 1)
-    share = torch.rand(count, 1, generator=draw)
+def _on_lines(rows: Tensor, draw: torch.Generator) -> Tensor:
+    """Points on lines through rows that lie at most `REACH` apart, ``(point, column)``."""
+    first = torch.randint(len(rows), (POINTS,), generator=draw)
+    second = (first + torch.randint(-REACH, REACH + 1, (POINTS,), generator=draw)).clamp(0, len(rows) - 1)
+    share = (1.0 + 2.0 * BEYOND) * torch.rand(POINTS, 1, generator=draw) - BEYOND
     return torch.lerp(rows[first], rows[second], share)
 
 
