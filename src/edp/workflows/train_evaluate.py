@@ -265,7 +265,7 @@ def evaluate(
         source: other recordings; all of them are judged.
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
-        minutes: after which no further baseline is begun; what is left out is judged by a later call without it.
+        minutes: after which no further baseline is begun; a later call judges it.
 
     Returns:
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
@@ -287,7 +287,7 @@ def evaluate(
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
         evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
-        # Scores that lack a baseline are shown, but not kept for a call that asks for all.
+        # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
         write_bytes(target / "predictions.safetensors", save(_shown(evaluation)))
         write_json(target / "scores.json", scores)
