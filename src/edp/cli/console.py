@@ -256,7 +256,9 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
         refuse_empty(sys.argv[1:])
         # Click would end the process itself; errors are to be told here.
         command = _command(app) if isinstance(app, typer.Typer) else app
-        code = command(prog_name="edp", standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
+        code = command(
+            prog_name="edp", standalone_mode=False
+        )  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:

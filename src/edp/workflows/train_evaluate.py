@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
 import torch
 from safetensors.numpy import save
 
@@ -289,7 +288,7 @@ def evaluate(
         evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
         # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
-        write_bytes(target / "predictions.safetensors", save(_shown(evaluation)))
+        write_bytes(target / "predictions.safetensors", save(evaluation.kept(SHOWN_RECORDINGS, SHOWN_TICKS)))
         write_json(target / "scores.json", scores)
     if source is None:
         note_test_result(folder, scores)
@@ -360,17 +359,6 @@ def _kept(folder: Path, key: str) -> dict[str, Any] | None:
         return None
     scores = read_scores(folder / "scores.json")
     return scores if scores.get("key") == key else None
-
-
-def _shown(evaluation: Evaluation) -> dict[str, np.ndarray]:
-    """Truth and predictions of a few recordings, for the report."""
-    tensors: dict[str, np.ndarray] = {}
-    for i, series in enumerate(evaluation.series[:SHOWN_RECORDINGS]):
-        tensors[f"{series.name}/truth"] = np.ascontiguousarray(series.targets[:SHOWN_TICKS])
-        for name in ("network", "ridge_arx"):
-            if name in evaluation.predictions:
-                tensors[f"{series.name}/{name}"] = np.ascontiguousarray(evaluation.predictions[name][i][:SHOWN_TICKS])
-    return tensors
 
 
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:
