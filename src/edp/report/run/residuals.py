@@ -29,16 +29,16 @@ def fit_table(facts: Facts) -> TextTable | None:
     horizons = sorted(facts.horizons)
     if model is None or not facts.targets:
         return None
-    rows, known = [], False
+    rows, any_r2 = [], False
     for target in facts.targets:
         cells = []
         for k in horizons:
             r2 = score(model, k, "r2", target.name)
             r2 = score(model, k, "r2") if r2 is None and len(facts.targets) == 1 else r2
-            known = known or r2 is not None
+            any_r2 = any_r2 or r2 is not None
             cells.append(number(None if r2 is None else 100.0 * (1.0 - math.sqrt(max(1.0 - r2, 0.0))), 1))
         rows.append((target.description, *cells))
-    if not known:
+    if not any_r2:
         return None
     columns = (("Output", ""), *((f"{horizon_text(facts, k)} ahead", "%") for k in horizons))
     return TextTable("Fit of the network by output", columns, tuple(rows))
@@ -104,8 +104,8 @@ def correlogram(facts: Facts) -> Chart | None:
     if not shown:
         return None
     panels = []
-    for place, (target, row) in enumerate(zip(facts.targets, marks, strict=True)):
-        up = ChartAxis("" if place % columns else "Autocorrelation", from_zero=True)
+    for position, (target, row) in enumerate(zip(facts.targets, marks, strict=True)):
+        up = ChartAxis("" if position % columns else "Autocorrelation", from_zero=True)
         panels.append(
             Panel((*row, GuideLine(y=0.0)), ChartAxis("Lag [samples]", from_zero=True), up, target.description)
         )
