@@ -93,6 +93,14 @@ def test_the_interval_is_drawn_around_the_prediction(run_folder):
     drawn = plots(run_charts(facts))["predictions"].figure.data
     bands = [trace for trace in drawn if trace.fill == "tonexty"]
     assert len(bands) == len(lines)
-    assert {trace.name for trace in bands} == {"Its interval"}
+    assert {trace.name for trace in bands} == {"Interval"}
     # The ends of the interval are no models of their own.
     assert {item.model for item in residual_histograms(facts)} == {"network", "ridge_arx"}
+
+
+def test_many_traces_are_drawn_of_fewer_recordings(run_folder):
+    facts = read_facts(run_folder)
+    assert len({line.recording for line in prediction_lines(facts)}) == 3
+    few = prediction_lines(facts, budget=15_000)
+    assert len({line.recording for line in few}) == 1
+    assert sum(len(line.y) for line in few) <= 15_000

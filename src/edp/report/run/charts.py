@@ -62,7 +62,7 @@ def interval_name(facts: Facts) -> str:
     """The interval that is drawn, in a legend."""
     rows = facts.models.get(NETWORK, {}).get("intervals", {}).get(str(main_horizon(facts)), ())
     coverages = [row["coverage"] for row in rows]
-    return f"Its {100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Its interval"
+    return f"{100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Interval"
 
 
 def _look(facts: Facts, model: str) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from edp.report.run.facts import HIGH, LOW, NETWORK, TRUTH, Facts, main_horizon,
 WHOLE, EXCERPT = "whole", "excerpt"
 POINT_BUDGET = 250_000  # of all prediction traces together: about 2 MB of the page
 RECORDINGS_SHOWN, HORIZONS_SHOWN = 6, 4
+LEAST_POINTS = 200  # of a trace: fewer no longer show its shape
 EXCERPT_SECONDS = 12.0
 Array = NDArray[np.floating]
 
@@ -112,11 +113,16 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
     """
     recordings = sorted(facts.predictions)[:RECORDINGS_SHOWN]
     horizons = horizons_shown(facts)
+    each = len(facts.targets) * max(
+        1 + (len(parts) - 1) * len(horizons) for parts in facts.predictions.values() or [()]
+    )
+    # Many outputs: fewer recordings, so that what is drawn keeps its shape and the page its size.
+    recordings = recordings[: max(1, budget // (2 * LEAST_POINTS * max(each, 1)))]
     models = sum(len(facts.predictions[name]) - 1 for name in recordings)
     traces = len(facts.targets) * (len(recordings) + models * len(horizons))
     if traces == 0 or not horizons:
         return []
-    points = int(np.clip(budget // (2 * traces), 200, 2000))
+    points = int(np.clip(budget // (2 * traces), LEAST_POINTS, 2000))
     lines: list[Line] = []
     for recording in recordings:
         truth = facts.predictions[recording][TRUTH]
