@@ -83,12 +83,22 @@ def test_settings_load(path):
     assert loader_of(path)(path) is not None
 
 
-def test_readme_shows_the_map_and_the_settings_of_the_examples():
-    shown = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+def test_the_page_of_own_logs_shows_the_map_and_the_settings_of_the_examples():
+    page = ROOT / "docs" / "own_logs.md"
+    shown = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     assert shown
     for name in ("map.toml", "rig.toml"):
         text = (EXAMPLES / name).read_text(encoding="utf-8")
-        assert text in shown, f"README.md and examples/{name} differ"
+        assert text in shown, f"{page.name} and examples/{name} differ"
+
+
+def test_the_readme_is_short_and_its_table_of_commands_is_whole():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 120
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    from edp.cli import app
+
+    names = [str(c.name) for c in app.registered_commands] + [str(group.name) for group in app.registered_groups]
+    assert [name for name in names if f"`edp {name}" not in page] == []
 
 
 def test_links_of_the_documents_lead_somewhere():

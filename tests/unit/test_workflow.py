@@ -195,7 +195,9 @@ def test_intervals_are_judged_and_shown(output, logs, tmp_path, capsys):
     assert rows[0]["width"]["v"] == pytest.approx(np.concatenate(width).mean(), rel=1e-5)
     score_table(scores)
     assert "meant" in capsys.readouterr().out
-    assert "Meant to hold" in build_report(tmp_path / "run").read_text(encoding="utf-8")
+    page = build_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "Meant to hold" in page
+    assert "% interval" in page.split('id="figures">')[1]  # drawn, too
 
 
 def test_the_same_judgement_is_not_made_twice(logs, tmp_path):

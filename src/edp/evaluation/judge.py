@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
+from edp.evaluation.scores_file import nearest_to_shown
 from edp.evaluation.situation import situation_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_intervals, stream_predictions
@@ -61,11 +62,24 @@ class Evaluation:
         scores: the content of ``scores.json`` (schema 1).
         predictions: by model, one array ``(time, horizon, target)`` for each series.
         series: the judged series.
+        bounds: of the interval nearest to 90 %, ``(time, 2, horizon, target)`` for each series; none without intervals.
     """
 
     scores: dict[str, Any]
     predictions: dict[str, Predictions]
     series: list[Series]
+    bounds: Predictions = field(default_factory=list)
+
+    def kept(self, recordings: int, ticks: int) -> dict[str, NDArray[Any]]:
+        """Truth, predictions and interval of the first recordings and ticks, by ``recording/name``, for the report."""
+        tensors: dict[str, NDArray[Any]] = {}
+        for i, series in enumerate(self.series[:recordings]):
+            parts: dict[str, NDArray[Any]] = {"truth": series.targets}
+            parts |= {name: self.predictions[name][i] for name in ("network", "ridge_arx") if name in self.predictions}
+            for end, side in enumerate(("network_low", "network_high") if self.bounds else ()):
+                parts[side] = self.bounds[i][:, end]
+            tensors |= {f"{series.name}/{name}": np.ascontiguousarray(part[:ticks]) for name, part in parts.items()}
+        return tensors
 
 
 def judge(
@@ -119,13 +133,16 @@ def judge(
     }
     for name, scores in _on_validation(on_validation, data, max(skip, spec.history)).items():
         models[name]["validation"] = scores
-    coverages = predictor.spec.output.coverages
+    coverages, bounds = predictor.spec.output.coverages, []
     if coverages:
         say("intervals")
-        models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
+        bounds = stream_intervals(predictor, data.test)
+        models["network"]["intervals"] = ruler.intervals(bounds, coverages)
+        shown = nearest_to_shown(coverages)
+        bounds = [pair[:, shown] for pair in bounds]
     left = {"left_out": left_out} if left_out else {}
     scores = ruler.header() | {"models": models, "situation": situation_of(data)} | left
-    return Evaluation(scores, predictions, data.test)
+    return Evaluation(scores, predictions, data.test, bounds)
 
 
 def _on_validation(predictions: dict[str, Predictions], data: Prepared, skip: int) -> dict[str, Any]:

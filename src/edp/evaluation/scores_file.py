@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -165,3 +165,8 @@ def _refuse(value: Any, words: str, where: str, file: str) -> None:
         f"{file}: {where or 'the whole'} is {shown(value)}; {words} must hold. The file was changed by hand or is of "
         "another version: remove it and run edp evaluate"
     )
+
+
+def nearest_to_shown(coverages: Sequence[float]) -> int:
+    """Which of several intervals pictures show: that nearest to 90 %."""
+    return min(range(len(coverages)), key=lambda which: abs(coverages[which] - 0.9))

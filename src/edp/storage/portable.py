@@ -48,7 +48,7 @@ def lock_region(msvcrt_module: object, stream: IO[str], wait: bool) -> None:
     is then told the last holder. `wait` tries for ten seconds at a time.
     """
     handle = stream.fileno()
-    place = os.lseek(handle, 0, os.SEEK_CUR)
+    offset = os.lseek(handle, 0, os.SEEK_CUR)
     try:
         while True:
             os.lseek(handle, _FAR, os.SEEK_SET)
@@ -60,7 +60,7 @@ def lock_region(msvcrt_module: object, stream: IO[str], wait: bool) -> None:
                 raise
             return
     finally:
-        os.lseek(handle, place, os.SEEK_SET)
+        os.lseek(handle, offset, os.SEEK_SET)
 
 
 def cores() -> int:

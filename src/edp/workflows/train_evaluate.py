@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
 import torch
 from safetensors.numpy import save
 
@@ -261,7 +260,7 @@ def evaluate(
         source: other recordings; all of them are judged.
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
-        minutes: after which no further baseline is begun; what is left out is judged by a later call without it.
+        minutes: after which no further baseline is begun; a later call judges it.
 
     Returns:
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
@@ -283,9 +282,9 @@ def evaluate(
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
         evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
-        # Scores that lack a baseline are shown, but not kept for a call that asks for all.
+        # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
-        write_bytes(target / "predictions.safetensors", save(_shown(evaluation)))
+        write_bytes(target / "predictions.safetensors", save(evaluation.kept(SHOWN_RECORDINGS, SHOWN_TICKS)))
         write_json(target / "scores.json", scores)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
@@ -356,17 +355,6 @@ def _floor_scores(folder: Path, data: Prepared, scores: Mapping[str, Any]) -> di
         return None
     floor = load_bundle(folder / FLOOR).predictor
     return score_predictions(stream_predictions(floor, data.test), data, scores["task"]["skip"])
-
-
-def _shown(evaluation: Evaluation) -> dict[str, np.ndarray]:
-    """Truth and predictions of a few recordings, for the report."""
-    tensors: dict[str, np.ndarray] = {}
-    for i, series in enumerate(evaluation.series[:SHOWN_RECORDINGS]):
-        tensors[f"{series.name}/truth"] = np.ascontiguousarray(series.targets[:SHOWN_TICKS])
-        for name in ("network", "ridge_arx"):
-            if name in evaluation.predictions:
-                tensors[f"{series.name}/{name}"] = np.ascontiguousarray(evaluation.predictions[name][i][:SHOWN_TICKS])
-    return tensors
 
 
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:

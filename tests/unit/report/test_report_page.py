@@ -70,7 +70,7 @@ def test_the_page_says_the_verdict_and_every_section(run_folder):
 def test_every_figure_has_its_place(run_folder):
     text = render(read_facts(run_folder))
     specs = json.loads(Page(text).scripts[1])
-    assert len(specs) == 6
+    assert len(specs) == 7
     for spec in specs:
         assert f'id="figure-{spec["name"]}"' in text
         for key in spec["controls"]:
@@ -150,6 +150,7 @@ def test_the_page_in_a_browser(browser, run_folder):
 @pytest.mark.processes
 def test_choices_zoom_and_legend_work(browser, run_folder):
     browser.open(build_report(run_folder))
+    browser.run("window.dispatchEvent(new Event('beforeprint'))")  # draws what is not in sight, too
     lines = "[...document.querySelectorAll('#figure-predictions path[stroke-linejoin]')].map(p => p.getAttribute('d'))"
     first = browser.run(lines)
     browser.run(
@@ -198,4 +199,4 @@ def test_names_stay_text_in_the_drawing(browser, run_folder):
 def test_the_page_prints_every_figure(browser, run_folder, tmp_path):
     browser.open(build_report(run_folder))
     assert browser.printed(tmp_path / "page.pdf").stat().st_size > 20_000
-    assert browser.run("document.querySelectorAll('.figure-stage svg').length") == 6
+    assert browser.run("document.querySelectorAll('.figure-stage svg').length") == 7

@@ -43,11 +43,11 @@ def _looks(comparison: Comparison) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
-            "colour": colours[place % len(colours)],
-            "symbol": ("circle", *SYMBOLS)[place % (1 + len(SYMBOLS))],
-            "rank": place,
+            "colour": colours[position % len(colours)],
+            "symbol": ("circle", *SYMBOLS)[position % (1 + len(SYMBOLS))],
+            "rank": position,
         }
-        for place, name in enumerate(names)
+        for position, name in enumerate(names)
     ]
 
 
@@ -117,8 +117,8 @@ def recording_chart(comparison: Comparison) -> Chart | None:
     base = comparison.errors(comparison.runs[0], measures[0])
     order = [comparison.recordings[i] for i in base.argsort()][-MOST_ROWS:]
     labels = dict(zip(order, short_labels(order), strict=True))
-    for place, measure in enumerate(measures):
-        when = {"measure": str(place)}
+    for position, measure in enumerate(measures):
+        when = {"measure": str(position)}
         marks.append(DataSeries(x=[None] * len(order), y=list(labels.values()), when=when, hover=None))
         for run, look in zip(comparison.runs, _looks(comparison), strict=True):
             errors = [run.errors[measure].get(name) for name in order]
@@ -166,11 +166,11 @@ def cost_chart(comparison: Comparison) -> Chart | None:
     measure = comparison.measures[0]
     marks: list[Mark] = []
     for run, look in zip(comparison.runs, _looks(comparison), strict=True):
-        for place, cost in enumerate(costs):
-            at, error, when = [run.costs[cost]], [comparison.error(run, measure)], {"cost": str(place)}
+        for position, cost in enumerate(costs):
+            at, error, when = [run.costs[cost]], [comparison.error(run, measure)], {"cost": str(position)}
             marks.append(DataSeries(x=at, y=error, size=11, when=when, hover="{y:.4g} with {x:,}", **look))
             marks.append(Texts(x=at, y=error, texts=[str(look["name"])], raised=True, when=when))
-    choice = Control("cost", "Cost", tuple((str(place), cost) for place, cost in enumerate(costs)), alone=True)
+    choice = Control("cost", "Cost", tuple((str(position), cost) for position, cost in enumerate(costs)), alone=True)
     across = ChartAxis("Cost", kind="log", ticks=ROUND_TICKS)
     up = ChartAxis(with_unit("Error", measure.unit), from_zero=True)
     return Chart("cost", (Panel(tuple(marks), across, up),), choices=(choice,), height=360, legend="none")

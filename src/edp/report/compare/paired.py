@@ -27,7 +27,7 @@ Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
-class PairedDifference:
+class RunDifference:
     """What a run's error is more or less than that of the first run.
 
     Attributes:
@@ -84,7 +84,7 @@ class Comparison:
         """Mean over the common recordings, each of the same weight."""
         return float(self.errors(run, measure).mean())
 
-    def differences(self, measure: Measure) -> dict[str, PairedDifference]:
+    def differences(self, measure: Measure) -> dict[str, RunDifference]:
         """Of each run but the first, by name."""
         first, *others = self.runs
         base = self.errors(first, measure)
@@ -106,7 +106,7 @@ class Comparison:
             if over == "blocks" and test is not None:
                 # The interval belongs to the kept part, whose mean may be another than that of the whole recording.
                 relative = float(test.mean) / scale
-            results[run.name] = PairedDifference(relative, low, high, p, over, len(change), int((own < base).sum()))
+            results[run.name] = RunDifference(relative, low, high, p, over, len(change), int((own < base).sum()))
         return results
 
     def headline(self) -> str:
@@ -180,12 +180,12 @@ def _remarks(runs: Sequence[ComparedRun], names: set[str]) -> list[str]:
             )
     digests = {run.digest for run in runs if run.digest}
     if len(digests) > 1:
-        kept = all(names <= run.predictions.keys() for run in runs)
+        all_there = all(names <= run.predictions.keys() for run in runs)
         remarks.append(
             "The runs read other sets of recordings"
             + (
                 "; the common ones hold the same values."
-                if kept
+                if all_there
                 else "; recordings of one name are taken to be the same, as not all of them were kept to compare."
             )
         )
@@ -233,11 +233,11 @@ def _absolute(run: ComparedRun, name: str, measure: Measure) -> Array | None:
     targets = [target for target, _ in run.targets] if measure.output == MEAN else [measure.output]
     errors = []
     for target in targets:
-        place = run.target(target)
-        if place is None:
+        column_and_factor = run.target(target)
+        if column_and_factor is None:
             return None
-        predicted, truth = parts[NETWORK][:, column, place[0]], parts[TRUTH][:, place[0]]
+        predicted, truth = parts[NETWORK][:, column, column_and_factor[0]], parts[TRUTH][:, column_and_factor[0]]
         ahead = np.full(len(truth), np.nan)
         ahead[: len(truth) - horizon] = truth[horizon:]
-        errors.append(np.abs(predicted - ahead) * place[1])
+        errors.append(np.abs(predicted - ahead) * column_and_factor[1])
     return np.asarray(np.mean(errors, axis=0, dtype=np.float64))

@@ -113,9 +113,9 @@ def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
     if not 2 <= len(paths) <= MOST_RUNS:
         raise ConfigError(f"{len(paths)} run(s) came; edp compare takes 2 to {MOST_RUNS} run folders")
     real = [path.resolve() for path in paths]
-    for place, path in enumerate(real):
-        if path in real[:place]:
-            raise ConfigError(f"'{paths[place]}' came twice; name each run once")
+    for position, path in enumerate(real):
+        if path in real[:position]:
+            raise ConfigError(f"'{paths[position]}' came twice; name each run once")
     runs = [_read(path, name) for path, name in zip(paths, _names(real), strict=True)]
     if len({run.kind for run in runs}) > 1:
         free = [run.name for run in runs if run.kind == FREE]
@@ -149,10 +149,10 @@ def _network(path: Path, name: str) -> ComparedRun:
     if facts.provenance is None and (path.resolve().parent / "provenance.json").is_file():
         whole = read_facts(path.resolve().parent)
     errors: dict[Measure, dict[str, float]] = {}
-    known = {str(horizon) for horizon in facts.horizons}
+    horizons = {str(horizon) for horizon in facts.horizons}
     for recording, by_horizon in facts.models[NETWORK].get("recordings", {}).items():
         for horizon, scores in by_horizon.items():
-            for output, unit in _outputs(facts) if horizon in known else ():
+            for output, unit in _outputs(facts) if horizon in horizons else ():
                 alone = output == MEAN or len(facts.targets) == 1
                 error = scores.get("mean" if alone else output, {}).get("mae")
                 if error is not None:
@@ -209,8 +209,8 @@ def _table(value: Any) -> Mapping[str, Any]:
 
 
 def _positive(values: Mapping[str, Any]) -> dict[str, float]:
-    known = {name: value for name, value in values.items() if isinstance(value, int | float) and value is not True}
-    return {name: float(value) for name, value in known.items() if 0 < value < math.inf}
+    numbers = {name: value for name, value in values.items() if isinstance(value, int | float) and value is not True}
+    return {name: float(value) for name, value in numbers.items() if 0 < value < math.inf}
 
 
 def _twin(path: Path, name: str) -> ComparedRun:
@@ -257,7 +257,7 @@ def recording_that_differs(first: ComparedRun, second: ComparedRun, names: set[s
         shared = [target for target, _ in first.targets if second.target(target) is not None]
         parts = []
         for run in (first, second):
-            columns = [column for target in shared if (place := run.target(target)) for column in place[:1]]
+            columns = [column for target in shared if (where := run.target(target)) for column in where[:1]]
             parts.append(run.predictions[name][TRUTH][:, columns])
         if parts[0].shape != parts[1].shape or not np.allclose(parts[0], parts[1], atol=1e-7, equal_nan=True):
             return name

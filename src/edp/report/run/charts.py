@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edp.evaluation.guard import MEASURE_NAME
+from edp.evaluation.scores_file import nearest_to_shown
 from edp.report.common.chart import (
     BLUE,
     GREY,
@@ -24,11 +25,12 @@ from edp.report.common.chart import (
     GuideLine,
     Mark,
     Panel,
+    Range,
     with_unit,
 )  # fmt: skip
 from edp.report.common.wording import short_label
 from edp.report.run import figures
-from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, label_of
+from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
 
 DOTS_AT_MOST = 40  # recordings; above that a rank curve, names on hover
 
@@ -55,6 +57,13 @@ def _place(facts: Facts, model: str) -> int:
 def name_of(facts: Facts, model: str) -> str:
     """A model in a legend."""
     return "Measured" if model == TRUTH else short_label(label_of(facts, model))
+
+
+def interval_name(facts: Facts) -> str:
+    """The interval that is drawn, in a legend."""
+    rows = facts.models.get(NETWORK, {}).get("intervals", {}).get(str(main_horizon(facts)), ())
+    coverages = [row["coverage"] for row in rows]
+    return f"{100 * coverages[nearest_to_shown(coverages)]:.0f} % interval" if coverages else "Interval"
 
 
 def _look(facts: Facts, model: str) -> dict[str, Any]:
@@ -96,8 +105,13 @@ def prediction_chart(facts: Facts) -> Chart | None:
         when = {"recording": line.recording, "extent": line.extent}
         when |= {} if line.horizon is None else {"horizon": str(line.horizon)}
         width = 3.0 if line.model == TRUTH else 1.6 if line.model == NETWORK else 1.1
+        x = Evenly(line.start, line.step) if line.x is None else line.x
+        if line.low is not None and line.high is not None:
+            marks[line.target].append(
+                Range(x=x, low=line.low, high=line.high, name=interval_name(facts), hover=None, when=when)
+            )
         marks[line.target].append(DataSeries(
-            x=Evenly(line.start, line.step) if line.x is None else line.x, y=line.y, name=name_of(facts, line.model),
+            x=x, y=line.y, name=name_of(facts, line.model),
             colour=colour(facts, line.model), width=width,
             opacity=1.0 if line.model == NETWORK else 0.75, rank={TRUTH: 1, NETWORK: 2}.get(line.model, 3), when=when,
         ))  # fmt: skip

@@ -21,6 +21,8 @@ from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, rea
 
 NETWORK = "network"
 TRUTH = "truth"
+LOW, HIGH = "network_low", "network_high"
+"""Ends of the network's interval, beside its prediction."""
 MAKERS = {
     "config.toml": "edp train",
     "provenance.json": "edp train",
@@ -50,7 +52,8 @@ class Facts:
         limit: the limit of predictability of the run's data, see `edp.report.run.predictability`.
         foundation: errors on machines that were never seen, of a run over many machines, see
             `edp.report.run.foundation`.
-        predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI.
+        predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI;
+            so are both ends of the network's interval, where it has one.
     """
 
     folder: Path

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from tsdownsample import MinMaxLTTBDownsampler
 
 from edp.evaluation.guard import MEASURE
-from edp.report.run.facts import NETWORK, TRUTH, Facts, main_horizon, score
+from edp.report.run.facts import HIGH, LOW, NETWORK, TRUTH, Facts, main_horizon, score
 
 WHOLE, EXCERPT = "whole", "excerpt"
 POINT_BUDGET = 250_000  # of all prediction traces together: about 2 MB of the page
 RECORDINGS_SHOWN, HORIZONS_SHOWN = 6, 4
+LEAST_POINTS = 200  # of a trace: fewer no longer show its shape
 EXCERPT_SECONDS = 12.0
 Array = NDArray[np.floating]
 
@@ -31,6 +32,7 @@ class Line:
         x: (point,) seconds, or samples where the rate is unknown.
         y: (point,) report units; NaN breaks the line.
         start: First sample and `step`: set instead of `x` where every sample is shown.
+        low, high: (point,) ends of the interval, report units; None without one.
     """
 
     recording: str
@@ -42,6 +44,8 @@ class Line:
     x: Array | None = None
     start: float = 0.0
     step: float = 1.0
+    low: Array | None = None
+    high: Array | None = None
 
 
 def horizons_shown(facts: Facts) -> list[int]:
@@ -110,11 +114,16 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
     """
     recordings = sorted(facts.predictions)[:RECORDINGS_SHOWN]
     horizons = horizons_shown(facts)
+    each = len(facts.targets) * max(
+        1 + (len(parts) - 1) * len(horizons) for parts in facts.predictions.values() or [()]
+    )
+    # Many outputs: fewer recordings, so that what is drawn keeps its shape and the page its size.
+    recordings = recordings[: max(1, budget // (2 * LEAST_POINTS * max(each, 1)))]
     models = sum(len(facts.predictions[name]) - 1 for name in recordings)
     traces = len(facts.targets) * (len(recordings) + models * len(horizons))
     if traces == 0 or not horizons:
         return []
-    points = int(np.clip(budget // (2 * traces), 200, 2000))
+    points = int(np.clip(budget // (2 * traces), LEAST_POINTS, 2000))
     lines: list[Line] = []
     for recording in recordings:
         truth = facts.predictions[recording][TRUTH]
@@ -124,12 +133,15 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
         for model, horizon, values in _series(facts, recording, horizons):
             for output, target in enumerate(facts.targets):
                 y = np.asarray(values[:, output] * target.factor, dtype=np.float32)
-                selected = downsample(y, points)
+                ends = _ends(facts, recording, model, horizon, output)
+                selected, cut = downsample(y, points), slice(first, first + length)
+                at = (selected / rate).astype(np.float32)
+                low, high = (None if end is None else end[selected] for end in ends)
+                lines.append(Line(recording, WHOLE, model, horizon, output, y[selected], at, low=low, high=high))
+                low, high = (None if end is None else end[cut] for end in ends)
                 lines.append(
-                    Line(recording, WHOLE, model, horizon, output, y[selected], (selected / rate).astype(np.float32))
+                    Line(recording, EXCERPT, model, horizon, output, y[cut], None, first / rate, 1.0 / rate, low, high)
                 )
-                cut = y[first : first + length]
-                lines.append(Line(recording, EXCERPT, model, horizon, output, cut, start=first / rate, step=1.0 / rate))
     return lines
 
 
@@ -137,10 +149,20 @@ def _series(facts: Facts, recording: str, horizons: Sequence[int]) -> list[tuple
     """(model, horizon, (time, target)) of the truth, the baselines and last, so drawn on top, the network."""
     parts = facts.predictions[recording]
     series: list[tuple[str, int | None, Array]] = [(TRUTH, None, parts[TRUTH])]
-    for name in sorted(parts.keys() - {TRUTH}, key=lambda name: name == NETWORK):
+    for name in sorted(parts.keys() - {TRUTH, LOW, HIGH}, key=lambda name: name == NETWORK):
         for horizon in horizons:
             series.append((name, horizon, aligned(parts[name][:, facts.horizons.index(horizon)], horizon)))
     return series
+
+
+def _ends(facts: Facts, recording: str, model: str, horizon: int | None, output: int) -> tuple[Array | None, ...]:
+    """(time,) both ends of the network's interval at the moments it speaks of, report units; None without one."""
+    parts = facts.predictions[recording]
+    if model != NETWORK or horizon is None or LOW not in parts or HIGH not in parts:
+        return None, None
+    column, factor = facts.horizons.index(horizon), facts.targets[output].factor
+    ends = (aligned(parts[name][:, column, output], horizon) for name in (LOW, HIGH))
+    return tuple(np.asarray(end * factor, dtype=np.float32) for end in ends)
 
 
 @dataclass(frozen=True)
@@ -166,7 +188,7 @@ class Histogram:
 def residual_histograms(facts: Facts, bins: int = 61) -> list[Histogram]:
     """Prediction minus truth over the recordings kept, in bins that span 99 % of the network's residuals."""
     histograms: list[Histogram] = []
-    models = {name for parts in facts.predictions.values() for name in parts} - {TRUTH}
+    models = {name for parts in facts.predictions.values() for name in parts} - {TRUTH, LOW, HIGH}
     order = sorted(models, key=lambda name: name != NETWORK)
     for horizon in horizons_shown(facts):
         for output, target in enumerate(facts.targets):

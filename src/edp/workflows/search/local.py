@@ -123,6 +123,8 @@ class LocalPool(ClosedAtExit):
             raise ConfigError(
                 f"a pool of {workers} workers with {threads} threads each cannot do anything; give 1 or more"
             )
+        if sys.platform == "win32":  # where no socket can be handed to a process that is started
+            raise ConfigError("edp search starts processes in a way that Windows lacks; run it in WSL, or on a cluster")
         self.workers, self.threads, self.retries = workers, threads, retries
         # The parent-death signal is tied to the thread that starts the worker.
         self._thread = threading.get_ident()
