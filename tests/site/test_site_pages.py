@@ -95,7 +95,7 @@ def test_entries_of_pages_that_are_not_there_are_left_out(tmp_path):
 
 def test_every_public_name_is_in_the_reference_with_its_members_and_a_text(staged):
     text = (staged / "reference" / "python.md").read_text(encoding="utf-8")
-    titles = {heading.text.partition(" ")[0] for heading in markdown.headings(text)}
+    titles = {heading.text.strip("`") for heading in markdown.headings(text)}
     for name in edp.__all__:
         assert f"edp.{name}" in titles
         value = getattr(edp, name)
