@@ -29,6 +29,7 @@ def site(tmp_path_factory) -> Path:
     call = [str(BUILDER), "build", "--clean", "--strict", "--config-file", "mkdocs.yml"]
     made = subprocess.run(call, cwd=out, capture_output=True, text=True, timeout=240)
     assert made.returncode == 0, made.stdout + made.stderr
+    assert built.seal(out / "site") > 0
     return out / "site"
 
 
@@ -57,6 +58,13 @@ def test_pages_are_accessible_load_nothing_from_elsewhere_and_fit_the_window(sit
     assert [finding for visit in visits for finding in visit.serious()] == []
     assert [(visit.page, visit.elsewhere) for visit in visits if visit.elsewhere] == []
     assert [(visit.page, visit.wide) for visit in visits if visit.wide > 0] == []
+
+
+@pytest.mark.slow
+def test_the_search_finds_a_page_and_loads_nothing_from_elsewhere(site, axe):
+    (visit,) = browser.visit(site, ["index.html"], axe, words="feedback port")
+    assert any("twin.html" in link for link in visit.words)
+    assert visit.elsewhere == []
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ import yaml
 import edp
 import edp_site.commands as site_commands
 from edp_site import markdown, notebooks, parts, python_api, results, settings_keys
-from edp_site.built import problems_of
+from edp_site.built import problems_of, seal
 from edp_site.links import broken_links
 from edp_site.stage import builder_settings, stage
 
@@ -95,7 +95,7 @@ def test_entries_of_pages_that_are_not_there_are_left_out(tmp_path):
 
 def test_every_public_name_is_in_the_reference_with_its_members_and_a_text(staged):
     text = (staged / "reference" / "python.md").read_text(encoding="utf-8")
-    titles = {heading.text.partition(" ")[0] for heading in markdown.headings(text)}
+    titles = {heading.text.strip("`") for heading in markdown.headings(text)}
     for name in edp.__all__:
         assert f"edp.{name}" in titles
         value = getattr(edp, name)
@@ -257,6 +257,15 @@ def test_a_built_page_is_held_to_its_links_and_to_loading_nothing(tmp_path):
         "bad.html: ok.html#b: the page has no such anchor",
         "s.css: loads https://example.org/b.png",
     ]
+    (tmp_path / "assets").mkdir()
+    script = "load('https://cdn.example.org/m.js'); make('http://www.w3.org/2000/svg')"
+    (tmp_path / "assets" / "m.js").write_text(script)
+    assert [problem for problem in problems_of(tmp_path) if "could load" in problem] == [
+        "assets/m.js: could load from https://cdn.example.org"
+    ]
+    assert seal(tmp_path) == 1
+    assert (tmp_path / "assets" / "m.js").read_text() == "load('about:blank#/m.js'); make('http://www.w3.org/2000/svg')"
+    assert not [problem for problem in problems_of(tmp_path) if "could load" in problem]
     (tmp_path / "plain.html").write_text("<html><body></body></html>")
     assert len([problem for problem in problems_of(tmp_path) if problem.startswith("plain.html")]) == 3
 

@@ -30,21 +30,40 @@ _SCRIPT = """
 <style>* { transition: none !important; animation: none !important; }</style>
 <script src="/__axe.js"></script>
 <script>
+const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+const roots = (root) => [root, ...[...root.querySelectorAll("*")].filter((one) => one.shadowRoot)
+  .flatMap((one) => roots(one.shadowRoot))];
+const search = async (words) => { // the theme's search lies in a shadow tree, and its index is read by a worker
+  document.querySelector(".md-search__button").click();
+  for (let round = 0; round < 40; round += 1) {
+    await pause(500);
+    const [, ...shadows] = roots(document);
+    const field = shadows.flatMap((root) => [...root.querySelectorAll("input")]).find((one) => one.autofocus);
+    if (field && field.value !== words) {
+      field.value = words;
+      field.dispatchEvent(new Event("input", {bubbles: true}));
+    }
+    const found = shadows.flatMap((root) => [...root.querySelectorAll("a")].map((one) => one.getAttribute("href")));
+    if (found.length) return found;
+  }
+  return [];
+};
 window.addEventListener("load", async () => {
   const job = await (await fetch("/__job")).json();
   if (job.scheme) document.body.setAttribute("data-md-color-scheme", job.scheme);
-  await new Promise((done) => setTimeout(done, 300)); // scripts of the page wrap tables and draw icons
-  const found = await axe.run(document, {resultTypes: ["violations"]});
+  await pause(300); // scripts of the page wrap tables and draw icons
+  const judged = await axe.run(document, {resultTypes: ["violations"]});
   const elsewhere = performance.getEntriesByType("resource").map((entry) => entry.name)
     .filter((name) => !name.startsWith(location.origin) && !name.startsWith("data:") && !name.startsWith("blob:"));
   const wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-  const violations = found.violations.map((one) => ({
+  const violations = judged.violations.map((one) => ({
     id: one.id, impact: one.impact, help: one.help,
     nodes: one.nodes.slice(0, 5).map((node) =>
       `${node.html.slice(0, 200)} ${(node.any[0] || {}).message || ''}`), count: one.nodes.length,
   }));
+  const words = job.words ? await search(job.words) : [];
   const next = await (await fetch("/__found", {method: "POST",
-    body: JSON.stringify({violations, elsewhere, wide})})).json();
+    body: JSON.stringify({violations, elsewhere, wide, words: words})})).json();
   if (next.page) location.href = next.page;
 });
 </script>
@@ -60,12 +79,14 @@ class Visit:
         violations: of axe-core: id, impact, help, nodes.
         elsewhere: what it loaded, or tried to load, that is not of the site.
         wide: pixels by which it is wider than the window.
+        words: pages that its search finds, where it was asked to search.
     """
 
     page: str
     violations: list[dict[str, Any]] = field(default_factory=list)
     elsewhere: list[str] = field(default_factory=list)
     wide: int = 0
+    words: list[str] = field(default_factory=list)
 
     def serious(self) -> list[str]:
         """Violations that axe-core calls serious or critical."""
@@ -82,7 +103,13 @@ def browser() -> str | None:
 
 
 def visit(
-    site: Path, pages: Sequence[str], axe: Path, scheme: str = "", width: int = 1280, timeout_s: float = 240.0
+    site: Path,
+    pages: Sequence[str],
+    axe: Path,
+    scheme: str = "",
+    width: int = 1280,
+    words: str = "",
+    timeout_s: float = 240.0,
 ) -> list[Visit]:
     """Open pages of a built site one after the other in one browser.
 
@@ -92,12 +119,13 @@ def visit(
         axe: axe-core's ``axe.min.js``.
         scheme: colour scheme of the theme, such as ``slate`` (dark); empty: as the page opens.
         width: of the window in pixels.
+        words: to search for on each page; empty: nothing.
         timeout_s: after which the browser is stopped.
 
     Raises:
         TimeoutError: pages are missing then; says which is the first.
     """
-    queue = _Queue(site, list(pages), axe, scheme)
+    queue = _Queue(site, list(pages), axe, scheme, words)
     with _served(queue) as address, tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         started = [
             str(browser()), "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--mute-audio",
@@ -121,8 +149,8 @@ def visit(
 class _Queue:
     """What is left to be opened, and what was found."""
 
-    def __init__(self, site: Path, pages: list[str], axe: Path, scheme: str) -> None:
-        self.site, self.pages, self.axe, self.scheme = site, pages, axe, scheme
+    def __init__(self, site: Path, pages: list[str], axe: Path, scheme: str, words: str) -> None:
+        self.site, self.pages, self.axe, self.scheme, self.words = site, pages, axe, scheme, words
         self.visits: list[Visit] = []
         self.reported: list[str] = []
         self.done = threading.Event()
@@ -131,7 +159,8 @@ class _Queue:
         """Keep what a page gave; the page to go on with."""
         elsewhere = [*found["elsewhere"], *self.reported]
         self.reported = []
-        self.visits.append(Visit(self.pages[len(self.visits)], found["violations"], elsewhere, found["wide"]))
+        page = self.pages[len(self.visits)]
+        self.visits.append(Visit(page, found["violations"], elsewhere, found["wide"], found["words"]))
         if len(self.visits) < len(self.pages):
             return f"/{self.pages[len(self.visits)]}"
         self.done.set()
@@ -147,7 +176,9 @@ class _Handler(SimpleHTTPRequestHandler):
         if self.path == "/__axe.js":
             self._send(self.queue.axe.read_bytes(), "text/javascript")
         elif self.path == "/__job":
-            self._send(json.dumps({"scheme": self.queue.scheme}).encode(), "application/json")
+            self._send(
+                json.dumps({"scheme": self.queue.scheme, "words": self.queue.words}).encode(), "application/json"
+            )
         elif self.path.partition("?")[0].endswith(".html") and Path(self.translate_path(self.path)).is_file():
             text = Path(self.translate_path(self.path)).read_text(encoding="utf-8")
             self._send(text.replace("</body>", f"{_SCRIPT}</body>").encode(), "text/html; charset=utf-8")

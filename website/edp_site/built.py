@@ -1,6 +1,7 @@
 """Checks of the built site: links and anchors, nothing loaded from elsewhere, and what a page needs for every reader.
 
-``python -m edp_site.built SITE`` prints what is wrong and ends with 1 where something is.
+``python -m edp_site.built SITE`` takes addresses out of the scripts of the theme, prints what is wrong, and ends with 1
+where something is.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ _LOADING_RELATIONS = {
     "manifest",
 }
 _IN_STYLES = re.compile(r"(?:@import\s+|url\()\s*['\"]?((?:https?:)?//[^'\")\s]+)", re.IGNORECASE)
+_IN_SCRIPTS = re.compile(r"https?://(?!www\.w3\.org/|fontawesome\.com)[\w.-]+")
+"""Addresses in scripts; those of the exceptions name vocabularies of markup, and a licence in a comment."""
+NOWHERE = "about:blank#"
 _UNNEEDED = {"404.html"}
 """Pages whose links begin at the root of a server."""
 
@@ -108,10 +112,30 @@ def problems_of(site: Path) -> list[str]:
         if name not in _UNNEEDED and not name.startswith("gallery/"):
             problems += [f"{name}: {problem}" for problem in page.problems]
             problems += _broken(path, page, name, pages)
+    for path in sorted((site / "assets").rglob("*.js")):
+        found = _IN_SCRIPTS.findall(path.read_text(encoding="utf-8", errors="replace"))
+        problems += [f"{path.relative_to(site)}: could load from {address}" for address in sorted(set(found))]
     for path in sorted(site.rglob("*.css")):
         found = _IN_STYLES.findall(path.read_text(encoding="utf-8", errors="replace"))
         problems += [f"{path.relative_to(site)}: loads {target}" for target in found]
     return problems
+
+
+def seal(site: Path) -> int:
+    """Take addresses out of the scripts of the theme, which load diagrams, viewers and the like from elsewhere.
+
+    No page of ours asks for those; without the addresses none can by mistake.
+
+    Returns:
+        How many addresses were replaced.
+    """
+    replaced = 0
+    for path in sorted((site / "assets").rglob("*.js")):
+        text, count = _IN_SCRIPTS.subn(NOWHERE, path.read_text(encoding="utf-8"))
+        if count:
+            path.write_text(text, encoding="utf-8")
+        replaced += count
+    return replaced
 
 
 def _broken(path: Path, page: Page, name: str, pages: dict[Path, Page]) -> list[str]:
@@ -133,6 +157,7 @@ def _broken(path: Path, page: Page, name: str, pages: dict[Path, Page]) -> list[
 def main() -> int:
     """Check the site that is named; 1 where something is wrong."""
     site = Path(sys.argv[1])
+    seal(site)
     problems = problems_of(site)
     size = sum(path.stat().st_size for path in site.rglob("*") if path.is_file())
     print(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ class Command(NamedTuple):
         return {name: option for option in self.parsed.params for name in (*option.opts, *option.secondary_opts)}
 
 
+@cache
 def commands() -> dict[tuple[str, ...], Command]:
     """Every command and group of ``edp`` by its words, in the order of ``edp --help``; the root has none."""
     found: dict[tuple[str, ...], Command] = {}

@@ -49,7 +49,7 @@ def members(cls: type) -> Iterator[tuple[str, Any]]:
 
 
 def _entry(name: str, value: Any, depth: int) -> list[str]:
-    lines = [f"{'#' * depth} {name}", ""]
+    lines = [f"{'#' * depth} `{name}`", ""]
     if isinstance(value, ModuleType):
         lines += described(value)
         for inner in vars(value)["__all__"]:
@@ -68,7 +68,7 @@ def _entry(name: str, value: Any, depth: int) -> list[str]:
 
 
 def _member(name: str, member: Any, depth: int) -> list[str]:
-    lines = [f"{'#' * depth} {name}", ""]
+    lines = [f"{'#' * depth} `{name}`", ""]
     if isinstance(member, property):
         kind = inspect.signature(member.fget).return_annotation if member.fget else ""
         return [*lines, f"Property: `{_type(kind)}`.", "", *described(member)]
