@@ -94,6 +94,13 @@ def encoder() -> Columns:
     return columns | {"x": 0.002 * np.round(columns["x"] / 0.002)}
 
 
+def rests_at_its_end() -> Columns:
+    """Two minutes of which six tenths are rest, the last fifth altogether; everything is measured in steps."""
+    columns = rig(34, 120, 50, idle=0.6)
+    steps = {"v": 0.02, "x": 0.002, "p": 2e4}
+    return columns | {name: step * np.round(columns[name] / step) for name, step in steps.items()}
+
+
 def of_sizes() -> Columns:
     """Two outputs, one in millionths, the other in millions."""
     columns = rig(4, 60, 50)
@@ -225,6 +232,9 @@ ODDITIES = {
     ),
     "a constant column": Oddity(
         lambda: [rig(12, 60, 50) | {"k": np.full(3000, 3.7)}], 50, ["task.targets=['v']", "task.horizons=[5]"]
+    ),
+    "rest and steps at the end": Oddity(
+        lambda: [rests_at_its_end()], 50, ["task.targets=['v', 'p']", "task.horizons=[10]"], 1.02
     ),
     "sizes 1e-6 and 1e6": Oddity(
         lambda: [of_sizes()], 50, ["task.targets=['small', 'large']", "task.horizons=[5]"], kinds={}

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.data.even_split import blocks_of_motion, is_even, moving_ticks
+from edp.data.even_split import blocks_at_rest, blocks_of_motion, is_even, moving_ticks
 from edp.data.splits import ByBlocks, ByName, ByRecording, ByTime
 from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.workflows.auto import load_auto
 from edp.workflows.auto.division import divide
+from edp.workflows.proposal import propose
 
 RATE = 50.0
 
@@ -94,3 +95,17 @@ def test_missing_values_and_channels_are_no_motion():
 def test_blocks_are_longer_than_their_gaps():
     short = recording("a", MOVES[:600])
     assert blocks_of_motion([short], 42).block_s * RATE >= 8 * 42
+
+
+def test_a_single_recording_is_asked_for_blocks_where_its_end_rests():
+    log = recording("a", RESTS_AT_ITS_END)
+    assert blocks_at_rest(log, 10) == divide([log], settings())[0].split
+    assert blocks_at_rest(recording("b", MOVES), 10) is None
+
+
+def test_the_proposal_for_a_log_that_rests_at_its_end_is_blocks(tmp_path):
+    log = recording("a", RESTS_AT_ITS_END)
+    table = np.column_stack([np.arange(6000) / RATE, log.values])
+    np.savetxt(tmp_path / "a.csv", table, "%.6g", ",", header="time,u_valve,x_pos", comments="")
+    settings_text = propose(tmp_path / "a.csv").files["settings.toml"]
+    assert 'kind = "blocks"' in settings_text

@@ -18,6 +18,8 @@ MOVES = 0.5
 BLOCKS, LEAST_GAPS = 15, 8
 """Blocks of a recording, three of which test, and gaps that one is long at least."""
 EVERY = 5
+HISTORY = 32
+"""Ticks before a prediction that it reads at least."""
 
 Mask = NDArray[np.bool_]
 
@@ -74,6 +76,20 @@ def _shares(split: ByRecording | ByTime | ByBlocks) -> dict[str, float]:
     test = 1 / split.every if isinstance(split, ByBlocks) else split.test_share
     validation = split.validation_share * (1 - test if isinstance(split, ByBlocks) else 1)
     return {"train": 1 - validation - test, "validation": validation, "test": test}
+
+
+def blocks_at_rest(recording: Recording, horizon: int) -> ByBlocks | None:
+    """Blocks for a recording of which time alone would validate or test rest; None where time will do.
+
+    Args:
+        recording: all of its channels are to be predicted.
+        horizon: largest horizon in ticks.
+    """
+    gap = HISTORY + horizon
+    moving = moving_ticks([recording], recording.channel_names, max(1, horizon))
+    blocks = blocks_of_motion([recording], gap)
+    rests = not is_even(ByTime(), [recording], gap, moving) and is_even(blocks, [recording], gap, moving)
+    return blocks if rests else None
 
 
 def blocks_of_motion(recordings: Sequence[Recording], gap: int) -> ByBlocks:

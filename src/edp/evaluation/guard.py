@@ -78,21 +78,23 @@ def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
 
 @dataclass(frozen=True)
 class LostOutput:
-    """An output on which a baseline has less error than the network.
+    """An output on which a baseline has less error than the network at some horizon.
 
     Attributes:
         target: name of the output.
         label: how tables call the best baseline on it.
-        less: by which share its error is less, over all horizons.
+        less: by which share its error is less.
+        horizon: where it is less by most, in samples.
     """
 
     target: str
     label: str
     less: float
+    horizon: int
 
 
 def lost_outputs(scores: Mapping[str, Any]) -> list[LostOutput]:
-    """The outputs on which some baseline has less root-mean-square error than the network, the worst first.
+    """The outputs on which some baseline has less root-mean-square error at some horizon, the worst first.
 
     Args:
         scores: the content of ``scores.json``.
@@ -100,14 +102,16 @@ def lost_outputs(scores: Mapping[str, Any]) -> list[LostOutput]:
     models, horizons = scores["models"], scores["task"]["horizons"]
     lost = []
     for target in scores["targets"] if NETWORK in models else ():
+        # Each horizon by itself: a network that leads at one may be of no use at another.
         gains = {
-            str(model["label"]): _logarithm(models[NETWORK], model, target["name"], horizons)
+            (str(model["label"]), horizon): _logarithm(models[NETWORK], model, target["name"], [horizon])
             for name, model in models.items()
+            for horizon in horizons
             if name != NETWORK
         }
-        best = max((label for label in gains if gains[label] > LEAST), key=lambda label: gains[label], default=None)
+        best = max((where for where in gains if gains[where] > LEAST), key=lambda where: gains[where], default=None)
         if best is not None:
-            lost.append(LostOutput(str(target["name"]), best, 1.0 - math.exp(-gains[best])))
+            lost.append(LostOutput(str(target["name"]), best[0], 1.0 - math.exp(-gains[best]), int(best[1])))
     return sorted(lost, key=lambda output: -output.less)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from edp.data.even_split import blocks_at_rest
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.proposal.columns import LogColumn
 from edp.logs.proposal.groups import LogGroup, group_logs
@@ -19,8 +20,9 @@ from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
 from edp.logs.read import find_recordings, unique_names
 from edp.logs.source import map_of_table
 from edp.logs.timebase import judge
+from edp.recording import Recording
 from edp.settings.tree import parse_toml
-from edp.signals import TIME_UNITS, VOCABULARY, Kind, SignalMap
+from edp.signals import TIME_UNITS, VOCABULARY, Channel, Kind, SignalMap
 from edp.storage import make_folder, write_bytes
 
 MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
@@ -120,7 +122,8 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     if len(channels) > MOST_FEATURES:
         notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")
         channels = list(dict.fromkeys([*channels[:MOST_FEATURES], *targets]))
-    split = {"kind": "names"} if len(group.paths) >= _LEAST_RECORDINGS else {"kind": "time"}
+    split = _split(group, proposal, targets)
+    notes += ["the machine rests at the end of the log: blocks of time test in turn"] * (split["kind"] == "blocks")
     files = {
         MAP: _text(_map_table(proposal.signal_map), _remarks(source, proposal)),
         SETTINGS: _settings(proposal, channels, targets, split),
@@ -261,6 +264,26 @@ def _remarks(source: Path, proposal: MapProposal) -> list[str]:
     absent = [guess for guess in proposal.columns if not guess.channel and guess.role != "time"]
     lines += [f"Not taken: {guess.column[:60]} ({guess.role}: {guess.why})" for guess in absent[:MOST_FEATURES]]
     return lines
+
+
+def _split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> dict[str, Any]:
+    """Whole logs where there are many, else time; blocks of a single log whose end, which would test, is at rest."""
+    if len(group.paths) >= _LEAST_RECORDINGS:
+        return {"kind": "names"}
+    looked = {column.name: column for column in proposal.look.columns}
+    columns = [
+        looked[guess.column] for guess in proposal.columns if guess.channel in targets and guess.column in looked
+    ]
+    rate = proposal.clock.wanted_hz or proposal.clock.rate_hz
+    whole = all(len(column.values) == column.samples for column in columns)
+    if len(group.paths) == 1 and columns and rate and whole:
+        step = max(1, round((proposal.clock.rate_hz or rate) / rate))
+        values = np.stack([column.values[::step] for column in columns], axis=1).astype(np.float32)
+        channels = tuple(Channel(column.name, Kind.GENERIC) for column in columns)
+        blocks = blocks_at_rest(Recording("log", channels, values, rate), horizons_for(rate)[-1])
+        if blocks is not None:
+            return {"kind": "blocks", "block_s": round(blocks.block_s, 2), "every": blocks.every}
+    return {"kind": "time"}
 
 
 def _text(table: dict[str, Any], remarks: Iterable[str] = ()) -> str:

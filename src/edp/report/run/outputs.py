@@ -19,11 +19,16 @@ FEW = 3
 
 
 def losses_line(scores: Mapping[str, Any]) -> str:
-    """The outputs on which a baseline has less error than the network, worst first; empty where there are none."""
+    """The outputs on which a baseline has less error at some horizon, worst first; empty where there are none."""
     losses = lost_outputs(scores)
     if not losses:
         return ""
-    parts = [f"{loss.target} ({loss.label}: {percent(loss.less)} less {MEASURE_NAME})" for loss in losses[:SHOWN]]
+    several = len(scores["task"]["horizons"]) > 1
+    parts = [
+        f"{loss.target}{f' at k = {loss.horizon}' if several else ''} "
+        f"({loss.label}: {percent(loss.less)} less {MEASURE_NAME})"
+        for loss in losses[:SHOWN]
+    ]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
     return (
         f"The network loses to a baseline on {len(losses)} of {len(scores['targets'])} outputs: {listed(parts)}{more}."
