@@ -253,22 +253,28 @@ def prepared(plan: Plan) -> tuple[list[str], list[str]]:
     return session_names(plan.data / "test", "healthy"), session_names(plan.data / "test", "faulty")
 
 
+def calm(plan: Plan, group: str, names: Sequence[str]) -> dict[str, Any]:
+    """False alarms of sessions that are healthy, of an earlier run where there was one."""
+
+    def counted() -> dict[str, Any]:
+        count = sum(len(alarms) for alarms in watched(plan, names).values())
+        return dict(finite(false_alarm_rate(count, len(names) * seconds / 3600.0)))
+
+    seconds = QUICK_SECONDS if plan.quick else DURATION_S
+    return kept(plan.monitor / f"{group}.json", counted)
+
+
 def measure(plan: Plan, seed: int) -> dict[str, Any]:
     """Everything of one run."""
     healthy, faulty = prepared(plan)
     found: dict[str, Any] = {"fit": fitted(plan)}
-    calm, wrong = watched(plan, healthy), watched(plan, faulty)
-    seconds = QUICK_SECONDS if plan.quick else DURATION_S
-    count = sum(len(alarms) for alarms in calm.values())
-    found["healthy"] = false_alarm_rate(count, len(calm) * seconds / 3600.0)
+    found["healthy"] = calm(plan, "healthy", healthy)
+    wrong = watched(plan, faulty)
     cases = our_cases(plan, wrong)
-    found |= {"ours": summary(cases), "naming": naming(plan, wrong), "curves": curves(cases), "nuisance": {}}
+    found |= {"ours": summary(cases), "naming": naming(plan, wrong), "curves": curves(cases)}
     found["same_alarms"] = same_alarms(plan, wrong)
-    for group in NUISANCES:
-        silent = watched(plan, session_names(plan.data / "test", group))
-        count = sum(len(alarms) for alarms in silent.values())
-        if silent:
-            found["nuisance"][group] = false_alarm_rate(count, len(silent) * seconds / 3600.0)
+    names = {group: session_names(plan.data / "test", group) for group in NUISANCES}
+    found["nuisance"] = {group: calm(plan, group, some) for group, some in names.items() if some}
     found["rivals"] = kept(plan.monitor / "rivals.json", lambda: finite(rival_results(plan, healthy, faulty)))
     found["promise"] = kept(plan.monitor / "promise.json", lambda: promise(plan, seed))
     return found

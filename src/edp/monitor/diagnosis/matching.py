@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +73,7 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
 
 def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
     """`match` from the directions at the onset and after it on; None where there are no rows of a part."""
-    tried = candidates(dictionary)
+    tried = _all_candidates(dictionary)
     return judged(tried, *likelihoods(tried, seen, dictionary.changing), dictionary)
 
 
@@ -91,6 +92,12 @@ class Candidates:
     sizes: Array
     signatures: Array
     firsts: NDArray[np.int64]
+
+
+@lru_cache(maxsize=2)
+def _all_candidates(dictionary: Dictionary) -> Candidates:
+    """Those of a monitor that is at work: every alarm compares with the same ones."""
+    return candidates(dictionary)
 
 
 def candidates(dictionary: Dictionary, further: bool = True) -> Candidates:
