@@ -46,9 +46,7 @@ class McapRecorder:
         try:
             self._writer = foxglove.open_mcap(self.path, context=self._context)
         except (OSError, RuntimeError, FileExistsError) as error:
-            raise StorageError(
-                f"--record {path}: {error}; choose a new file in a folder that is there"
-            ) from error
+            raise StorageError(f"--record {path}: {error}; choose a new file in a folder that is there") from error
 
         def channel(topic: str, schema: dict[str, Any]) -> Any:
             return foxglove.Channel(topic, schema=schema, message_encoding="json", context=self._context)
