@@ -31,7 +31,7 @@ class Page:
 
     def __init__(self, address: str) -> None:
         self._stack = contextlib.ExitStack()
-        self._socket = self._stack.enter_context(connect(address, max_size=None))
+        self._socket = self._stack.enter_context(connect(address, max_size=None, ping_interval=None))
         self._numbers = itertools.count(1)
         self.messages: list[str] = []
         self.requests: list[str] = []
