@@ -30,7 +30,8 @@ class Page:
     """
 
     def __init__(self, address: str) -> None:
-        self._socket = connect(address, max_size=None)
+        self._stack = contextlib.ExitStack()
+        self._socket = self._stack.enter_context(connect(address, max_size=None, ping_interval=None))
         self._numbers = itertools.count(1)
         self.messages: list[str] = []
         self.requests: list[str] = []
@@ -88,7 +89,7 @@ class Page:
         path.write_bytes(base64.b64decode(data))
 
     def close(self) -> None:
-        self._socket.close()
+        self._stack.close()
 
 
 class Browser:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.logs.formats.base import RawLog, RawSignal
@@ -119,7 +118,7 @@ def read_json_mcap(path: Path) -> RawLog:
 
 
 def _signals(topic: _Topic, facts: EdpMetadata, origin: int) -> Iterator[tuple[str, RawSignal]]:
-    seconds: NDArray[np.float64] = (np.asarray(topic.at_ns, dtype=np.int64) - origin) * 1e-9
+    seconds = np.asarray((np.asarray(topic.at_ns, dtype=np.int64) - origin) * 1e-9, dtype=np.float64)
     for name, values in topic.columns.items():
         channel = facts.channels.get(name)
         signal = RawSignal(

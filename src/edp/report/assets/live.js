@@ -12,9 +12,11 @@
   const chosen = new Set(), groups = new Map();
 
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
-  let palette = null;
+  let palette = null, paletteOf = null;
   function colours() {
-    if (palette) return palette;
+    // By what it is of, not by the event of a change, which comes before the styles are new.
+    if (palette && paletteOf === dark.matches) return palette;
+    paletteOf = dark.matches;
     const style = getComputedStyle(document.documentElement), value = (name) => style.getPropertyValue(`--${name}`).trim();
     palette = Object.fromEntries(["ink", "soft", "grid", "measured", "blue", "band", "rest", "bad"].map((name) => [name, value(name)]));
     return palette;
@@ -72,10 +74,15 @@
     dirty = true;
   }
   function boxes() {
-    const box = element("boxes"), names = new Map(plots().map((spec) => [spec.choice, spec]));
+    const box = element("boxes"), names = new Map();
+    plots().forEach((spec) => { if (!names.has(spec.choice)) names.set(spec.choice, spec); });
     box.replaceChildren();
     const first = [...names.keys()];
-    if (!chosen.size) first.slice(0, layout.statistics.length ? SHOWN + 1 : SHOWN).forEach((name) => chosen.add(name));
+    if (!chosen.size) {
+      // Predictions show what is measured, too; raw channels stand first only where nothing is predicted.
+      const wanted = layout.forecasts.length ? first.filter((name) => !name.startsWith("trace|")) : first;
+      wanted.slice(0, layout.statistics.length ? SHOWN + 1 : SHOWN).forEach((name) => chosen.add(name));
+    }
     first.forEach((name) => {
       const label = document.createElement("label"), input = document.createElement("input");
       input.type = "checkbox"; input.checked = chosen.has(name);
@@ -105,7 +112,7 @@
     element("front").hidden = !side;
     element("events").replaceChildren(); groups.clear();
     if (charts) charts.show([]);
-    charts = edpCharts(element("charts"), colours);
+    charts = edpCharts(element("charts"), colours, () => { dirty = true; });
     leversOf(); boxes(); choose();
   }
 

@@ -1,11 +1,11 @@
 "use strict";
-/* Plots of a session, by uPlot. A plot is { title, unit, lines } and a line { name, values(tick), colour, dashed }. */
-function edpCharts(holder, colours) {
+/* Plots of a session, by uPlot; those out of sight are not drawn, and `redraw` is called when one comes into it. A plot is { title, unit, lines } and a line { name, values(tick), colour, dashed }. */
+function edpCharts(holder, colours, redraw) {
   const POINTS = 1200; // of a line: more than a plot has pixels
   const charts = new Map();
   const seen = new IntersectionObserver((entries) => entries.forEach((entry) => {
     const chart = [...charts.values()].find((one) => one.figure === entry.target);
-    if (chart) chart.visible = entry.isIntersecting;
+    if (chart && chart.visible !== entry.isIntersecting) { chart.visible = entry.isIntersecting; redraw(); }
   }));
   let span = [0, 1];
 

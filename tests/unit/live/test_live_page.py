@@ -1,0 +1,154 @@
+"""The page in a headless Chromium: what it shows, what it does not fetch, and that names in it are text."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import live_browser
+import numpy as np
+import pytest
+
+from edp.live import Forecast, LiveLayout, LiveSession, LiveTrace, Pace, write_session_page
+from edp.live.server import LiveServer
+from edp.report.animation.page import geometry_of
+from edp.signals import Channel, Kind
+from edp.sim import load_machine
+
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(live_browser.CHROMIUM is None, reason="needs chromium (make system-packages)"),
+]
+HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
+
+
+def session_of(steered: bool = True) -> LiveSession:
+    names = (HOSTILE, "</script><script>document.title='owned'</script>", "Lever_1")
+    traces = [LiveTrace.of(Channel(name, Kind.VELOCITY, name)) for name in names]
+    forecast = Forecast(HOSTILE, "mm/s", 1e3, 10, 3, 4, 5, 0.9, 0)
+    layout = LiveLayout(
+        HOSTILE, HOSTILE, 100.0, 10, traces, [forecast], geometry_of(load_machine("M22")), (6, 7, 8), (2,),
+        {HOSTILE: 9}, steered, 5000,
+    )  # fmt: skip
+    return LiveSession(layout)
+
+
+def stream(session: LiveSession, ticks: int) -> None:
+    for _ in range(ticks):
+        t = session.ticks / 100.0
+        wave = np.sin(t)
+        row = [wave, 0.1, 0.5, wave, wave - 0.2, wave + 0.2, 0.6 + 0.1 * wave, -1.5, -0.5 + 0.3 * wave, 0.3]
+        session.append(np.array(row, np.float32))
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[live_browser.Browser]:
+    with live_browser.browser() as one:
+        yield one
+
+
+@pytest.fixture
+def served() -> Iterator[LiveServer]:
+    server = LiveServer(session_of(), Pace(100.0))
+    ready, started = threading.Event(), {}
+
+    async def run() -> None:
+        started["loop"], started["stop"] = asyncio.get_running_loop(), asyncio.Event()
+        await server.run(started["stop"], lambda one: ready.set())
+
+    thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
+    thread.start()
+    assert ready.wait(20)
+    yield server
+    started["loop"].call_soon_threadsafe(started["stop"].set)
+    thread.join(20)
+
+
+def harmless(page: live_browser.Page, address: str) -> None:
+    """Nothing ran, nothing failed, nothing was fetched from elsewhere."""
+    assert page.value("document.title").endswith("live view")
+    assert page.value("document.querySelectorAll('img').length") == 0
+    assert page.messages == []
+    assert [one for one in page.requests if not one.startswith(address)] == []
+
+
+def test_a_session_is_shown_as_it_comes_and_names_are_text(chromium, served):
+    session = served.session
+    stream(session, 200)
+    session.event("alarm", HOSTILE, "g")
+    session.event("alarm", HOSTILE, "g")
+    page = chromium.page()
+    page.size(1280, 900)
+    page.open(served.address)
+    page.wait("window.edpLive && edpLive.frames > 0 && document.querySelectorAll('#events li').length")
+    stream(session, 300)
+    page.wait("edpLive.ticks >= 300 && document.getElementById('clock').textContent.startsWith('5.0 s')")
+    assert page.value("document.getElementById('title').textContent") == HOSTILE
+    assert HOSTILE in page.value("document.getElementById('charts').textContent")
+    assert page.value("document.querySelectorAll('#charts figure').length") == 3
+    # Alarms that say the same are one row, with their number.
+    assert page.value("document.querySelectorAll('#events li.alarm').length") == 1
+    assert "(2 times" in page.value("document.querySelector('#events li.alarm').textContent")
+    assert page.value("document.getElementById('front').width") > 100
+    assert page.value("document.documentElement.scrollWidth <= innerWidth")
+    harmless(page, served.address)
+    page.size(390, 844)
+    assert page.wait("document.documentElement.scrollWidth <= innerWidth")
+    page.size(1280, 900, dark=True)
+    assert page.value("getComputedStyle(document.body).backgroundColor") == "rgb(20, 25, 30)"
+    stream(session, 10)
+    # The line of what is measured is light on dark now.
+    page.wait("document.querySelector('figcaption i[data-colour=measured]').style.borderColor === 'rgb(232, 236, 240)'")
+
+
+def test_viewers_pause_look_back_and_run_ahead(chromium, served):
+    stream(served.session, 400)
+    page = chromium.page()
+    page.open(served.address)
+    page.wait("window.edpLive && edpLive.frames > 0 && edpLive.state")
+    page.value("document.getElementById('play').click()")
+    page.wait("document.getElementById('state').textContent.startsWith('source paused')")
+    assert served.pace.paused
+    page.value("document.getElementById('play').click()")
+    page.wait("document.getElementById('play').textContent === 'Pause'")
+    seek = (
+        "(() => {{ const s = document.getElementById('scrub'); s.value = {}; s.dispatchEvent(new Event('input')); }})()"
+    )
+    page.value(seek.format(100))
+    page.wait("document.getElementById('clock').textContent.startsWith('1.0 s')")
+    stream(served.session, 50)
+    time.sleep(0.3)
+    assert page.value("document.getElementById('clock').textContent").startswith("1.0 s")
+    page.value(seek.format(3000))
+    page.wait("document.getElementById('clock').textContent.startsWith('4.5 s')")
+    assert served.pace._ahead == 3000
+    harmless(page, served.address)
+
+
+def test_a_server_that_ends_and_rows_that_stop_are_said(chromium, served):
+    stream(served.session, 100)
+    page = chromium.page()
+    page.open(served.address)
+    page.wait("window.edpLive && edpLive.frames > 0")
+    stream(served.session, 10)
+    page.wait("document.getElementById('state').textContent.startsWith('no new values for')")
+    served.session.end("the log has ended after 1 s")
+    page.wait("document.getElementById('state').textContent.startsWith('the log has ended')")
+
+
+def test_a_saved_session_replays_without_a_server(chromium, tmp_path: Path):
+    session = session_of()
+    stream(session, 500)
+    session.event("alarm", HOSTILE)
+    session.end("done")
+    file = write_session_page(session, tmp_path / "session.html")
+    page = chromium.page()
+    page.open(file.as_uri())
+    page.wait("window.edpLive && edpLive.frames > 3")
+    page.wait("parseFloat(document.getElementById('clock').textContent) > 0.3")
+    assert page.value("document.getElementById('events').textContent").count(HOSTILE) == 1
+    page.value("document.getElementById('speed').value = '50'")
+    page.wait("document.getElementById('play').textContent === 'Play'")
+    page.wait("document.getElementById('clock').textContent.startsWith('5.0 s')")
+    harmless(page, file.as_uri())
