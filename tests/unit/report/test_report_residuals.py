@@ -127,7 +127,7 @@ def with_signals(folder, columns):
 def test_raw_signals_stand_first_in_their_units(run_folder):
     facts = with_signals(run_folder, 2)
     chart = signal_chart(facts)
-    assert [panel.title for panel in chart.panels] == ["Signals [1]", "[bar]"]
+    assert [panel.title for panel in chart.panels] == ["</script><b>lever", "[bar]"]
     assert chart.panels[1].marks[0].y.max() == pytest.approx(200, rel=1e-3)
     page = render(facts)
     assert page.index("Raw signals</h2>") < page.index("Against the baselines</h2>")

@@ -24,9 +24,11 @@ def signal_chart(facts: Facts) -> Chart | None:
     values, rate = facts.predictions[name][INPUTS], facts.rate_hz or 1.0
     by_unit: dict[str, list[int]] = {}
     for column, channel in enumerate(channels):
-        by_unit.setdefault(channel["unit"], []).append(column)
+        # Numbers without a unit have no common axis: each stands alone.
+        by_unit.setdefault(channel["unit"] if channel["unit"] != "1" else f"1 {column}", []).append(column)
     panels = []
-    for unit, columns in list(by_unit.items())[:MOST_PANELS]:
+    for columns in list(by_unit.values())[:MOST_PANELS]:
+        unit = channels[columns[0]]["unit"]
         marks: list[Mark] = []
         labels = short_labels(channels[column]["name"] for column in columns[:MOST_SERIES])
         for label, column, colour in zip(labels, columns, (BLUE, *SHADES)):
@@ -35,7 +37,7 @@ def signal_chart(facts: Facts) -> Chart | None:
             x = (selected / rate).astype(np.float32)
             marks.append(DataSeries(x=x, y=y[selected], name=label, colour=colour, width=1.2))
         more = f", {len(columns) - MOST_SERIES} more not drawn" if len(columns) > MOST_SERIES else ""
-        title = with_unit("Signals" if unit == "1" else "", unit).strip() + more
+        title = labels[0] if unit == "1" else with_unit("", unit).strip() + more
         panels.append(Panel(tuple(marks), ChartAxis("Time [s]" if facts.rate_hz else "Sample"), title=title))
     return Chart("signals", tuple(panels), height=100 + 150 * len(panels), together=True)
 
