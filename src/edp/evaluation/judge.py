@@ -78,6 +78,8 @@ class Evaluation:
             parts |= {name: self.predictions[name][i] for name in ("network", "ridge_arx") if name in self.predictions}
             for end, side in enumerate(("network_low", "network_high") if self.bounds else ()):
                 parts[side] = self.bounds[i][:, end]
+            if i == 0:  # of one recording: of all, they would take more room than everything else
+                parts["inputs"] = series.inputs[:, : len(self.scores["inputs"])]
             tensors |= {f"{series.name}/{name}": np.ascontiguousarray(part[:ticks]) for name, part in parts.items()}
         return tensors
 
@@ -258,6 +260,10 @@ class _Ruler:
             "targets": [
                 {"name": name, "description": text, "unit": unit, "factor": float(factor)}
                 for name, text, unit, factor in targets
+            ],
+            "inputs": [
+                {"name": c.name, "unit": KINDS[c.kind].report_unit, "factor": float(KINDS[c.kind].report_factor)}
+                for c in self.data.inputs
             ],
         }
 

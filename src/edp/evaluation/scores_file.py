@@ -105,6 +105,7 @@ SCORES = KeyedObject(
             {"name": NAME, "horizons": Listed(COUNT), "rate_hz": SIZE, "mode": NAME, "skip": COUNT}, ("horizons",)
         ),
         "targets": Listed(KeyedObject({"name": NAME, "description": NAME, "unit": NAME, "factor": SIZE}, ("name",))),
+        "inputs": Listed(KeyedObject({"name": NAME, "unit": NAME, "factor": SIZE}, ("name", "unit", "factor"))),
         "models": NamedValues(MODEL),
         "situation": SITUATION,
     },

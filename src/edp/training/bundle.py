@@ -242,6 +242,8 @@ def _bundle_folder(folder: str | Path) -> Path:
     if os.path.lexists(path / "twin" / "twin.json"):
         raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
     if not os.path.lexists(path / HEADER):
+        if (Path(path) / "run.json").is_file():
+            raise BundleError(f"'{path}' holds a training that is not finished; give the same edp train again to go on")
         raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
     return path
 

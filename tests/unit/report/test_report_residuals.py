@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from edp.errors import DataError
 from edp.report.common.interactive import plots
 from edp.report.run.charts import run_charts
 from edp.report.run.facts import read_facts
 from edp.report.run.figures import prediction_lines, residual_histograms
+from edp.report.run.page import render
 from edp.report.run.residuals import correlations, correlogram, fit_table
+from edp.report.run.signals import signal_chart
 
 
 def test_fit_is_that_of_system_identification(run_folder):
@@ -104,3 +107,34 @@ def test_many_traces_are_drawn_of_fewer_recordings(run_folder):
     few = prediction_lines(facts, budget=15_000)
     assert len({line.recording for line in few}) == 1
     assert sum(len(line.y) for line in few) <= 15_000
+
+
+def with_signals(folder, columns):
+    scores = json.loads((folder / "scores.json").read_text())
+    scores["inputs"] = [
+        {"name": "</script><b>lever", "unit": "1", "factor": 1.0},
+        {"name": "p_head", "unit": "bar", "factor": 1e-5},
+    ]
+    (folder / "scores.json").write_text(json.dumps(scores))
+
+    def keep(arrays):
+        ticks = len(arrays["trench_01/truth"])
+        arrays["trench_01/inputs"] = np.linspace(0, 2e7, ticks * columns, dtype=np.float32).reshape(ticks, columns)
+
+    return rewritten(folder, keep)
+
+
+def test_raw_signals_stand_first_in_their_units(run_folder):
+    facts = with_signals(run_folder, 2)
+    chart = signal_chart(facts)
+    assert [panel.title for panel in chart.panels] == ["</script><b>lever", "[bar]"]
+    assert chart.panels[1].marks[0].y.max() == pytest.approx(200, rel=1e-3)
+    page = render(facts)
+    assert page.index("Raw signals</h2>") < page.index("Against the baselines</h2>")
+    assert "<b>lever" not in page
+    assert {item.model for item in residual_histograms(facts)} == {"network", "ridge_arx"}
+
+
+def test_signals_of_another_shape_are_refused(run_folder):
+    with pytest.raises(DataError, match="inputs"):
+        with_signals(run_folder, 3)

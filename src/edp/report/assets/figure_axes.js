@@ -134,7 +134,7 @@ const FigureAxes = (function () {
       if (tickvals) return tickvals.map((value, i) => [this.place(value), plain(ticktext[i])]).filter(inside);
       if (this.categories) return this.categories.map((name, i) => [i, plain(name)]).filter(inside);
       if (this.log) return this.decades().filter(inside);
-      const step = niceStep(this.high - this.low, length / (this.upright ? 38 : 85));
+      const step = niceStep(this.high - this.low, Math.max(length / (this.upright ? 38 : 85), 3.5));
       const decimals = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
       const first = Math.ceil(this.low / step - 1e-9);
       const count = Math.floor(this.high / step + 1e-9) - first + 1;

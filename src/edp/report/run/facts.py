@@ -23,6 +23,10 @@ NETWORK = "network"
 TRUTH = "truth"
 LOW, HIGH = "network_low", "network_high"
 """Ends of the network's interval, beside its prediction."""
+INPUTS = "inputs"
+"""Raw signals of one recording, ``(time, channel)``, SI."""
+NO_MODELS = frozenset((TRUTH, LOW, HIGH, INPUTS))
+"""What of the arrays kept of a recording is no prediction."""
 MAKERS = {
     "config.toml": "edp train",
     "provenance.json": "edp train",
@@ -210,8 +214,8 @@ def _check_predictions(facts: Facts) -> None:
         truth = parts[TRUTH]
         for name, array in parts.items():
             expected_shape = (
-                (len(truth), len(facts.targets))
-                if name == TRUTH
+                (len(truth), len(facts.targets if name == TRUTH else facts.scores.get("inputs", ())))
+                if name in (TRUTH, INPUTS)
                 else (
                     len(truth),
                     len(facts.horizons),

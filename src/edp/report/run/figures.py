@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsdownsample import MinMaxLTTBDownsampler
 
 from edp.evaluation.guard import MEASURE
-from edp.report.run.facts import HIGH, LOW, NETWORK, TRUTH, Facts, main_horizon, score
+from edp.report.run.facts import HIGH, INPUTS, LOW, NETWORK, NO_MODELS, TRUTH, Facts, main_horizon, score
 
 WHOLE, EXCERPT = "whole", "excerpt"
 POINT_BUDGET = 250_000  # of all prediction traces together: about 2 MB of the page
@@ -114,12 +114,10 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
     """
     recordings = sorted(facts.predictions)[:RECORDINGS_SHOWN]
     horizons = horizons_shown(facts)
-    each = len(facts.targets) * max(
-        1 + (len(parts) - 1) * len(horizons) for parts in facts.predictions.values() or [()]
-    )
+    each = len(facts.targets) * (1 + len(horizons) * max((_drawn(facts, name) for name in recordings), default=0))
     # Many outputs: fewer recordings, so that what is drawn keeps its shape and the page its size.
     recordings = recordings[: max(1, budget // (2 * LEAST_POINTS * max(each, 1)))]
-    models = sum(len(facts.predictions[name]) - 1 for name in recordings)
+    models = sum(_drawn(facts, name) for name in recordings)
     traces = len(facts.targets) * (len(recordings) + models * len(horizons))
     if traces == 0 or not horizons:
         return []
@@ -145,11 +143,16 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
     return lines
 
 
+def _drawn(facts: Facts, recording: str) -> int:
+    """Lines of a recording beside its truth, for each horizon and output."""
+    return len(facts.predictions[recording].keys() - {TRUTH, INPUTS})
+
+
 def _series(facts: Facts, recording: str, horizons: Sequence[int]) -> list[tuple[str, int | None, Array]]:
     """(model, horizon, (time, target)) of the truth, the baselines and last, so drawn on top, the network."""
     parts = facts.predictions[recording]
     series: list[tuple[str, int | None, Array]] = [(TRUTH, None, parts[TRUTH])]
-    for name in sorted(parts.keys() - {TRUTH, LOW, HIGH}, key=lambda name: name == NETWORK):
+    for name in sorted(parts.keys() - NO_MODELS, key=lambda name: name == NETWORK):
         for horizon in horizons:
             series.append((name, horizon, aligned(parts[name][:, facts.horizons.index(horizon)], horizon)))
     return series
@@ -188,7 +191,7 @@ class Histogram:
 def residual_histograms(facts: Facts, bins: int = 61) -> list[Histogram]:
     """Prediction minus truth over the recordings kept, in bins that span 99 % of the network's residuals."""
     histograms: list[Histogram] = []
-    models = {name for parts in facts.predictions.values() for name in parts} - {TRUTH, LOW, HIGH}
+    models = {name for parts in facts.predictions.values() for name in parts} - NO_MODELS
     order = sorted(models, key=lambda name: name != NETWORK)
     for horizon in horizons_shown(facts):
         for output, target in enumerate(facts.targets):

@@ -19,6 +19,7 @@ from edp.report.run.charts import DOTS_AT_MOST, run_charts
 from edp.report.run.choice import candidates_table, model_tables, promise_line, promise_table, read_choice
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.report.run.residuals import correlogram, fit_table
+from edp.report.run.signals import signal_chart, signals_of
 from edp.storage import write_bytes
 
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
@@ -78,7 +79,8 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "unseen": foundation_tables(facts),
         "worst": tables.worst_recordings_table(facts),
         "fit": fit_table(facts),
-        **shown([*run_charts(facts), *(chart for chart in (correlogram(facts),) if chart is not None)]),
+        "signals": signals_of(facts),
+        **shown(chart for chart in (signal_chart(facts), *run_charts(facts), correlogram(facts)) if chart is not None),
         "checks": tables.budget_checks(facts),
         "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
         "parts": tables.parts_table(facts),
