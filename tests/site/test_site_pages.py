@@ -28,7 +28,7 @@ HAND_WRITTEN = sorted(
 HISTORY = ("CHANGELOG.md", "findings.md")
 """Pages that tell of commands as they were then; decisions are others."""
 PRESENT = [page for page in HAND_WRITTEN if page.name not in HISTORY and page.parent.name != "decisions"]
-PLANNED = {"live.md", "compare.md"}
+PLANNED = {"commands.md", "compare.md", "install.md", "limits.md", "live.md", "own_logs.md"}
 """Places in the navigation for pages that another branch brings."""
 RUN_ELSEWHERE = {"README.md", "python.md"}
 """Their Python is run by tests/examples/test_python_page.py."""

@@ -19,11 +19,11 @@ SHARED = Path(os.environ.get("EDP_SHARED_DATA", ROOT.parent / "shared" / "data")
 RECORDING = SHARED / "fatigue_rig_faster" / "faster.csv"
 
 
-def commands_behind(heading: str) -> list[list[str]]:
-    """The `edp` calls of the tutorial behind a heading, as words."""
+def commands_behind(heading: str, until: str = "## Where to go on") -> list[list[str]]:
+    """The `edp` calls of the tutorial between two headings, as words."""
     lines = [
         line
-        for fence in markdown.fences(PAGE.split(heading)[1])
+        for fence in markdown.fences(PAGE.split(heading)[1].split(until)[0])
         if fence.language == "sh"
         for line in fence.code.splitlines()
     ]
@@ -75,13 +75,8 @@ def test_the_tutorial_runs_on_its_recording(tmp_path):
 def test_the_tutorial_runs_on_simulated_recordings_without_a_map(tmp_path):
     (simulate,) = [words for words in commands_behind("## 1.") if words[0] == "simulate"]
     run([{"20": "4", "10": "4"}.get(word, word) for word in simulate], tmp_path)
-    for words in commands_behind("## 3."):
-        if words[0] in ("inspect", "train", "evaluate", "report"):
-            plain = [
-                word
-                for before, word in zip(["", *words], words)
-                if not {word, before} & {"--map", "--config"}
-            ]  # fmt: skip
-            short = ["0.1" if before == "--minutes" else word for before, word in zip(["", *plain], plain)]
-            run(short, tmp_path, (0, 6) if words[0] == "evaluate" else (0,))
+    for words in commands_behind("## 3.", "## 6."):
+        plain = [word for before, word in zip(["", *words], words) if not {word, before} & {"--map", "--config"}]
+        short = ["0.1" if before == "--minutes" else word for before, word in zip(["", *plain], plain)]
+        run(short, tmp_path, (0, 6) if words[0] == "evaluate" else (0,))
     assert (tmp_path / "runs" / "first" / "report.html").is_file()
