@@ -163,6 +163,16 @@ def test_a_test_at_rest_is_said_and_one_that_never_moves_is_no_error():
     assert situation_of(prepared(rest, rest))["outside"] == []
 
 
+def test_a_bundle_alone_has_no_training_to_differ_from():
+    alone = replace(prepared(walk(0), walk(1)), train=[], validation=[])
+    assert situation_of(alone) == {"outside": [], "changes": []}
+
+
+def test_a_training_no_longer_than_the_horizon_has_no_changes_to_compare():
+    found = situation_of(prepared(walk(0, samples=4), walk(1)))
+    assert {row["horizon"] for row in found["changes"]} <= {1, 5}
+
+
 def test_rare_pulses_are_said():
     pulses = walk(1)
     pulses[::100, 1] += 0.1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,9 @@ def situation_of(data: Prepared) -> dict[str, Any]:
         ``changes``: of targets and horizons (in ticks), ``target``, ``horizon``, ``ratio`` of the root-mean-square
         change to that in training, and ``beyond``, the share of changes that are larger than any in training.
     """
-    trained = [*data.train, *data.validation]
+    trained = [part for part in (*data.train, *data.validation) if part.samples]
+    if not trained:
+        return {"outside": [], "changes": []}  # a bundle alone does not know what trained it
     outside = _outside(trained, data.test, [channel.name for channel in data.inputs], list(data.task.targets))
     changes: list[dict[str, Any]] = []
     for horizon in (k for k in data.task.horizons if k > 0):
@@ -53,7 +55,7 @@ def _outside(
     names = [*inputs, *(targets[number] for number in hidden)]
 
     def values(parts: Iterable[Series]) -> Iterator[NDArray[np.floating]]:
-        return (np.concatenate([part.inputs, part.targets[:, hidden]], axis=1) for part in parts if part.samples)
+        return (np.concatenate([part.inputs, part.targets[:, hidden]], axis=1) for part in parts)
 
     bounds = [(part.min(axis=0), part.max(axis=0)) for part in values(trained)]
     low = np.min([one for one, _ in bounds], axis=0)
@@ -69,19 +71,17 @@ def _outside(
 
 
 def _changes(
-    parts: Iterable[Series], horizon: int, bound: NDArray[np.floating] | None = None
+    parts: Sequence[Series], horizon: int, bound: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Root-mean-square change of each target, and the largest; with a bound the share that is larger than it."""
-    squares: NDArray[np.floating] | float = 0.0
-    largest: NDArray[np.floating] | float = 0.0
-    above: NDArray[np.floating] | float = 0.0
-    count = 0
+    squares = np.zeros(parts[0].targets.shape[1])
+    largest, above, count = np.zeros_like(squares), np.zeros_like(squares), 0
     for part in parts:
         change = np.abs(part.targets[horizon:].astype(np.float64) - part.targets[:-horizon])
         if len(change):
-            squares = squares + np.square(change).sum(axis=0)
+            squares += np.square(change).sum(axis=0)
             largest = np.maximum(largest, change.max(axis=0))
-            above = above + (0.0 if bound is None else (change > bound).sum(axis=0))
+            above += 0.0 if bound is None else (change > bound).sum(axis=0)
             count += len(change)
-    size = np.sqrt(np.asarray(squares) / max(count, 1))
-    return size, np.asarray(largest if bound is None else above / max(count, 1))
+    size = np.sqrt(squares / max(count, 1))
+    return size, largest if bound is None else above / max(count, 1)
