@@ -133,7 +133,7 @@ def loops(
     folder, rows = models.folder, {}
     named = list(variants(folder).items())[: 5 if own else 6]
     # The last ones: the other machine is always among them.
-    for name, variant in [AS_IT_WAS, *named[1 - size.variants :]]:
+    for name, variant in [AS_IT_WAS, *named[1:][1 - size.variants :]]:
         machine = OTHER if variant.other else MACHINE
         twin = models.other_twin(models.size.other[0]) if variant.other else own or models.twin()
         experiment = ControlExperiment(task=TASKS["grade"](), controller=nmpc, machine=machine, loops=1)
