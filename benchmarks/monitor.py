@@ -200,17 +200,17 @@ def pool(plan: Plan) -> tuple[SessionBlocks, ...]:
 
 def promise(plan: Plan, seed: int) -> dict[str, Any]:
     """Fits of all behind the residuals to other healthy sessions each, and what they raise on others."""
-    pool(plan)
     fits = 2 if plan.quick else plan.fits
+    if fits:
+        pool(plan)
     jobs = [_FitJob(plan, seed, number, f"fit {number}") for number in range(fits)]
     rows = []
     for row in ordered(_one_fit, jobs, plan.workers):
         rows.append(row)
         print(f"promise {len(rows)}: {row}", flush=True)
     within = sum(row["low_hours"] <= row["measured_hours"] <= row["high_hours"] for row in rows)
-    hours = plan.hours / 4 if plan.quick else plan.hours
-    as_promised = sum(row["measured_hours"] >= hours for row in rows)
-    return {"fits": rows, "within": within, "of": fits, "as_promised": as_promised, "promised_hours": hours}
+    as_promised = sum(row["measured_hours"] >= plan.fit_hours for row in rows)
+    return {"fits": rows, "within": within, "of": fits, "as_promised": as_promised, "promised_hours": plan.fit_hours}
 
 
 def _one_fit(job: _FitJob) -> dict[str, Any]:
@@ -218,9 +218,8 @@ def _one_fit(job: _FitJob) -> dict[str, Any]:
     order = np.random.default_rng([job.seed, job.number]).permutation(len(parts))
     count = min(FIT_SESSIONS, len(parts) // 2)
     chosen, others = ([parts[i] for i in some] for some in (order[:count], order[count:][:MEASURED_SESSIONS]))
-    hours = plan.hours / 4 if plan.quick else plan.hours
     spec, old = load_monitor_experiment(None, plan.settings, {}).chain, monitor.chain
-    result = fit_from_blocks(spec, old.summaries, chosen, monitor.rate_hz, old.settle, hours)
+    result = fit_from_blocks(spec, old.summaries, chosen, monitor.rate_hz, old.settle, plan.fit_hours)
     own = MonitorOfBlocks.of(monitor, result.chain)
     count = sum(len(own.run(part)) for part in others)  # type: ignore[arg-type]
     measured = sum(len(part.summaries) for part in others) * monitor.block_s / 3600.0

@@ -63,6 +63,11 @@ class Plan:
     networks: Path | None = None
     fits: int = 20
 
+    @property
+    def fit_hours(self) -> float:
+        """Hours to a false alarm that fits of the promise are asked for; they have few sessions in the short form."""
+        return self.hours / 4 if self.quick else self.hours
+
 
 @dataclass(frozen=True)
 class _Job:

@@ -25,6 +25,8 @@ BEYOND = 1.3
 FURTHER = (2.0, 4.0, 8.0)
 """Sizes beyond the ladder that are tried, over its largest: signatures go on as they changed towards it, and what is at
 its clip stays there."""
+MOST_STRANGE = 0.5
+"""Probability of none of the ladders' faults, above which sizes beyond them are tried."""
 MOST_SHARE = 100.0
 """Of what is measured in shares: there is no more to lose."""
 LEAST_SIZE = 0.5
@@ -73,7 +75,13 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
 
 def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
     """`match` from the directions at the onset and after it on; None where there are no rows of a part."""
-    tried = _all_candidates(dictionary)
+    matched = _matched(dictionary, seen, further=False)
+    # Carried on, signatures are coarse: they are asked only where no size of the ladders explains the evidence.
+    return matched if matched.none <= MOST_STRANGE else _matched(dictionary, seen, further=True)
+
+
+def _matched(dictionary: Dictionary, seen: Sequence[Seen | None], further: bool) -> Match:
+    tried = _all_candidates(dictionary, further)
     return judged(tried, *likelihoods(tried, seen, dictionary.changing), dictionary)
 
 
@@ -95,9 +103,9 @@ class Candidates:
 
 
 @lru_cache(maxsize=2)
-def _all_candidates(dictionary: Dictionary) -> Candidates:
+def _all_candidates(dictionary: Dictionary, further: bool) -> Candidates:
     """Those of a monitor that is at work: every alarm compares with the same ones."""
-    return candidates(dictionary)
+    return candidates(dictionary, further)
 
 
 def candidates(dictionary: Dictionary, further: bool = True) -> Candidates:
