@@ -142,6 +142,12 @@ class GreyProblem:
         truth = np.ascontiguousarray(values[:, 1:])
         return GreyRound(self.twin.demands(np.stack(commands)), measured, truth, counts)
 
+    @property
+    def final_memory(self) -> float:
+        """What final rounds remember; no more ticks than there are: those that are drawn twice say nothing new."""
+        fit = self.twin.spec.fit
+        return min(fit.final_memory, max(0.0, 1.0 - fit.final_ticks / self.ticks))
+
     def numbers(self, theta: Doubles) -> Doubles:
         """Numbers by coordinates in plausible deviations."""
         if self.tie is not None:
@@ -217,7 +223,7 @@ def fit_grey_box(
     """Fit the numbers of a grey box to free runs; free runs of the validation part choose among the rounds.
 
     Where the settings leave the stretches of opening curves open, the fewest are fitted first. Then each one is halved,
-    which changes no curve, and the final rounds are run once more: as often as the validation part gains by it.
+    which changes no curve, and final rounds follow: as often as the validation part gains by it.
 
     Args:
         twin: with the numbers to start from.
@@ -231,37 +237,56 @@ def fit_grey_box(
         DataError: stretches that are too short.
     """
     fit, parts = twin.spec.fit, (train, validation)
-    choose = tie is None and not twin.spec.stretches
     progress = _Progress(sum(fit.rounds) + (fit.starts - 1) * fit.rounds[0] + fit.final_rounds, on_event)
-    begun = twin.with_stretches(STRETCHES[0]) if choose else twin
-    best = _fitted(GreyProblem(begun, train, tie), parts, seed, progress)
-    for stretches in STRETCHES[1:] if choose and fit.final_rounds else ():
+    if tie is not None or twin.spec.stretches or not fit.final_rounds:
+        return _fitted(GreyProblem(twin, train, tie), parts, seed, progress)
+    coarse = GreyProblem(twin.with_stretches(STRETCHES[0]), train)
+    stages = _fitted(coarse, parts, seed, progress, final=False)
+    # Final rounds of a coarser form remember too well what it made of the logs: a finer one begins before them.
+    begin, share, best = stages, 1.0 - fit.memory, stages
+    for stretches in STRETCHES:
+        tried = _continued(begin, stretches, (share, parts, seed), progress)
         progress.total += fit.final_rounds
-        begun = best.twin.with_stretches(stretches)
-        by_finer = coarse_by_fine(best.twin.table, begun.table)
-        problem = GreyProblem(begun, train, carried=by_finer.T @ best.information @ by_finer)
-        tried = _fitted(problem, parts, seed + stretches, progress)
         history, better = best.history + tried.history, tried.error < (1.0 - LEAST_GAIN) * best.error
         best = replace(tried if better else best, history=history, seconds=progress.seconds)
+        if stretches == STRETCHES[0]:
+            continue
         if not better:
             break
+        begin, share = best, 1.0 - coarse.final_memory
     return best
 
 
+def _continued(before: GreyFit, stretches: int, how: tuple[float, Any, int], progress: _Progress) -> GreyFit:
+    """Final rounds with as many stretches or more; `how`: share of what was known that counts, parts and seed.
+
+    Rounds that remember one another know several times what one does; the share makes it one round's.
+    """
+    share, parts, seed = how
+    begun = before.twin.with_stretches(stretches)
+    by_finer = coarse_by_fine(before.twin.table, begun.table)
+    problem = GreyProblem(begun, parts[0], carried=share * by_finer.T @ before.information @ by_finer)
+    return _fitted(problem, parts, seed + stretches, progress)
+
+
 def _fitted(
-    problem: GreyProblem, parts: tuple[Sequence[Series], Sequence[Series]], seed: int, progress: _Progress
+    problem: GreyProblem,
+    parts: tuple[Sequence[Series], Sequence[Series]],
+    seed: int,
+    progress: _Progress,
+    final: bool = True,
 ) -> GreyFit:
-    """The numbers of one form; `parts` train and choose."""
+    """The numbers of one form; `parts` train and choose; `final`: whether final rounds follow the stages."""
     twin, spec, (_, validation) = problem.twin, problem.twin.spec.fit, parts
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
     rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
     history: list[dict[str, Any]] = []
 
-    def advance(path: _Path, lengths: Sequence[float], final: bool = False) -> None:
+    def advance(path: _Path, lengths: Sequence[float], last: bool = False) -> None:
         for number, length_s in enumerate(lengths, 1):
             progress.done += 1
             before = path.theta
-            path.step(length_s, final)
+            path.step(length_s, last)
             # The last round of a stage is judged, whatever its number.
             if number != len(lengths) and number % spec.validate_every and length_s == lengths[number]:
                 continue
@@ -281,7 +306,7 @@ def _fitted(
         # Which valley a start lies in shows after short runs; long ones of every start would cost as much again.
         chosen = min(paths, key=lambda path: path.least)
         advance(chosen, rounds[spec.rounds[0] :])
-    advance(chosen, rounds[-1:] * spec.final_rounds, True)
+    advance(chosen, rounds[-1:] * (spec.final_rounds if final else 0), True)
     end = twin.with_numbers(problem.numbers(chosen.best))
     return GreyFit(end, history, progress.seconds, chosen.information, chosen.best, chosen.least)
 
@@ -316,10 +341,7 @@ class _Path:
         self.theta, self.damping, self.matrix = _improve(
             self.problem, self.theta, drawn, self.damping, steps, self.memory
         )
-        memory = spec.memory
-        if final:
-            # Stretches that are drawn twice say nothing new: no more ticks count than there are.
-            memory = min(spec.final_memory, max(0.0, 1.0 - lanes * ticks / self.problem.ticks))
+        memory = self.problem.final_memory if final else spec.memory
         # The first stage begins far away, where a linear model says little about the end.
         far = length_s == spec.lengths_s[0] and not final
         self.memory = self.memory if far else memory * (self.memory + self.matrix)
