@@ -22,9 +22,11 @@ from edp.networks.radial import RadialFeatures
 from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.signals import Channel, Kind
+from edp.testing.streaming import check_graph
 from edp.training.bagging.boosting import TreeLearner
 from edp.training.bagging.fit import fit_bagged
 from edp.training.bagging.spec import BaggingSpec
+from edp.training.bagging.stacking import stacking_weights
 from edp.training.fit import fit
 from edp.training.spec import TrainingSpec, check_fitted_parts
 
@@ -125,6 +127,7 @@ def test_the_network_computes_the_weighted_sum_of_its_learners():
     weights = net.heads.weights[0].detach().double().numpy()[0, :, 0]
     near = []
     for functions, read in ((backbone.radial, range(10)), (backbone.near[0], [0, 1, 4, 5])):  # lags 1, 2, 4, 8 of two
+        # Limits are those of these very rows: none of them is held back.
         situation = columns[:, list(read)] * functions.gain
         distance = torch.cdist(situation, functions.weight[:, :-1].detach())
         near.append(torch.sigmoid(-(distance**2) / 2).double().numpy())
@@ -163,6 +166,19 @@ def test_basis_functions_on_few_columns_read_no_others():
     own[..., 4] += 1.0
     assert torch.equal(functions(other, ())[0], functions(x, ())[0])
     assert not torch.equal(functions(own, ())[0], functions(x, ())[0])
+
+
+def test_few_columns_count_no_further_than_they_were_recorded():
+    """Beyond the recorded range nothing changes, in the network and in its list of layers."""
+    outcome = fit_bagged(data_of(recording(600)), committee(activations=(), centres=30, near=(0, 2)), spec())
+    net, columns = outcome.fitted.predictor, torch.from_numpy(outcome.table.columns)
+    functions = net.backbone.near[0]
+    far = columns.clone()
+    far[:, 0] = columns[:, 0].max() + torch.linspace(0, 100, len(columns))
+    at_limit = far.clone()
+    at_limit[:, 0] = columns[:, 0].max()
+    assert torch.equal(functions(far, ())[0], functions(at_limit, ())[0])
+    check_graph(net.double())
 
 
 @pytest.mark.parametrize("near", [(3,), (2, 1), (0, 0), (-1,)])
@@ -245,6 +261,20 @@ def test_a_learner_of_noise_gets_no_share():
     error = np.sqrt(np.square(outcome.left_out - outcome.table.targets).mean(axis=0))
     linear = np.sqrt(np.square(outcome.linear - outcome.table.targets).mean(axis=0))
     np.testing.assert_allclose(error, linear, rtol=0.01)
+
+
+def test_further_learners_must_earn_their_place():
+    """One that lowers the error by chance gets nothing, one that knows more does."""
+    rng = np.random.default_rng(8)
+    truth, noise = rng.normal(size=(500, 1)), rng.normal(size=(4, 500, 1))
+    owner = np.arange(500) * 5 // 500
+    usual = [truth + noise[0], truth + 2 * noise[1]]
+    alone = stacking_weights(usual, truth, owner, [False, False])
+    by_chance = stacking_weights([*usual, noise[2]], truth, owner, [False, False, True])
+    np.testing.assert_array_equal(by_chance, [*alone, [0.0]])
+    better = stacking_weights([*usual, truth + noise[3]], truth, owner, [False, False, True])
+    assert better[2, 0] > 0.1
+    assert stacking_weights([], truth, owner, []).shape == (0, 1)
 
 
 def test_members_of_two_losses_are_a_multiple_of_twice_the_folds():

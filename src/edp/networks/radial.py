@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from edp.errors import ConfigError
 from edp.ir import Builder
-from edp.ir.layers import Activate, BinaryOperation, Dense, Function, ScaleShift
+from edp.ir.layers import Activate, BinaryOperation, Clip, Dense, Function, ScaleShift
 from edp.networks.streaming import Cost, Operation, State, Streaming
 from edp.settings.bounds import shown
 
@@ -42,16 +42,22 @@ class RadialFeatures(Streaming):
     Args:
         width: columns of its input.
         centres: how many.
-        columns: those that it reads, in their order; None for all of them.
+        columns: those that it reads, in their order, each no further than within its limits; None for all of them, as
+            they are.
 
     Attributes:
         columns: that it reads.
         gain: what each of these is multiplied by, one over the product of length and spread, ``(column,)``.
         weight: ``(centre, column + 1)``; at first all centres are at the origin.
         bias: ``(centre,)``.
+        low: limits of the columns, ``(column,)``, where some are chosen; at first all numbers of single precision.
+            Few columns allow long basis functions with large weights, which run away where no row was.
+        high: likewise.
     """
 
     gain: Tensor
+    low: Tensor
+    high: Tensor
     minus_half: Tensor
     operations = frozenset({Operation.LINEAR, Operation.SIGMOID})
     matrices = (("weight", (0,)),)
@@ -60,9 +66,14 @@ class RadialFeatures(Streaming):
         super().__init__()
         self.width, self.count = width, centres
         self.columns = tuple(range(width)) if columns is None else tuple(columns)
+        self.clipped = columns is not None
         read = len(self.columns)
         self.register_buffer("gain", torch.ones(read))
         self.register_buffer("minus_half", torch.full((1, read), -0.5), persistent=False)
+        if self.clipped:
+            most = torch.full((read,), torch.finfo(torch.float32).max)
+            self.register_buffer("low", -most)
+            self.register_buffer("high", most)
         self.weight = nn.Parameter(torch.zeros(centres, read + 1))
         self.bias = nn.Parameter(torch.zeros(centres))
         self.set_centres(torch.zeros(centres, read))
@@ -73,17 +84,27 @@ class RadialFeatures(Streaming):
             self.weight.copy_(torch.cat([centres, torch.ones_like(centres[:, :1])], dim=1))
             self.bias.copy_(-0.5 * centres.square().sum(dim=1))
 
+    def set_limits(self, low: Tensor, high: Tensor) -> None:
+        """Hold each chosen column within the range that was recorded, ``(column,)`` each."""
+        with torch.no_grad():
+            self.low.copy_(low)
+            self.high.copy_(high)
+
     def initial_state(self, batch: int, like: Tensor) -> State:
         return ()
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        # Indexing copies; all columns in order need no copy.
-        z = (x if len(self.columns) == self.width else x[..., self.columns]) * self.gain
+        if self.clipped:
+            x = torch.clamp(x[..., self.columns], self.low, self.high)
+        z = x * self.gain
         norm = nn.functional.linear(z * z, self.minus_half)
         return torch.sigmoid(nn.functional.linear(torch.cat([z, norm], dim=-1), self.weight, self.bias)), state
 
     def lower(self, build: Builder, x: str) -> str:
         x = build.pick("read", x, self.columns)
+        # Limits that nothing has set hold nothing back.
+        if self.clipped and bool((self.high < torch.finfo(torch.float32).max).any()):
+            x = build.add(Clip, "within", x, low=self.low, high=self.high)
         z = build.add(ScaleShift, "situation", x, gain=self.gain, shift=torch.zeros_like(self.gain))
         square = build.combine("square", BinaryOperation.MULTIPLY, z, z)
         norm = build.add(Dense, "norm", square, weight=self.minus_half, bias=torch.zeros(1))

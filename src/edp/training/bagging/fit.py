@@ -27,6 +27,7 @@ from edp.training.bagging.learner import FoldFit, HeadPart, Learner
 from edp.training.bagging.perceptrons import PerceptronLearner, losses_of, record
 from edp.training.bagging.radial import RadialLearner
 from edp.training.bagging.spec import BaggingSpec
+from edp.training.bagging.stacking import stacking_weights
 from edp.training.bagging.table import Table, committee_of, table_of
 from edp.training.outcome import Fitted, TrainingProgress
 from edp.training.spec import TrainingSpec, check_training, thread_count
@@ -129,16 +130,12 @@ def _learners(work: FoldFit) -> list[Learner]:
 
 def _combine(work: FoldFit, learners: Sequence[Learner]) -> DoubleArray:
     """Weigh all models, write everything into the network, and give the predictions of rows that were left out."""
-    # Here, since every command that trains imports this module, and scipy.optimize takes a second.
-    from scipy.optimize import nnls
-
     models = [list(learner.left_out()) for learner in learners]
     every = [one for each in models for one in each]
     residual = work.residual
-    shares = np.zeros((len(every), residual.shape[1]))
-    for output in range(residual.shape[1] if every else 0):
-        # Non-negative: a model that only fits the noise gets nothing, and none is played off against another.
-        shares[:, output], _ = nnls(np.stack([one[:, output] for one in every], axis=1), residual[:, output])
+    few = [isinstance(learner, RadialLearner) and learner.few for learner in learners]
+    further = np.repeat(few, [len(each) for each in models]).tolist()
+    shares = stacking_weights(every, residual, work.table.folds.owner, further)
     parts, first = [], 0
     for learner, own in zip(learners, models, strict=True):
         parts.append(learner.write(shares[first : first + len(own)]))

@@ -54,9 +54,10 @@ class RadialLearner:
 
     def __init__(self, work: FoldFit, features: RadialFeatures) -> None:
         self.work, self.features = work, features
+        self.few = features.clipped
         columns = work.table.columns
         # A view where all columns are read: a copy of them would double the memory of the table.
-        self.columns = columns if len(features.columns) == features.width else columns[:, features.columns]
+        self.columns = columns[:, features.columns] if self.few else columns
         count = min(features.count, len(columns))
         chosen = np.random.default_rng(work.spec.seed).choice(len(columns), count, replace=False)
         self.centres = self.columns[np.sort(chosen)].astype(np.float64)
@@ -112,6 +113,9 @@ class RadialLearner:
         with torch.no_grad():
             self.features.gain.copy_(torch.from_numpy(1.0 / kernel.scale))
         self.features.set_centres(centres)
+        if self.few:
+            limits = (self.columns.min(axis=0), self.columns.max(axis=0))
+            self.features.set_limits(*(torch.from_numpy(limit) for limit in limits))
         return HeadPart(full, intercept * shares[0], np.zeros(len(intercept)))
 
     def _fitted(self) -> _Kernel:
