@@ -170,7 +170,11 @@
         const path = [];
         for (let k = Math.max(0, tick - PAST_S * rate); k <= tick; k += Math.max(1, Math.round(rate / 20))) {
           const then = layout.angles.map((column) => store.at(k, column));
-          if (then.every((value) => value === value)) path.push(side.pose(then).tip);
+          if (!then.every((value) => value === value)) continue;
+          const tip = side.pose(then).tip, last = path[path.length - 1];
+          // A new session begins elsewhere: no bucket flew there.
+          if (last && Math.hypot(tip[0] - last[0], tip[1] - last[1]) > 0.1 * side.reach) path.length = 0;
+          path.push(tip);
         }
         side.draw(element("front"), { angles, path, colours: dark.matches ? DARK : {} });
       }
