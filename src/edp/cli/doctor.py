@@ -34,6 +34,7 @@ _EXTRAS: Mapping[str, tuple[str, str]] = {
     "onnx": ("onnx", "edp export --to onnx"),
     "fmu": ("ziglang", "edp export --to fmu, edp parity of FMUs"),
     "casadi": ("casadi", "edp export --to casadi"),
+    "live": ("foxglove", "edp live --record"),
     "control": ("gymnasium", "edp control, edp tune, the simulator as an environment"),
     "rl": ("stable_baselines3", "controllers learned by reinforcement"),
     "cluster": ("ray", "edp search --cluster"),

@@ -59,6 +59,7 @@ def session_page(session: LiveSession) -> str:
         "rows": base64.b64encode(rows.astype("<f4").tobytes()).decode(),
         "events": [event.to_plain() for event in session.events()],
         "ended": session.ended,
+        "breaks": session.breaks,
     }
     return _rendered(session.layout.title, "'none'", content)
 

@@ -36,6 +36,8 @@ BACKLOG_S = 30.0
 """Of rows that a new viewer gets at once."""
 MOST_AHEAD_S = 600.0
 MOST_VIEWERS = 32
+MOST_BREAKS = 50
+"""New beginnings that a page is told of."""
 TOKEN_BYTES = 24
 HEADERS = {
     "Cache-Control": "no-store",
@@ -168,6 +170,7 @@ class LiveServer:
             late=0 if pace is None else pace.late,
             skipped=self.skipped,
             viewers=len(self.viewers),
+            breaks=session.breaks[-MOST_BREAKS:],
         )
 
     async def _answer(self, connection: ServerConnection, request: HttpRequest) -> Response | None:

@@ -65,6 +65,7 @@ class LiveSession:
         # A source whose end is known needs no more; pages of memory are taken as they are written.
         self._rows = np.zeros((min(capacity, layout.ticks or capacity), layout.width), np.float32)
         self._events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
+        self._breaks: deque[int] = deque(maxlen=MOST_EVENTS)
         self._counted, self._lock = 0, threading.Lock()
 
     @property
@@ -90,6 +91,17 @@ class LiveSession:
         with self._lock:
             self._events.append(LiveEvent(self._counted, self.ticks, kind, text[:MOST_TEXT], group[:MOST_TEXT]))
             self._counted += 1
+
+    def break_off(self) -> None:
+        """What follows does not continue what came: predictions from before say nothing of it."""
+        with self._lock:
+            self._breaks.append(self.ticks)
+
+    @property
+    def breaks(self) -> list[int]:
+        """Ticks at which the session began anew, as far as they are kept."""
+        with self._lock:
+            return list(self._breaks)
 
     def end(self, why: str) -> None:
         """Nothing more comes."""

@@ -139,11 +139,14 @@ def test_a_server_that_ends_and_rows_that_stop_are_said(chromium, served):
 
 def test_a_saved_session_replays_without_a_server(chromium, tmp_path: Path):
     session = session_of()
-    stream(session, 500)
+    stream(session, 450)
+    session.break_off()
+    stream(session, 50)
     session.event("alarm", HOSTILE)
     session.end("done")
     file = write_session_page(session, tmp_path / "session.html")
     page = chromium.page()
+    page.size(1280, 1400)
     page.open(file.as_uri())
     page.wait("window.edpLive && edpLive.frames > 3")
     page.wait("parseFloat(document.getElementById('clock').textContent) > 0.3")
@@ -151,4 +154,11 @@ def test_a_saved_session_replays_without_a_server(chromium, tmp_path: Path):
     page.value("document.getElementById('speed').value = '50'")
     page.wait("document.getElementById('play').textContent === 'Play'")
     page.wait("document.getElementById('clock').textContent.startsWith('5.0 s')")
+    scrub = "const s = document.getElementById('scrub')"
+    residual = "[...document.querySelectorAll('figcaption span span')].pop().textContent"
+    for tick, shown in ((449, True), (451, False), (459, False), (461, True)):
+        page.value(f"(() => {{ {scrub}; s.value = {tick}; s.dispatchEvent(new Event('input')); }})()")
+        page.wait(f"document.getElementById('clock').textContent.startsWith('{tick / 100:.1f} s')")
+        # Nothing foretold of the session before is held against the one that began anew.
+        page.wait(f"({residual} !== '–') === {str(shown).lower()}")
     harmless(page, file.as_uri())

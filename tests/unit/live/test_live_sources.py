@@ -179,6 +179,10 @@ def test_the_simulator_works_on_and_its_operator_sees_what_the_batch_simulation_
     seen = view_of_truth(info["truth"], full)
     assert all(np.shape(a) == np.shape(b) for a, b in zip(view[:7], seen[:7], strict=True))
     assert source._env.tip(full * seen.strokes)[:3] == pytest.approx([seen.tip_x, seen.tip_y, seen.attitude], abs=1e-6)
+    wanted = Needs((Channel("PumpPressure_1", Kind.PRESSURE), Channel("other", Kind.PRESSURE)), 50.0)
+    needed = SOURCES["sim"].of(SourceOptions("M22"), wanted)
+    assert needed.rate_hz == 50.0
+    assert "PumpPressure_1" in [channel.name for channel in needed.channels]
     with pytest.raises(ConfigError, match="unknown excitation"):
         SimSource("M22", 100.0, settings={"excitation": "nobody"})
     ground = next(name for name, kind in EXCITATIONS.items() if kind.works_ground)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.logs.formats.base import RawLog, RawSignal
@@ -118,7 +119,8 @@ def read_json_mcap(path: Path) -> RawLog:
 
 
 def _signals(topic: _Topic, facts: EdpMetadata, origin: int) -> Iterator[tuple[str, RawSignal]]:
-    seconds = np.asarray((np.asarray(topic.at_ns, dtype=np.int64) - origin) * 1e-9, dtype=np.float64)
+    at_ns: NDArray[np.int64] = np.asarray(topic.at_ns, dtype=np.int64) - origin
+    seconds = (at_ns * 1e-9).astype(np.float64)
     for name, values in topic.columns.items():
         channel = facts.channels.get(name)
         signal = RawSignal(

@@ -9,6 +9,7 @@
   let layout = null, store = null, charts = null, side = null, steered = false, socket = null, ended = "", asked = -1;
   let following = true, position = 0, playing = true, dirty = false, drawn = 0, stamp = 0, arrived = 0, retry = 500, closed = false;
   let state = { paused: false, skipped: 0, late: 0, oldest: 0, viewers: 1 };
+  let breaks = session.breaks || [];
   const chosen = new Set(), groups = new Map();
 
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
@@ -28,8 +29,15 @@
     steel: "#d9ae45", cylinders: ["#8ab4f8", "#e0a458", "#74c7a5"],
   };
 
+  /* Whether the session began anew after a tick and up to another: what was foretold before says nothing of it. */
+  function parted(from, to) {
+    for (let k = breaks.length - 1; k >= 0 && breaks[k] > from; k--) if (breaks[k] <= to) return true;
+    return false;
+  }
   /* What a forecast said of a tick: it was made `ticks` before. */
-  const foretold = (forecast, column) => (tick) => store.at(tick - forecast.ticks, column) * forecast.factor;
+  const foretold = (forecast, column) => (tick) => (
+    parted(tick - forecast.ticks, tick) ? NaN : store.at(tick - forecast.ticks, column) * forecast.factor
+  );
   const measured = (column, factor, offset = 0) => (tick) => store.at(tick, column) * factor + offset;
 
   function forecastPlots(horizon) {
@@ -170,7 +178,11 @@
         const path = [];
         for (let k = Math.max(0, tick - PAST_S * rate); k <= tick; k += Math.max(1, Math.round(rate / 20))) {
           const then = layout.angles.map((column) => store.at(k, column));
-          if (then.every((value) => value === value)) path.push(side.pose(then).tip);
+          if (!then.every((value) => value === value)) continue;
+          const tip = side.pose(then).tip, last = path[path.length - 1];
+          // A new session begins elsewhere: no bucket flew there.
+          if (last && Math.hypot(tip[0] - last[0], tip[1] - last[1]) > 0.1 * side.reach) path.length = 0;
+          path.push(tip);
         }
         side.draw(element("front"), { angles, path, colours: dark.matches ? DARK : {} });
       }
@@ -233,7 +245,7 @@
     if (message.type === "event") addEvent(message.event);
     if (message.type === "dropped") stats.dropped = message.ticks;
     if (message.type === "state") {
-      state = message; ended = message.ended; stats.state = message;
+      state = message; ended = message.ended; breaks = message.breaks; stats.state = message;
       if (message.speed && document.activeElement !== element("speed")) element("speed").value = String(message.speed);
     }
     if (message.type === "closed") { closed = true; }

@@ -156,6 +156,7 @@ class LiveRun:
         """What follows does not continue what came."""
         for part in self._parts:
             part.reset()
+        self.session.break_off()
 
     def note(self, kind: str, text: str, group: str = "") -> None:
         """An event."""

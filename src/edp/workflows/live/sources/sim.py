@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from edp.control.loop import LEVERS
 from edp.errors import ConfigError
+from edp.signals import EXTRA_CHANNELS
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.view import View
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Sink, SourceOptions
@@ -28,14 +29,23 @@ class SimSource(LiveSource):
         rate_hz: ticks per second.
         seed: of the first episode.
         settings: ``excitation``, ``faults`` (texts, see `edp.sim.faults`) and ``material``, where they are given.
+        further: names of channels that are shown besides, where the simulator knows them.
 
     Raises:
         EdpError: gymnasium is not installed, or there is no such machine or excitation.
     """
 
-    def __init__(self, machine: str, rate_hz: float, seed: int = 0, settings: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        machine: str,
+        rate_hz: float,
+        seed: int = 0,
+        settings: Mapping[str, Any] | None = None,
+        further: Sequence[str] = (),
+    ) -> None:
         # Gymnasium is an extra, and this brings the compiler of the simulator.
         from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
+        from edp.sim.environment.spec import OBSERVED
 
         chosen = dict(settings or {})
         name = chosen.get("excitation") or USUAL_EXCITATION
@@ -51,6 +61,7 @@ class SimSource(LiveSource):
                 hand=self._kind.by_hand,
                 material=material,
                 faults=tuple(chosen.get("faults") or ()),
+                observed=(*OBSERVED, *(name for name in further if name in EXTRA_CHANNELS and name not in OBSERVED)),
             )
         )
         self.channels, self.rate_hz, self.machine = (*self._env.channels, *LEVERS), rate_hz, machine
@@ -59,7 +70,9 @@ class SimSource(LiveSource):
     @classmethod
     def of(cls, options: SourceOptions, needs: Needs) -> SimSource:
         """`SourceOptions.value` is the machine."""
-        return cls(options.value, options.rate_hz or needs.rate_hz or USUAL_RATE_HZ, options.seed, options.settings)
+        rate_hz = options.rate_hz or needs.rate_hz or USUAL_RATE_HZ
+        names = [channel.name for channel in needs.channels]
+        return cls(options.value, rate_hz, options.seed, options.settings, names)
 
     def run(self, sink: Sink) -> None:
         """See `LiveSource`."""
