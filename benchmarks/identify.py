@@ -35,6 +35,7 @@ GOALS = ("valve curves", "dead bands", "leakage", "friction")
 JOINTS = ("boom", "arm", "bucket")
 QUICK = (
     *("twin.fit.lengths_s=[0.1, 0.3]", "twin.fit.rounds=[3, 2]", "twin.fit.starts=1", "twin.fit.ticks=1500"),
+    *("twin.fit.final_rounds=1", "twin.fit.final_ticks=1500"),
     *("twin.fit.validation_runs=8", "judge.seconds=10", "judge.starts=2", "judge.at_s=[1, 10]"),
 )
 

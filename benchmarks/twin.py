@@ -61,7 +61,7 @@ WRONG = {
 SOIL = Path(__file__).parents[1] / "examples" / "scenarios" / "c14_soil.toml"
 SOIL_MINUTES = 20.0
 """Of the logs of a machine in soil that train and choose; the rest tests."""
-QUICK_FIT = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(1, 1), ticks=1000, starts=1)
+QUICK_FIT = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(1, 1), final_rounds=1, ticks=1000, starts=1)
 VALIDATION_S = 10.0
 """Length of the free runs by which one of them is chosen: that of the validation in a training."""
 

@@ -96,8 +96,8 @@ def turning_bench():
 
 
 def front_bench():
-    """A front whose load is bodies of a known linkage."""
-    spec = GreyBox(linkage="m22")
+    """A front whose load is bodies of a known linkage, with opening curves of ten stretches."""
+    spec = GreyBox(linkage="m22", stretches=10)
     return plant_bundle(TwinBundle(spec, sample_twin(spec, sample_front())[0]))
 
 

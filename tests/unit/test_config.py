@@ -13,6 +13,7 @@ from edp.config.experiment import (
     merged,
     plain_tree,
 )
+from edp.config.twin import load_twin_experiment
 from edp.data.features import FG2
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError
@@ -105,6 +106,23 @@ def test_another_kind_replaces_the_table_whole():
     base = {"backbone": {"kind": "hybrid", "channels": [64]}, "kept": 1}
     assert merged(base, {"backbone": {"kind": "lstm"}}) == {"backbone": {"kind": "lstm"}, "kept": 1}
     assert merged(base, {"backbone": {"units": 3}})["backbone"] == {"kind": "hybrid", "channels": [64], "units": 3}
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
+def test_a_kind_and_its_options_may_be_given_in_any_order(tmp_path, order):
+    changes = ["model.backbone.units=8", "model.backbone.kind=gru", "model.backbone.layers=2"]
+    path = saved(tmp_path, '[model]\nbackbone = { kind = "lstm", dropout = 0.5 }\n')
+    backbone = load_experiment(path, "quick", [changes[i] for i in order]).model.backbone
+    assert (type(backbone).__name__, backbone.units, backbone.layers, backbone.dropout) == ("GruSpec", 8, 2, 0.0)
+
+
+def test_options_of_a_file_that_names_no_kind_are_those_of_the_kind_on_the_command_line(tmp_path):
+    path = saved(tmp_path, "[twin]\nunits = 48\n")
+    for changes in (["twin.members=2", "twin.kind=recurrent"], ["twin.kind=recurrent", "twin.members=2"]):
+        twin = load_twin_experiment(path, changes).twin
+        assert (twin.units, twin.members) == (48, 2)
+    with pytest.raises(ConfigError, match="units"):
+        load_twin_experiment(path, ["twin.kind=static"])
 
 
 def test_all_problems_are_reported_at_once(tmp_path):

@@ -13,7 +13,7 @@ from edp.control.controllers.pi import ProportionalIntegral
 from edp.control.tasks import TASKS, TaskSpec
 from edp.control.tasks.grade import Grade
 from edp.settings.bounds import MOST_SEED, above, check_bounds, integer
-from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+from edp.settings.tree import SettingsTree, Table, combined, merged, override, read_toml
 
 CONTROL_SETTINGS = SettingsTree(
     {"task": TASKS, "controller": CONTROLLERS}, {"task": "grade", "controller": "pi"}, what="settings"
@@ -67,8 +67,7 @@ def load_control_experiment(
     """
     table: Table = {} if path is None else read_toml(path)
     table = merged(table, options or {})
-    for text in overrides:
-        table = merged(table, override(text))
+    table = merged(table, combined([override(text) for text in overrides]))
     where = "of closed loops" if path is None else f"'{path}'"
     return CONTROL_SETTINGS.build(ControlExperiment, table, where + (" with --set" if overrides else ""))
 

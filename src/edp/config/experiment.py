@@ -21,7 +21,7 @@ from edp.networks.losses import LOSSES, TERMS
 from edp.networks.physics import PhysicsSpec
 from edp.networks.plain import NETWORK_PARTS, USUAL_KINDS
 from edp.networks.predictor import ModelSpec
-from edp.settings.tree import Change, SettingsTree, Table, merged, override, parse_toml, read_toml
+from edp.settings.tree import Change, SettingsTree, Table, combined, merged, override, parse_toml, read_toml
 from edp.training.averages import AVERAGES
 from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
@@ -179,14 +179,15 @@ def load_experiment(
 
 
 def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()) -> list[Table]:
-    """The table of a settings file and those of overrides, in the order in which they are laid over settings.
+    """The table of a settings file and that of all overrides, in the order in which they are laid over settings.
 
     Raises:
         ConfigError: a file or an override that cannot be read.
     """
     # Files named in settings lie beside the settings file, files named on the command line in the working directory.
     first = [] if path is None else [with_set_file(read_toml(path), Path(path).parent)]
-    return first + [with_set_file(override(change), Path()) for change in overrides]
+    every = combined([with_set_file(override(change), Path()) for change in overrides])
+    return first + ([every] if every else [])
 
 
 def preset_table(name: str) -> Table:

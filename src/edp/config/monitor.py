@@ -16,7 +16,7 @@ from edp.monitor.residuals.balances import BalancesSpec
 from edp.monitor.residuals.look_ahead import LookAheadSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
-from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+from edp.settings.tree import SettingsTree, Table, combined, merged, override, read_toml
 
 MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS}, what="settings")
 
@@ -126,8 +126,7 @@ def load_monitor_experiment(
     """
     table: Table = {} if path is None else read_toml(path)
     table = merged(table, options or {})
-    for text in overrides:
-        table = merged(table, override(text))
+    table = merged(table, combined([override(text) for text in overrides]))
     where = "of a monitor" if path is None else f"'{path}'"
     return MONITOR_SETTINGS.build(MonitorExperiment, table, where + (" with --set" if overrides else ""))
 

@@ -15,7 +15,7 @@ from edp.errors import ConfigError
 from edp.evaluation.free_run import FreeRunJudgeSpec
 from edp.networks.twin import TWINS, TwinSpec
 from edp.networks.twin.kinds import KINDS, AutoTwin
-from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+from edp.settings.tree import SettingsTree, Table, combined, merged, override, read_toml
 from edp.training.free_run import FreeRunSpec
 from edp.training.optimizers import OPTIMIZERS
 
@@ -58,8 +58,7 @@ def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str
         ConfigError: names every unknown key, wrong type and impossible value at once.
     """
     table: Table = {} if path is None else read_toml(path)
-    for text in overrides:
-        table = merged(table, override(text))
+    table = merged(table, combined([override(text) for text in overrides]))
     where = "of a twin" if path is None else f"'{path}'"
     return TWIN_SETTINGS.build(TwinExperiment, table, where + (" with --set" if overrides else ""))
 

@@ -7,7 +7,7 @@ registries by the names of these fields; `build` and `plain_tree` are those of a
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -65,12 +65,17 @@ def parse_toml(text: str, where: str) -> Table:
 
 
 def merged(base: Table, change: Mapping[str, Any]) -> Table:
-    """`base` with `change` laid over it; a table of another kind replaces the old one whole."""
+    """`base` with `change` laid over it; a table of another kind replaces the old one whole.
+
+    A table that names no kind has options of whichever kind is named later.
+    """
     result = dict(base)
     for key, value in change.items():
         old = result.get(key)
         same = (
-            isinstance(old, dict) and isinstance(value, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and ("kind" not in old or value.get("kind", old["kind"]) == old["kind"])
         )
         result[key] = merged(old, value) if same and isinstance(old, dict) else value
     return result
@@ -94,6 +99,17 @@ def override(change: Change) -> Table:
     except ConfigError:
         # Words need no quotes on a command line, where a shell would take them away.
         return parse_toml(f'{key.strip()} = "{value.strip()}"', where)
+
+
+def combined(changes: Sequence[Table]) -> Table:
+    """All changes as one, before they are laid over settings: a kind and its options may be given in any order.
+
+    Laid one by one, a kind that came last would take the options with it that came before.
+    """
+    table: Table = {}
+    for change in changes:
+        table = merged(table, change)
+    return table
 
 
 class SettingsTree:

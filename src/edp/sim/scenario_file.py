@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from edp.errors import ConfigError
-from edp.settings.tree import SettingsTree, Table, merged, override
+from edp.settings.tree import SettingsTree, Table, combined, merged, override
 from edp.sim.plan import DataSetSpec
 from edp.sim.predictability import LimitSpec
 from edp.storage import read_toml
@@ -86,10 +86,7 @@ def _table(path: str | Path) -> Table:
 
 
 def _merged(overrides: Sequence[str]) -> Table:
-    table: Table = {}
-    for text in overrides:
-        table = merged(table, override(text))
-    return table
+    return combined([override(text) for text in overrides])
 
 
 def _stated(settings: Any, table: Table) -> tuple[dict[str, Any], dict[str, str]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.errors import DataError
+from edp.networks.twin.grey.numbers import coarse_by_fine
+from edp.networks.twin.grey.plausible import STRETCHES
 from edp.networks.twin.greybox import GreyTwin, RunTarget
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FreeRunProgress, FreeRunValidation
@@ -29,6 +31,8 @@ FARTHEST = 1.5
 """Plausible deviations that one step may move a number: beyond it a linear model says nothing."""
 APART = 0.3
 """Spread of the further starts in plausible deviations: far enough for another valley, near enough to be simulated."""
+LEAST_GAIN = 0.01
+"""Share of the validation error by which finer curves must be better."""
 TRIES = 4
 """Steps, each damped more, after which a round gives up and draws other stretches."""
 
@@ -54,6 +58,7 @@ class GreyFit:
         information: of the coordinates in which it was fitted: inverse covariance by the data that the last rounds
             saw, without what was thought plausible before ``(number, number)``.
         theta: where the fit ended in these coordinates, each in plausible deviations.
+        error: of the free runs of the validation part, see `FreeRunValidation.error`.
     """
 
     twin: GreyTwin
@@ -61,6 +66,7 @@ class GreyFit:
     seconds: float
     information: Doubles
     theta: Doubles
+    error: float
 
 
 class Tie(Protocol):
@@ -89,11 +95,14 @@ class GreyProblem:
 
     Args:
         twin: the grey box.
-        train: training stretches.
+        train: training stretches, of `ticks` together.
         tie: other coordinates than one of each number.
+        carried: information of the coordinates from a fit before, whose end is the start: only final rounds are left.
     """
 
-    def __init__(self, twin: GreyTwin, train: Sequence[Series], tie: Tie | None = None) -> None:
+    def __init__(
+        self, twin: GreyTwin, train: Sequence[Series], tie: Tie | None = None, carried: Doubles | None = None
+    ) -> None:
         stroke_weight, delta = twin.spec.fit.stroke_weight, twin.spec.fit.delta
         self.twin, self.tie, self.delta = twin, tie, delta / FINEST
         # Coordinates begin at the start of the twin, which knows more than the nominal numbers.
@@ -103,8 +112,10 @@ class GreyProblem:
         each = np.repeat([1.0, stroke_weight, 1.0], counts)
         self.weight = each * twin.units / twin.scales.answer_width.astype(np.float64) / FINEST
         self.series = [part for part in train if part.samples > twin.prefix_ticks + 2]
+        self.ticks = max(1, sum(part.samples for part in self.series))
         self.plausible = np.where(twin.table.positive, twin.table.width, 1.0)
         self.first = np.zeros(len(self.begin)) if tie is None else tie.begin
+        self.carried = carried
 
     def draw(self, ticks: int, lanes: int, rng: np.random.Generator) -> GreyRound:
         """Stretches with starts everywhere."""
@@ -130,6 +141,12 @@ class GreyProblem:
         counts = (prefix, prefix if self.twin.wiring.whole else 0, max(1, ticks // 10))
         truth = np.ascontiguousarray(values[:, 1:])
         return GreyRound(self.twin.demands(np.stack(commands)), measured, truth, counts)
+
+    @property
+    def final_memory(self) -> float:
+        """What final rounds remember; no more ticks than there are: those that are drawn twice say nothing new."""
+        fit = self.twin.spec.fit
+        return min(fit.final_memory, max(0.0, 1.0 - fit.final_ticks / self.ticks))
 
     def numbers(self, theta: Doubles) -> Doubles:
         """Numbers by coordinates in plausible deviations."""
@@ -173,6 +190,27 @@ def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple
     return matrix, gradient
 
 
+@dataclass(eq=False)
+class _Progress:
+    """Of all rounds of a fit: told after each one."""
+
+    total: int
+    on_event: Callable[[FreeRunProgress], None] | None
+    began: float = field(default_factory=time.process_time)
+    done: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Processor time so far."""
+        return time.process_time() - self.began
+
+    def tell(self, length_s: float, error: float, better: bool) -> None:
+        """A validation of the last round."""
+        if self.on_event is not None:
+            left = self.seconds * (self.total - self.done) / self.done
+            self.on_event(FreeRunProgress(self.done, self.total, length_s, left, error, better))
+
+
 @one_blas_thread()
 def fit_grey_box(
     twin: GreyTwin,
@@ -183,6 +221,9 @@ def fit_grey_box(
     tie: Tie | None = None,
 ) -> GreyFit:
     """Fit the numbers of a grey box to free runs; free runs of the validation part choose among the rounds.
+
+    Where the settings leave the stretches of opening curves open, the fewest are fitted first. Then each one is halved,
+    which changes no curve, and final rounds follow: as often as the validation part gains by it.
 
     Args:
         twin: with the numbers to start from.
@@ -195,41 +236,79 @@ def fit_grey_box(
     Raises:
         DataError: stretches that are too short.
     """
-    spec, began = twin.spec.fit, time.process_time()
-    problem = GreyProblem(twin, train, tie)
+    fit, parts = twin.spec.fit, (train, validation)
+    progress = _Progress(sum(fit.rounds) + (fit.starts - 1) * fit.rounds[0] + fit.final_rounds, on_event)
+    if tie is not None or twin.spec.stretches or not fit.final_rounds:
+        return _fitted(GreyProblem(twin, train, tie), parts, seed, progress)
+    coarse = GreyProblem(twin.with_stretches(STRETCHES[0]), train)
+    stages = _fitted(coarse, parts, seed, progress, final=False)
+    # Final rounds of a coarser form remember too well what it made of the logs: a finer one begins before them.
+    begin, share, best = stages, 1.0 - fit.memory, stages
+    for stretches in STRETCHES:
+        tried = _continued(begin, stretches, (share, parts, seed), progress)
+        progress.total += fit.final_rounds
+        history, better = best.history + tried.history, tried.error < (1.0 - LEAST_GAIN) * best.error
+        best = replace(tried if better else best, history=history, seconds=progress.seconds)
+        if stretches == STRETCHES[0]:
+            continue
+        if not better:
+            break
+        begin, share = best, 1.0 - coarse.final_memory
+    return best
+
+
+def _continued(before: GreyFit, stretches: int, how: tuple[float, Any, int], progress: _Progress) -> GreyFit:
+    """Final rounds with as many stretches or more; `how`: share of what was known that counts, parts and seed.
+
+    Rounds that remember one another know several times what one does; the share makes it one round's.
+    """
+    share, parts, seed = how
+    begun = before.twin.with_stretches(stretches)
+    by_finer = coarse_by_fine(before.twin.table, begun.table)
+    problem = GreyProblem(begun, parts[0], carried=share * by_finer.T @ before.information @ by_finer)
+    return _fitted(problem, parts, seed + stretches, progress)
+
+
+def _fitted(
+    problem: GreyProblem,
+    parts: tuple[Sequence[Series], Sequence[Series]],
+    seed: int,
+    progress: _Progress,
+    final: bool = True,
+) -> GreyFit:
+    """The numbers of one form; `parts` train and choose; `final`: whether final rounds follow the stages."""
+    twin, spec, (_, validation) = problem.twin, problem.twin.spec.fit, parts
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
     rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
-    total = len(rounds) + (spec.starts - 1) * spec.rounds[0]
     history: list[dict[str, Any]] = []
-    done = 0
 
-    def advance(path: _Path, lengths: Sequence[float]) -> None:
-        nonlocal done
+    def advance(path: _Path, lengths: Sequence[float], last: bool = False) -> None:
         for number, length_s in enumerate(lengths, 1):
-            done += 1
+            progress.done += 1
             before = path.theta
-            path.step(length_s)
+            path.step(length_s, last)
             # The last round of a stage is judged, whatever its number.
             if number != len(lengths) and number % spec.validate_every and length_s == lengths[number]:
                 continue
             judge.twin = twin.with_numbers(problem.numbers(path.theta))
             better = path.judge(judge.error()) and path.least <= min(other.least for other in paths)
-            seconds = time.process_time() - began
             moved = float(np.sqrt(np.mean((path.theta - before) ** 2)))
-            row = {"update": done, "start": path.number, "length_s": length_s, "validation": path.error, "best": better}
-            history.append(row | {"moved": moved, "damping": path.damping, "seconds": round(seconds, 2)})
-            if on_event is not None:
-                left = seconds * (total - done) / done
-                on_event(FreeRunProgress(done, total, length_s, left, path.error, better))
+            row = {"update": progress.done, "start": path.number, "length_s": length_s, "validation": path.error}
+            row |= {"stretches": twin.table.stretches, "best": better, "moved": moved, "damping": path.damping}
+            history.append(row | {"seconds": round(progress.seconds, 2)})
+            progress.tell(length_s, path.error, better)
 
-    paths = [_Path(problem, number, seed) for number in range(spec.starts)]
-    for path in paths:
-        advance(path, rounds[: spec.rounds[0]])
-    # Which valley a start lies in shows after short runs; long ones of every start would cost as much again.
-    chosen = min(paths, key=lambda path: path.least)
-    advance(chosen, rounds[spec.rounds[0] :])
-    final = twin.with_numbers(problem.numbers(chosen.best))
-    return GreyFit(final, history, time.process_time() - began, chosen.information, chosen.best)
+    paths = [_Path(problem, number, seed) for number in range(spec.starts if problem.carried is None else 1)]
+    chosen = paths[0]
+    if problem.carried is None:
+        for path in paths:
+            advance(path, rounds[: spec.rounds[0]])
+        # Which valley a start lies in shows after short runs; long ones of every start would cost as much again.
+        chosen = min(paths, key=lambda path: path.least)
+        advance(chosen, rounds[spec.rounds[0] :])
+    advance(chosen, rounds[-1:] * (spec.final_rounds if final else 0), True)
+    end = twin.with_numbers(problem.numbers(chosen.best))
+    return GreyFit(end, history, progress.seconds, chosen.information, chosen.best, chosen.least)
 
 
 class _Path:
@@ -249,18 +328,23 @@ class _Path:
         self.theta = problem.first + (APART * self.rng.normal(size=size) if number else 0.0)
         self.best, self.least, self.error = self.theta, np.inf, np.inf
         self.damping, self.matrix = 1.0, np.zeros((size, size))
-        self.memory, self.information = np.zeros((size, size)), np.zeros((size, size))
+        self.information = np.zeros((size, size))
+        self.memory = np.zeros((size, size)) if problem.carried is None else problem.carried
 
-    def step(self, length_s: float) -> None:
+    def step(self, length_s: float, final: bool = False) -> None:
         """One round on free runs of a length."""
         spec = self.problem.twin.spec.fit
         ticks = max(1, round(length_s * self.problem.twin.channels.rate_hz))
-        drawn = self.problem.draw(ticks, max(8, min(spec.lanes, spec.ticks // ticks)), self.rng)
+        lanes = max(8, min(spec.lanes, (spec.final_ticks if final else spec.ticks) // ticks))
+        drawn = self.problem.draw(ticks, lanes, self.rng)
+        steps = 1 if final else spec.steps
         self.theta, self.damping, self.matrix = _improve(
-            self.problem, self.theta, drawn, self.damping, spec.steps, self.memory
+            self.problem, self.theta, drawn, self.damping, steps, self.memory
         )
+        memory = self.problem.final_memory if final else spec.memory
         # The first stage begins far away, where a linear model says little about the end.
-        self.memory = spec.memory * (self.memory + self.matrix) if length_s != spec.lengths_s[0] else self.memory
+        far = length_s == spec.lengths_s[0] and not final
+        self.memory = self.memory if far else memory * (self.memory + self.matrix)
 
     def judge(self, error: float) -> bool:
         """Take in a validation error of where it stands; whether it is the least so far."""

@@ -9,7 +9,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.numbers import number_table
-from edp.networks.twin.grey.plausible import KNOTS, Travel
+from edp.networks.twin.grey.plausible import Travel, opening_knots
 from edp.networks.twin.grey.steps import GAMMA
 from edp.signals import VOCABULARY, Channel, Kind
 from edp.sim.machine.machine_files import load_machine, parse_machine
@@ -98,9 +98,10 @@ def test_opening_curves_and_areas_are_those_of_the_simulator(parts):
     axes, _ = pack(M22)
     assert numbers[table.actuator_at + at.HEAD_AREA] == pytest.approx(axes[:, 5])
     first = table.valve_at[2, at.INTO]
-    curve = np.concatenate([[0.0], np.cumsum(numbers[first : first + len(KNOTS) - 1])])
+    knots = opening_knots(table.stretches)
+    curve = np.concatenate([[0.0], np.cumsum(numbers[first : first + table.stretches])])
     band = M22.valves.dead_band_extend[1]
-    areas = [opening(band + (1.0 - band) * r, band) for r in KNOTS]
+    areas = [opening(band + (1.0 - band) * r, band) for r in knots]
     flow, bar = M22.valves.meter_in_extend[1]
     # L/min at bar to m^3/s/MPa^0.5
     full = flow / 6e4 / np.sqrt(bar * 1e5) * 1e3
@@ -116,7 +117,7 @@ def test_commands_that_reach_half_of_the_full_pilot_see_half_of_the_curve(parts)
     table = parts.table
     band, first = table.valve_at[0, at.BAND], table.valve_at[0, at.INTO]
     assert part[band] == pytest.approx(2.0 * whole[band])
-    total, share = (values[first : first + len(KNOTS) - 1].sum() for values in (whole, part))
+    total, share = (values[first : first + table.stretches].sum() for values in (whole, part))
     assert share / total == pytest.approx(opening(0.5, M22.valves.dead_band_extend[0]), rel=0.02)
 
 

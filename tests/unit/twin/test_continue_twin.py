@@ -143,6 +143,22 @@ def test_a_stroke_ends_where_it_came_twice_else_at_the_farther_end(ends, low, hi
     assert scales.high[4] >= limits.high[4]
 
 
+@pytest.mark.parametrize(("push", "high"), [(0.9, 0.7), (0.2, 1.0), (-0.9, 1.0)], ids=["pushed", "resting", "away"])
+def test_one_stay_at_an_outermost_place_is_an_end_stop_where_the_lever_pushes_on(push, high):
+    twin, _, _ = sample_twin(Recurrent(units=4, prefix_ticks=20))
+    limits = replace(twin.scales, low=twin.scales.low.copy(), high=twin.scales.high.copy())
+    limits.low[2:4], limits.high[2:4] = 0.0, 1.0
+    twin = with_scales(twin, limits)
+    channels = twin_channels(sample_actuators(ticks=300))
+    whole = channels.task().series(sample_actuators(ticks=300))
+    inputs, targets = whole.inputs.copy(), whole.targets.copy()
+    ticks = np.arange(len(targets))
+    targets[:, 2] = np.interp(ticks, [0, 80, 200, len(targets) - 1], [0.4, 0.7, 0.7, 0.4])
+    inputs[:, 0] = np.where((ticks > 70) & (ticks < 200), push, np.where(ticks < 40, 1.0, -0.3))
+    series = [Series(whole.name, inputs, targets)]
+    assert scales_for(twin, fit_scales(channels, series), series).high[2] == pytest.approx(high, abs=1e-6)
+
+
 def renamed(recording):
     channels = tuple(replace(c, name=c.name.replace("lever", "stick")) for c in recording.channels)
     return Recording(recording.name, channels, recording.values, recording.rate_hz, "sample")

@@ -1,5 +1,6 @@
 """Grey boxes: exact tangents, physics that must hold, elements that must connect, numbers that a fit finds again."""
 
+import json
 from dataclasses import replace
 from itertools import product
 
@@ -19,7 +20,10 @@ from edp.networks.twin.grey.plausible import Travel
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators
+from edp.training import grey_fit
+from edp.training.bundle import HASH, header_digest
 from edp.training.grey_fit import fit_grey_box
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 PREFIX = 30
 
@@ -41,8 +45,18 @@ BENCH = GreyBox(
     pumps=(PumpElement(name="pump", pressure="line"),),
     inertia_degree=1,
     potential_degree=2,
+    stretches=5,
     prefix_ticks=PREFIX,
-    fit=GreyFitSpec(lengths_s=(0.1, 0.4), rounds=(3, 2), lanes=24, ticks=600, validation_s=2.0, validation_runs=4),
+    fit=GreyFitSpec(
+        lengths_s=(0.1, 0.4),
+        rounds=(3, 2),
+        final_rounds=6,
+        lanes=24,
+        ticks=600,
+        final_ticks=600,
+        validation_s=2.0,
+        validation_runs=4,
+    ),
 )
 
 
@@ -145,6 +159,81 @@ def test_a_fit_finds_a_machine_again(bench):
     # Nothing ran into a cushion of a stop, and no port relief opened.
     assert not rows["ram.head_relief"]["excited"]
     assert "(" in datasheet_text(list(rows.values()))
+
+
+def test_finer_opening_curves_answer_as_the_coarser_ones_they_were_made_of(bench):
+    machine, runs = bench
+    commands = np.stack([series.inputs for series in runs])[:, :400]
+    start = np.stack([series.targets[0] for series in runs])
+    answers = machine.rollout(commands, machine.initial_state(commands[:, 0], start))[0]
+    for stretches in (10, 20):
+        finer = machine.with_stretches(stretches)
+        assert len(finer.table.knots) == stretches + 1
+        assert set(machine.table.knots) <= set(finer.table.knots)
+        assert len(finer.numbers) == len(machine.numbers) + 4 * (stretches - 5)
+        again = finer.rollout(commands, finer.initial_state(commands[:, 0], start))[0]
+        np.testing.assert_allclose(
+            again / machine.scales.answer_width, answers / machine.scales.answer_width, atol=1e-3
+        )
+    with pytest.raises(ValueError, match="a multiple of 10"):
+        machine.with_stretches(10).with_stretches(5)
+    with pytest.raises(ConfigError, match="stretches = 7; any of 5, 10, 20, or 0"):
+        replace(BENCH, stretches=7)
+
+
+def test_free_runs_choose_how_many_stretches_an_opening_curve_has(bench):
+    """A machine whose curves bend within the coarse stretches is fitted better by the finer ones."""
+    machine, runs = bench
+    free = replace(BENCH, stretches=0, fit=replace(BENCH.fit, final_rounds=16))
+    arrays = {"numbers": machine.numbers.astype(np.float32), "full": machine.full}
+    coarse = free.build(machine.channels, machine.scales, arrays)
+    bent = machine.with_stretches(10)
+    weights = np.where(np.arange(40) % 2, 1.9, 0.1)
+    bent.numbers[bent.table.in_curves] *= weights
+    told = []
+    for series in runs:
+        start = series.targets[:1]
+        answers = bent.rollout(series.inputs[None, :-1], bent.initial_state(series.inputs[:1], start))[0][0]
+        told.append(Series(series.name, series.inputs, np.concatenate([start, answers])))
+    result = fit_grey_box(coarse, told[:2], told[2:3], seed=0)
+    tried = {row["stretches"] for row in result.history}
+    assert tried >= {5, 10}
+    kept = result.twin.spec.stretches
+    assert kept in (10, 20)
+    assert result.error == min(row["validation"] for row in result.history if row["stretches"] == kept)
+    assert len(result.information) == len(result.twin.numbers) == len(result.theta)
+    names = {row["name"] for row in datasheet(result.twin.table, result.twin.numbers, result.information)}
+    assert {"into_extend_5", "into_extend_17.5", "into_extend_100"} <= names
+
+
+def test_a_curve_that_gains_too_little_stays_coarse(bench, monkeypatch):
+    machine, runs = bench
+    monkeypatch.setattr(grey_fit, "LEAST_GAIN", 1.0)
+    arrays = {"numbers": machine.numbers.astype(np.float32), "full": machine.full}
+    fit = replace(BENCH.fit, lengths_s=(0.1,), rounds=(1,), starts=1)
+    begun = replace(BENCH, stretches=0, fit=fit).build(machine.channels, machine.scales, arrays)
+    result = fit_grey_box(begun, runs[:2], runs[2:3], seed=0)
+    assert result.twin.spec.stretches == 5
+    assert {row["stretches"] for row in result.history} == {5, 10}
+
+
+def test_a_bundle_that_names_no_stretches_has_five(bench, tmp_path):
+    machine, _ = bench
+    save_twin(TwinBundle(BENCH, machine), tmp_path / "old")
+    path = tmp_path / "old" / "twin.json"
+    header = json.loads(path.read_text())
+    # As bundles were written before: the key is not there.
+    assert header["twin"].pop("stretches") == 5
+    del header[HASH]
+    path.write_text(json.dumps(header | {HASH: header_digest(header)}))
+    old = load_twin(tmp_path / "old").twin
+    assert old.table.stretches == 5
+    np.testing.assert_array_equal(old.numbers, machine.numbers)
+    finer = machine.with_stretches(20)
+    save_twin(TwinBundle(finer.spec, finer), tmp_path / "new")
+    again = load_twin(tmp_path / "new").twin
+    assert again.spec.stretches == again.table.stretches == 20
+    np.testing.assert_array_equal(again.numbers, finer.numbers.astype(np.float32))
 
 
 def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):

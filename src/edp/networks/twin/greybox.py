@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,8 @@ from edp.networks.twin.grey.elements import (
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.grey.known_linkage import KnownLinkage, check_linkage
 from edp.networks.twin.grey.lowering import add_layer
-from edp.networks.twin.grey.numbers import LEFT_OUT, NumberTable, number_table
-from edp.networks.twin.grey.plausible import KNOTS, Travel
+from edp.networks.twin.grey.numbers import LEFT_OUT, NumberTable, finer_values, number_table
+from edp.networks.twin.grey.plausible import STRETCHES, Travel
 from edp.networks.twin.grey.run import run_lanes
 from edp.networks.twin.grey.runner import GreyRunner
 from edp.networks.twin.grey.start import load_start
@@ -64,6 +64,8 @@ class GreyBox:
             for inertia and gravity then; empty: polynomials.
         without: what its equations leave out: `power_limit` of the pumps, `cushions` at the end stops, `play` of the
             spools.
+        stretches: of a spool's opening curve: 5, 10 or 20; 0: free runs of the validation part choose. A bundle that
+            names none has 5.
         prefix_ticks: measured ticks before a free run.
         fit: how its numbers are fitted.
 
@@ -79,6 +81,7 @@ class GreyBox:
     potential_degree: int = POLYNOMIALS[1]
     linkage: str = ""
     without: tuple[str, ...] = ()
+    stretches: int = 0
     prefix_ticks: int = 30
     fit: GreyFitSpec = field(default_factory=GreyFitSpec)
 
@@ -93,6 +96,11 @@ class GreyBox:
                 f"grey box: inertia_degree = {self.inertia_degree} and potential_degree = {self.potential_degree} are "
                 f"of polynomials, which twin.linkage = '{self.linkage[:80]}' replaces; leave the degrees out, or the "
                 "linkage"
+            )
+        if self.stretches not in (0, *STRETCHES):
+            raise ConfigError(
+                f"grey box: stretches = {self.stretches}; any of {', '.join(map(str, STRETCHES))}, or 0 for the "
+                "validation part to choose, must hold"
             )
         for part in self.without:
             if part not in LEFT_OUT:
@@ -120,7 +128,7 @@ class GreyBox:
         """With plausible numbers; where all is measured, its load balances the forces that were measured."""
         elements = self.elements(channels)
         front = KnownLinkage.read(self.linkage, elements, channels, scales) if self.linkage else None
-        table = self._table(elements, channels, scales, front)
+        table = self.table(elements, channels, scales, front)
         commands = np.concatenate([series.inputs for series in train])
         full = [_full(commands[:, _sides(valve, channels)]) for valve in elements.valves]
         arrays = {"numbers": table.nominal.astype(np.float32), "full": np.array(full, np.float32)}
@@ -137,13 +145,14 @@ class GreyBox:
         travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.actuators)
         own = KnownLinkage.SHAPES if self.linkage else {}
         front = KnownLinkage(*(np.ones(shape) for shape in own.values())) if own else None
-        table = number_table(elements, travels, [1.0] * len(elements.pumps), self.degrees, self.without, front)
+        pumps = [1.0] * len(elements.pumps)
+        table = number_table(elements, travels, pumps, self.degrees, self.without, front, self.curve)
         return {"numbers": (len(table.numbers),), "full": (len(elements.valves),), **own}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
         """The grey box with these numbers; nothing of a linkage's machine is read again."""
         elements = self.elements(channels)
-        table = self._table(elements, channels, scales, KnownLinkage.of(arrays) if self.linkage else None)
+        table = self.table(elements, channels, scales, KnownLinkage.of(arrays) if self.linkage else None)
         numbers = arrays["numbers"].astype(np.float64)
         if not (numbers[table.positive] > 0).all():
             raise ValueError("one of its numbers is not positive")
@@ -162,9 +171,15 @@ class GreyBox:
         """Of the polynomials of inertia and gravity."""
         return self.inertia_degree, self.potential_degree
 
-    def _table(
+    @property
+    def curve(self) -> int:
+        """Stretches of an opening curve; before they are chosen, and in old bundles, the fewest."""
+        return self.stretches or STRETCHES[0]
+
+    def table(
         self, elements: Elements, channels: TwinChannels, scales: TwinScales, front: KnownLinkage | None
     ) -> NumberTable:
+        """Its numbers, with starting values from what the scales of the data show."""
         names = [channel.name for channel in channels.answers]
         count = len(channels.velocities)
 
@@ -178,7 +193,7 @@ class GreyBox:
             fastest, (first, second) = float(scales.high[i]) / FASTEST, actuator.chambers
             travels.append(Travel(float(low), float(high), fastest, (highest(first), highest(second))))
         pumps = [highest(pump.pressure) * HIGHEST for pump in elements.pumps]
-        return number_table(elements, travels, pumps, self.degrees, self.without, front)
+        return number_table(elements, travels, pumps, self.degrees, self.without, front, self.curve)
 
 
 def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
@@ -235,6 +250,18 @@ class GreyTwin(Twin):
         """The same elements with other numbers, rounded as they are kept."""
         rounded = numbers.astype(np.float32).astype(np.float64)
         return GreyTwin(self.channels, self.scales, self.spec, (self.table, self.wiring), rounded, self.full)
+
+    def with_stretches(self, stretches: int) -> GreyTwin:
+        """The same machine with opening curves of as many stretches or more: its answers stay what they are."""
+        spec = replace(self.spec, stretches=stretches)
+        if spec.curve % self.table.stretches:
+            raise ValueError(f"stretches = {stretches}; a multiple of {self.table.stretches} must hold")
+        elements = spec.elements(self.channels)
+        table = spec.table(elements, self.channels, self.scales, self.table.front)
+        parts = (table, self.wiring)
+        return GreyTwin(
+            self.channels, self.scales, spec, parts, finer_values(self.table, self.numbers, table), self.full
+        )
 
     @property
     def units(self) -> Doubles:
@@ -330,9 +357,9 @@ class GreyTwin(Twin):
         limits = (self.scales.low / self.units, self.scales.high / self.units, self.units)
         run_lanes(
             demands, measured, judged.truth, state, judged.counts, (judged.weight, judged.delta), limits,
-            (numbers, KNOTS, *self.wiring.z_of, self.table.linkage), self.form, self.wiring.ports, self.table.places,
-            self.table.exponents, self.time, judged.full, nothing if answers is None else answers, judged.normal,
-            *network,
+            (numbers, self.table.knots, *self.wiring.z_of, self.table.linkage), self.form, self.wiring.ports,
+            self.table.places, self.table.exponents, self.time, judged.full, nothing if answers is None else answers,
+            judged.normal, *network,
         )  # fmt: skip
 
     def runner(self) -> TwinRunner:

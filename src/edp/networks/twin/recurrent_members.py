@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 
+from edp.data.roles import roles_of_channels
 from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
 from edp.networks.twin.recurrent import RecurrentTwin
 from edp.networks.twin.recurrent_cell import TwinNetwork
 from edp.networks.twin.scales import TwinScales
@@ -19,13 +22,18 @@ APART_S = 1.0
 """Time away from an end after which the next visit is another one."""
 VISITS = 2
 """Visits to the same outermost place that make it an end stop: turns on the way hardly come to the same place."""
+PUSHED_S = 1.0
+"""Time at an outermost place with its own lever pushing on that makes it an end stop at the first visit."""
+PUSHED = 0.5
+"""Of the largest command: a lever that moves an actuator anywhere else."""
 
 
 def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> TwinScales:
     """Scales of a twin that goes on with other recordings: its numbers keep their meaning, its bounds follow these.
 
-    A stroke ends where these recordings come to the same outermost place at least twice; an end that they do not show
-    so is the farther one of theirs and the twin's. Velocities and pressures have the wider bounds of both.
+    A stroke ends where these recordings come to the same outermost place at least twice, or stay there though a lever
+    pushes on; an end that they do not show so is the farther one of theirs and the twin's. Velocities and pressures
+    have the wider bounds of both.
 
     Args:
         twin: trained before.
@@ -34,15 +42,50 @@ def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> Twi
     """
     before, count = twin.scales, len(twin.channels.velocities)
     low, high = np.minimum(before.low, own.low), np.maximum(before.high, own.high)
-    for which in range(count, count + len(twin.channels.strokes)):
-        values = [series.targets[:, which] for series in train]
+    for axis in range(len(twin.channels.strokes)):
+        which = count + axis
         near = AT_STOP * float(high[which] - low[which])
-        apart = round(APART_S * twin.channels.rate_hz)
-        if sum(_visits(stretch <= own.low[which] + near, apart) for stretch in values) >= VISITS:
-            low[which] = own.low[which]
-        if sum(_visits(stretch >= own.high[which] - near, apart) for stretch in values) >= VISITS:
-            high[which] = own.high[which]
+        pushes = _pushes(twin.channels, axis, train)
+        for bound, side in ((low, -1.0), (high, 1.0)):
+            end = float((own.low if side < 0.0 else own.high)[which])
+            there = [side * (series.targets[:, which] - end) >= -near for series in train]
+            if _is_stop(there, [side * push for push in pushes], twin.channels.rate_hz):
+                bound[which] = end
     return replace(before, low=low, high=high)
+
+
+def _is_stop(there: Sequence[np.ndarray], pushes: Sequence[np.ndarray], rate_hz: float) -> bool:
+    """Whether an outermost place is an end stop.
+
+    Args:
+        there: of each stretch, tick by tick, whether it is there.
+        pushes: the lever towards that place, as a share of its largest value; empty: nothing tells which lever it is.
+        rate_hz: of the ticks.
+    """
+    if sum(_visits(one, round(APART_S * rate_hz)) for one in there) >= VISITS:
+        return True
+    longest = round(PUSHED_S * rate_hz)
+    stays = (one & (push[: len(one)] >= PUSHED) for one, push in zip(there, pushes, strict=False))
+    return any(_longest(one) >= longest for one in stays)
+
+
+def _longest(there: np.ndarray) -> int:
+    """Ticks of the longest stay."""
+    turns = np.flatnonzero(np.diff(np.concatenate([[0], there.astype(np.int8), [0]])))
+    return int((turns[1::2] - turns[::2]).max(initial=0))
+
+
+def _pushes(channels: TwinChannels, axis: int, train: Sequence[Series]) -> list[np.ndarray]:
+    """Signed command of an actuator in each stretch, extension positive, as a share of its largest; or nothing."""
+    names = [channel.name for channel in channels.commands]
+    every = channels.commands + channels.answers
+    axes = {one.velocity: one.command for one in roles_of_channels(every).axes}
+    columns = [names.index(name) for name in axes.get(channels.velocities[axis].name, ()) if name in names]
+    if not columns:
+        return []
+    signed = [series.inputs[:, columns[0]] - (series.inputs[:, columns[1]] if columns[1:] else 0.0) for series in train]
+    largest = max(float(np.abs(values).max(initial=0.0)) for values in signed)
+    return [values / largest for values in signed] if largest > 0.0 else []
 
 
 def _visits(there: np.ndarray, apart: int) -> int:

@@ -104,6 +104,10 @@ class ResidualTwin(GreyTwin):
         """The same elements and network with other numbers of the grey box, rounded as they are kept."""
         return ResidualTwin(super().with_numbers(numbers), self.network)
 
+    def with_stretches(self, stretches: int) -> ResidualTwin:
+        """The same machine and network with opening curves of as many stretches or more."""
+        return ResidualTwin(super().with_stretches(stretches), self.network)
+
     def without_network(self) -> ResidualTwin:
         """The grey box alone: a network that answers zero."""
         network = _network(self.channels, self.network.units)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as grey
 from edp.networks.twin.grey.numbers import NumberTable
-from edp.networks.twin.grey.plausible import KNOTS
+from edp.networks.twin.grey.plausible import opening_knots
 from edp.networks.twin.grey.steps import GAMMA
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Machine
@@ -88,7 +88,8 @@ def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
         _put_cylinder(si, table.actuator_at[i], axes[i], plant)
         for second, j in enumerate((parts.primary[i], parts.conflux[i])):
             if j >= 0:
-                _put_valve(si, table.valve_at[j], (machine, i, bool(second)), axes[i], (parts.reach[j], parts.step_s))
+                spool = machine, i, bool(second), table.stretches
+                _put_valve(si, table.valve_at[j], spool, axes[i], (parts.reach[j], parts.step_s))
     for a in table.pump_at:
         si[a + grey.FLOW] = plant[sim.EFFICIENCY] * plant[sim.MAX_FLOW]
         si[a + grey.LEAST], si[a + grey.LAG] = plant[sim.MIN_DISPLACEMENT], plant[sim.PUMP_TIME]
@@ -119,10 +120,17 @@ def _put_cylinder(si: Doubles, a: int, axis: Doubles, plant: Doubles) -> None:
 
 
 def _put_valve(
-    si: Doubles, places: NDArray[np.int64], which: tuple[Machine, int, bool], axis: Doubles, clock: tuple[float, float]
+    si: Doubles,
+    places: NDArray[np.int64],
+    which: tuple[Machine, int, bool, int],
+    axis: Doubles,
+    clock: tuple[float, float],
 ) -> None:
-    """Numbers of one spool; `which`: machine, cylinder, and whether it is the second spool; `clock`: reach and step."""
-    machine, i, second = which
+    """Numbers of one spool; `which`: machine, cylinder, whether it is the second spool, and stretches of its curves.
+
+    `clock` is reach and step.
+    """
+    machine, i, second, stretches = which
     reach, step_s = clock
     valves = machine.valves
     frequency = (valves.conflux_spool_frequency if second else valves.spool_frequency)[i]
@@ -143,7 +151,7 @@ def _put_valve(
         band = axis[bands[d]]
         si[places[grey.BAND + d]] = band / reach
         si[places[grey.GAIN + d]] = axis[demand[d]]
-        curve = _curve(float(band), float(reach))
+        curve = _curve(float(band), float(reach), stretches)
         for first, column in ((grey.INTO, into[d]), (grey.OUT_OF, out[d])):
             at = places[first + d]
             if at >= 0:
@@ -153,22 +161,20 @@ def _put_valve(
 
 
 @lru_cache(maxsize=256)  # differences by other numbers ask for the same curve thousands of times
-def _curve(band: float, reach: float) -> Doubles:
+def _curve(band: float, reach: float, stretches: int) -> Doubles:
     """Rises between the knots of the grey box's opening curve, of a spool with this dead band that reaches so far."""
     # Where the simulator's spool is: the curve of the grey box counts from its own full command.
     spool = band + (reach - band) * np.linspace(0.0, 1.0, FINE)
     r = np.clip((spool - band) / (1.0 - band), 0.0, 1.0)
-    return np.asarray(POLYGON @ (r * (0.25 + 0.75 * r)))
+    return np.asarray(_polygon(stretches) @ (r * (0.25 + 0.75 * r)))
 
 
-def _polygon() -> Doubles:
+@lru_cache(maxsize=4)
+def _polygon(stretches: int) -> Doubles:
     """Increments between the knots of the polygon through zero that is nearest to values on a fine grid."""
-    grid = np.linspace(0.0, 1.0, FINE)
-    rising = np.clip((grid[:, None] - KNOTS[:-1]) / np.diff(KNOTS), 0.0, 1.0)
+    grid, knots = np.linspace(0.0, 1.0, FINE), opening_knots(stretches)
+    rising = np.clip((grid[:, None] - knots[:-1]) / np.diff(knots), 0.0, 1.0)
     return np.asarray(np.linalg.pinv(rising))
-
-
-POLYGON = _polygon()
 
 
 def _lead(lags: tuple[float, float], step_s: float) -> float:

@@ -24,6 +24,7 @@ from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, closest
 from edp.evaluation.controller import load_budget
+from edp.settings.tree import combined
 from edp.storage import parse_toml
 from edp.workflows.search.phases.isolation import DEFAULT_BACKBONE, arm_settings
 from edp.workflows.search.settings import SearchSpec
@@ -71,8 +72,7 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     if path is not None:
         # Files named in settings are looked for beside the settings file, not in the working directory.
         table, where = merged(table, _with_files(read_toml(path), Path(path).parent)), f"'{path}'"
-    for change in overrides:
-        table = merged(table, _with_files(override(change), Path()))
+    table = merged(table, combined([_with_files(override(change), Path()) for change in overrides]))
     where += " with --set" if overrides else ""
     base, search = table.pop("base", "quick"), table.pop("search", {})
     if not isinstance(search, Mapping):

@@ -26,6 +26,7 @@ from edp.data.splits import ByTime
 from edp.data.task import Task
 from edp.errors import BundleError, ConfigError, EdpError
 from edp.networks.predictor import Predictor
+from edp.settings.tree import combined
 from edp.training import Bundle, load_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.train_evaluate import trained_run
@@ -118,9 +119,7 @@ def target_experiment(source: SourceModel, changes: Sequence[Change] = ()) -> Ex
     training = replace(source.experiment.training, updates=0)
     experiment = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec, training=training)
     table = plain_tree(experiment)
-    for layer in layers:
-        table = merged(table, layer)
-    return build(Experiment, table, "of the source with --set")
+    return build(Experiment, merged(table, combined(layers)), "of the source with --set")
 
 
 def _check_kept(layer: Table) -> None:

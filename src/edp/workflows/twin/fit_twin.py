@@ -93,15 +93,17 @@ class TwinFit:
             return FittedFormulation(spec, FittedTwin(twin, [], time.process_time() - started))
         self.tell("fitting the grey box to free runs")
         grey = fit_grey_box(twin, *parts, seed, self.on_event)
-        numbers = datasheet(twin.table, grey.twin.numbers, grey.information)
+        numbers = datasheet(grey.twin.table, grey.twin.numbers, grey.information)
+        # With as many stretches as were chosen: a bundle says how many numbers it has.
+        settled = grey.twin.spec
         if not (isinstance(grey.twin, ResidualTwin) and isinstance(spec, Residual)):
-            return FittedFormulation(spec, FittedTwin(grey.twin, grey.history, grey.seconds), numbers)
+            return FittedFormulation(settled, FittedTwin(grey.twin, grey.history, grey.seconds), numbers)
         self.tell("training the network on top of the grey box")
         network = fit_residual(grey.twin, spec, *parts, self.experiment.training, self.on_event, run)
         if not network.helps:
             self.tell("the network does not help on the validation part: the grey box stays alone")
         fitted = FittedTwin(network.twin, grey.history + network.history, grey.seconds + network.seconds)
-        return FittedFormulation(spec, fitted, numbers, {"residual": network.facts()})
+        return FittedFormulation(settled, fitted, numbers, {"residual": network.facts()})
 
     def train_members(
         self, jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None

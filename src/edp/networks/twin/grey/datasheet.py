@@ -19,7 +19,7 @@ NORMAL = 1.96
 UNEXCITED = 0.7
 """Share of the deviation that was plausible before: where more is left, the data say little about a number."""
 BASIS = (
-    "95 % intervals from the Gauss-Newton information of the last round of the fit and the deviations that are "
+    "95 % intervals from the Gauss-Newton information of the last rounds of the fit and the deviations that are "
     "plausible for such a machine; errors of rows that lie apart are taken as independent, so they are approximate"
 )
 

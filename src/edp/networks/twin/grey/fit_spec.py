@@ -32,6 +32,10 @@ class GreyFitSpec:
         lanes: free runs of a round at most.
         ticks: of all free runs of a round together, about.
         memory: share of what a round knows that counts in the next one, beside its own stretches.
+        final_rounds: behind all stages, each one step on free runs of the longest length; 0: none.
+        final_ticks: of all free runs of such a round together, about.
+        final_memory: share of what such a round knows that counts in the next one; less where the training part has
+            fewer ticks than would count then.
         stroke_weight: of an error of a stroke in its deviations, beside those of velocities and pressures.
         delta: where the Huber loss turns from a square to a line, in weighted deviations.
         validate_every: rounds from one validation to the next.
@@ -47,8 +51,11 @@ class GreyFitSpec:
     starts: int = 3
     steps: int = 3
     lanes: int = 512
-    ticks: int = 40_000
+    ticks: int = 12_000
     memory: float = 0.5
+    final_rounds: int = 24
+    final_ticks: int = 15_000
+    final_memory: float = 0.9
     stroke_weight: float = 5.0
     delta: float = 0.2
     validate_every: int = 2
@@ -58,6 +65,7 @@ class GreyFitSpec:
     def __post_init__(self) -> None:
         length, count = above(0.0, 600.0), integer(1, MOST_UPDATES)
         bounds = {"lengths_s": length, "validation_s": length, "rounds": count, "steps": count, "ticks": count}
+        bounds |= {"final_rounds": integer(0, MOST_UPDATES), "final_ticks": count, "final_memory": SHARE}
         bounds |= {
             "starts": integer(1, MOST_STARTS),
             "lanes": integer(1, MOST_BATCH),

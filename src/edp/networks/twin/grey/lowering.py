@@ -14,7 +14,6 @@ from edp.ir.builder import indices
 from edp.ir.hydraulics import NONE, HydraulicTick
 from edp.ir.reference import STEPS
 from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
-from edp.networks.twin.grey.plausible import KNOTS
 from edp.networks.twin.grey.run import run_lanes
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ def add_layer(build: Builder, twin: GreyTwin, fed: str) -> str:
         fed,
         numbers=twin.numbers,
         full=twin.full,
-        knots=KNOTS,
+        knots=table.knots,
         middle=wiring.z_of[0],
         scale=wiring.z_of[1],
         offset=scales.answer_offset / twin.units,

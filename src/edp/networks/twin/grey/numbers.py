@@ -18,12 +18,14 @@ from edp.networks.twin.grey.elements import Actuator, Elements, MotorElement
 from edp.networks.twin.grey.known_linkage import KnownLinkage
 from edp.networks.twin.grey.plausible import (
     MEGA,
+    STRETCHES,
     GreyNumber,
     Travel,
     circuit_numbers,
     cylinder_numbers,
     load_size,
     motor_numbers,
+    opening_knots,
     plausible_areas,
     pump_numbers,
     valve_numbers,
@@ -58,6 +60,21 @@ class NumberTable:
     potential_at: int
     exponents: IntArray
     front: KnownLinkage | None = None
+    stretches: int = STRETCHES[0]
+
+    @cached_property
+    def knots(self) -> Array:
+        """Of all opening curves ``(stretches + 1,)``."""
+        return opening_knots(self.stretches)
+
+    @property
+    def in_curves(self) -> NDArray[np.bool_]:
+        """Which numbers are increments of an opening curve."""
+        inside = np.zeros(len(self.numbers), np.bool_)
+        for first in self.valve_at[:, at.INTO : at.REGENERATION].ravel():
+            if first >= 0:
+                inside[first : first + self.stretches] = True
+        return inside
 
     @property
     def linkage(self) -> Array:
@@ -123,6 +140,7 @@ def number_table(
     degrees: tuple[int, int],
     left_out: Sequence[str] = (),
     front: KnownLinkage | None = None,
+    stretches: int = STRETCHES[0],
 ) -> NumberTable:
     """Numbers of connected elements, with starting values from what the data show.
 
@@ -133,6 +151,7 @@ def number_table(
         degrees: of the polynomials of L and of U.
         left_out: keys of `LEFT_OUT`.
         front: linkage whose bodies are the load; None: polynomials.
+        stretches: of each opening curve, one of `STRETCHES`.
 
     Raises:
         ConfigError: the load would have more numbers than can be fitted.
@@ -153,12 +172,12 @@ def number_table(
         numbers += pump_numbers(pump.name, 0.6 * float(np.mean(flows)), highest)
     circuit_at = len(numbers)
     numbers += circuit_numbers(max([*highest_pump, *(max(t.highest) for t in travels)]), 0.6 * sum(flows))
-    names = [actuator.name for actuator in elements.actuators]
+    names, knots = [actuator.name for actuator in elements.actuators], opening_knots(stretches)
     valve_at = np.full((len(elements.valves), at.VALVE_PLACES), -1, np.int64)
     for j, valve in enumerate(elements.valves):
         i = names.index(valve.actuator)
         numbers += valve_numbers(
-            valve.name, (valve.meter_out, valve.regeneration), areas[i], travels[i], valve_at[j], len(numbers)
+            valve.name, (valve.meter_out, valve.regeneration), areas[i], travels[i], valve_at[j], len(numbers), knots
         )
     inertia_at = len(numbers)
     exponents = _load_exponents(elements, max(degrees))
@@ -171,8 +190,29 @@ def number_table(
     every = tuple(_fixed(number, neutral[number.name]) if number.name in neutral else number for number in numbers)
     return NumberTable(
         every, valve_at, np.array(actuator_at), np.array(pump_at, dtype=np.int64), circuit_at, inertia_at,
-        inertia_terms, potential_at, exponents, front,
+        inertia_terms, potential_at, exponents, front, stretches,
     )  # fmt: skip
+
+
+def finer_values(coarse: NumberTable, values: Array, fine: NumberTable) -> Array:
+    """Numbers of the same machine in a table of more stretches: every stretch is divided, no curve changes."""
+    parts = fine.stretches // coarse.stretches
+    divided, result = coarse.in_curves, np.empty(len(fine.numbers))
+    # Curves, and what is no curve, have the same order in both tables.
+    result[fine.in_curves] = np.repeat(values[divided] / parts, parts)
+    result[~fine.in_curves] = values[~divided]
+    return result
+
+
+def coarse_by_fine(coarse: NumberTable, fine: NumberTable) -> Array:
+    """Derivatives of the coordinates in which `coarse` is fitted by those of `fine` with equal curves
+    ``(coarse, fine)``: all stretches that one is divided into grow together where it grows.
+    """
+    parts = fine.stretches // coarse.stretches
+    slopes, divided = np.zeros((len(coarse.numbers), len(fine.numbers))), coarse.in_curves
+    slopes[np.repeat(np.flatnonzero(divided), parts), np.flatnonzero(fine.in_curves)] = 1.0 / parts
+    slopes[np.flatnonzero(~divided), np.flatnonzero(~fine.in_curves)] = 1.0
+    return slopes
 
 
 def _check_load(elements: Elements, degrees: tuple[int, int]) -> None:

@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.elements import Actuator, MotorElement
 
+Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-KNOTS = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
-"""Of the opening curves, as shares of the spool's travel behind the dead band: denser where levers are finer."""
+COARSE = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
+"""Knots of an opening curve of five stretches, as shares of the spool's travel behind the dead band: denser where
+levers are finer."""
+STRETCHES = (5, 10, 20)
+"""Of an opening curve. Each number halves the stretches of the one before: a finer curve can be a coarser one."""
 MEGA, LITRE = 1e6, 1e3
 PLAUSIBLE_AREAS = (0.015, 0.008)
 """m^2, of head and rod side where no bore is known."""
@@ -24,6 +28,13 @@ room beyond its own volume then. A cushion that leaves all of the outflow, and a
 a motor has the equations of a cylinder, and none of its own."""
 START_CURVE = (0.25, 0.75)
 """Linear and quadratic share of the opening that a curve starts from: fine control near closed, as spools are cut."""
+
+
+def opening_knots(stretches: int) -> Array:
+    """Knots of an opening curve with a number of `STRETCHES` ``(stretches + 1,)``, from 0 to 1."""
+    parts = stretches // STRETCHES[0]
+    places = np.arange(stretches + 1) / parts
+    return np.asarray(np.interp(places, np.arange(len(COARSE)), COARSE))
 
 
 @dataclass(frozen=True)
@@ -188,13 +199,14 @@ def valve_numbers(
     travel: Travel,
     places: IntArray,
     first: int,
+    knots: Array,
 ) -> list[GreyNumber]:
-    """Numbers of a spool; `places` is filled in."""
+    """Numbers of a spool with opening curves between `knots`; `places` is filled in."""
     rows = [("dead_time", "s", 0.04, 0.5), ("pilot_lag", "s", 0.025, 0.5), ("spool_lag", "s", 0.02, 0.5)]
     numbers = [GreyNumber(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
     places[at.DELAY : at.BAND] = first + np.arange(3)
     linear, square = START_CURVE
-    curve = np.diff(KNOTS * (linear + square * KNOTS))
+    curve = np.diff(knots * (linear + square * knots))
     meter_out, regeneration = has
     for d, way in enumerate(("extend", "retract")):
         into, out = (areas[0], areas[1]) if d == 0 else (areas[1], areas[0])
@@ -207,7 +219,7 @@ def valve_numbers(
         for label, column, area in fed:
             places[column + d] = first + len(numbers)
             numbers += [
-                GreyNumber(name, f"{label}_{way}_{100 * KNOTS[k + 1]:.0f}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0)
+                GreyNumber(name, f"{label}_{way}_{100 * knots[k + 1]:.4g}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0)
                 for k, step in enumerate(curve)
             ]
         if meter_out and regeneration:
