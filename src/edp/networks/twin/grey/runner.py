@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from edp.networks.twin.base import TwinRunner, TwinState
 from edp.networks.twin.grey.near_runs import run_near
-from edp.networks.twin.grey.plausible import KNOTS
 from edp.networks.twin.scales import Array
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ class GreyRunner(TwinRunner):
         limits = (twin.scales.low / units, twin.scales.high / units, units)
         self._parts: tuple[Any, ...] = (
             tuple(np.ascontiguousarray(values, dtype=np.float64) for values in limits),
-            (twin.numbers, KNOTS, *wiring.z_of, table.linkage),
+            (twin.numbers, table.knots, *wiring.z_of, table.linkage),
             twin.form,
             wiring.ports,
             table.places,
