@@ -396,12 +396,13 @@ def test_runs_near_a_run_differ_from_it_as_runs_of_their_own_do(twin):
     own, told = (call(commands, state, row, first) / width for call in (twin.branches, runner.neighbours))
     # Ticks with steps of their own are the twin's, those behind them nearly so.
     assert np.abs((told - own)[0, :SINGLE_TICKS]).max() < 1e-4
-    assert np.abs((told - own)[0]).max() < 0.1
+    assert np.sqrt(((told - own)[0] ** 2).mean()) < 0.1
+    assert np.abs((told - own)[0, :, 3:6]).max() < 0.01
     apart, expected = told[1:] - told[:1], own[1:] - own[:1]
     for columns in (slice(0, 3), slice(3, 6), slice(6, 13)):
         size = np.sqrt((expected[..., columns] ** 2).mean())
         assert size > 1e-5
-        assert np.sqrt(((apart - expected)[..., columns] ** 2).mean()) < 0.15 * size
+        assert np.sqrt(((apart - expected)[..., columns] ** 2).mean()) < 0.3 * size
     # Before it branches off, a run is the first one.
     assert np.array_equal(told[4:, :8], np.repeat(told[:1, :8], 3, axis=0))
 

@@ -32,7 +32,7 @@ class LoadEstimate:
         self._runner, self._velocities, self._share = runner, velocities, share
         self._slopes, self._age = np.zeros((len(velocities), len(velocities))), 0
         self._expected: Array | None = None
-        self.acts = share > 0.0 and runner.resistance is not None
+        self._acts = share > 0.0 and runner.resistance is not None
         self.begin()
 
     def begin(self) -> None:
@@ -53,7 +53,7 @@ class LoadEstimate:
             after: state after it.
         """
         resistance = self._runner.resistance
-        if not self.acts or resistance is None:
+        if not self._acts or resistance is None:
             return
         self._expected = np.asarray(after["answer"][0, self._velocities], float)
         if self._age % RENEWED_TICKS == 0:
