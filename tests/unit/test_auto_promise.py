@@ -13,9 +13,10 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import StorageError
+from edp.evaluation.guard import beaten_by
 from edp.evaluation.situation import situation_of
 from edp.report.run.choice import note_test_result, promise_line, read_choice
-from edp.report.run.outputs import situation_line
+from edp.report.run.outputs import minutes_of, situation_line
 from edp.signals import Channel, Kind
 from edp.workflows.auto.promise import Promise
 
@@ -93,6 +94,16 @@ def test_what_became_of_a_promise_is_said(tmp_path):
     note_test_result(tmp_path, scores(1.3), None)
     line = promise_line(read_choice(tmp_path))
     assert line.startswith("The promised error held on 0 of 1")
+
+
+def test_who_gave_the_preset_auto_too_little_time_is_told_to_give_it_more(tmp_path):
+    (tmp_path / "auto.json").write_text(json.dumps(content()))
+    overall = {"1": {"v": {"rmse": 0.5}}}
+    judged = scores(1.0)
+    judged["models"]["trees"] = {"label": "Trees", "overall": overall}
+    judged |= {"task": {"horizons": [1]}, "targets": [{"name": "v"}]}
+    assert "more than 1 minutes" in beaten_by(judged, minutes_of(tmp_path)).sentence()
+    assert "train with the preset auto" in beaten_by(judged, minutes_of(tmp_path / "none")).sentence()
 
 
 @pytest.mark.parametrize(

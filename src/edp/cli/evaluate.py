@@ -64,11 +64,11 @@ def evaluate(
     names = None if baselines is None else baseline_names(baselines)
     from edp.evaluation.guard import beaten_by
     from edp.report.run.choice import promise_line, read_choice
-    from edp.report.run.outputs import judged_line, losses_line, situation_line
+    from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
     from edp.storage.runs import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json, minutes)
-    beaten = beaten_by(scores)
+    beaten = beaten_by(scores, minutes_of(run))
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
     choice = read_choice(run) if source is None else None
     beyond, promise = situation_line(scores), "" if choice is None else promise_line(choice)

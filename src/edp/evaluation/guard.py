@@ -15,6 +15,7 @@ MEASURE = "rmse"
 and promises by them, published floors state them; and of a machine that mostly rests the mean absolute error is decided
 by ticks at rest, of which persistence is exactly right."""
 MEASURE_NAME = "RMSE"
+ADVICE = "train with the preset auto, or on more recordings"
 LEAST = 1e-3
 """Share of error below which two models count as equal: rounding and threads make as much."""
 
@@ -35,7 +36,7 @@ class Beaten:
     less: float
     outputs: tuple[str, ...]
     judged: str = "network"
-    advice: str = "train with the preset auto, or on more recordings"
+    advice: str = ADVICE
 
     def sentence(self) -> str:
         """For the first line of what a person reads."""
@@ -46,7 +47,7 @@ class Beaten:
         )
 
 
-def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
+def beaten_by(scores: Mapping[str, Any], minutes: float | None = None) -> Beaten | None:
     """The baseline that beats the network by most; None where none does.
 
     Errors are compared by the geometric mean of the ratio of root-mean-square errors over horizons and targets, so
@@ -54,10 +55,12 @@ def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
 
     Args:
         scores: the content of ``scores.json``.
+        minutes: that the preset auto was given; None for any other training.
     """
     models = scores["models"]
     if NETWORK not in models:
         return None
+    advice = ADVICE if minutes is None else f"give it more than {minutes:g} minutes (--minutes), or more recordings"
     better = []
     for name, model in models.items():
         if name == NETWORK:
@@ -70,7 +73,7 @@ def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
         if finite:
             mean = sum(finite) / len(finite)
             lost = tuple(target for target, value in by_target.items() if value > LEAST)
-            better.append((mean, Beaten(str(model["label"]), 1.0 - math.exp(-mean), lost)))
+            better.append((mean, Beaten(str(model["label"]), 1.0 - math.exp(-mean), lost, advice=advice)))
     # Logarithms: halving one target's error and doubling another's cancel out.
     mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
     return worst if mean > LEAST else None

@@ -15,7 +15,7 @@ from edp.errors import DataError, StorageError
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, beaten_by
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
-from edp.report.run.outputs import by_output, judged_line, losses_line, situation_line
+from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
 
@@ -285,7 +285,7 @@ def headline(facts: Facts) -> str:
     rows = comparison_rows(facts)
     if samples is None or not any(row["is_network"] for row in rows):
         return f"This run has no scores yet; `edp evaluate {facts.folder}` makes them."
-    beaten = beaten_by(facts.scores) if facts.scores else None
+    beaten = beaten_by(facts.scores, minutes_of(facts.folder)) if facts.scores else None
     if beaten is not None:
         return beaten.sentence()
     first = losses_line(facts.scores) if facts.scores else ""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from edp.data.splits import kind_of_name
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
 from edp.report.common.wording import listed, number, percent
+from edp.storage import read_object
 
 SHOWN = 4
 """Outputs or logs that a sentence names."""
@@ -55,6 +57,13 @@ def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None)
     elif len(kinds) == 1 and others and "" not in kinds:
         line += f" All are of one kind; the figure says nothing of {listed(sorted(others)[:SHOWN])}."
     return line
+
+
+def minutes_of(folder: Path) -> float | None:
+    """That the preset auto was given for a run; None where another training made it."""
+    path = folder / "auto.json"
+    minutes = read_object(path).get("minutes") if path.is_file() else None
+    return float(minutes) if isinstance(minutes, int | float) else None
 
 
 def situation_line(scores: Mapping[str, Any]) -> str:
