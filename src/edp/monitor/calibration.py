@@ -99,13 +99,13 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
             f"calibration: {hours:.3g} h of healthy sessions are too few for one false alarm in {promised_hours:.3g} "
             f"h; they support one in {hours:.3g} h: ask for that, or bring {promised_hours - hours:.3g} h more"
         )
-    held = [session for session in sessions if len(session)]
-    peaks = [_range(spec, session) for session in held]
-    limit = _lowest(spec, held, peaks, allowed)
+    whole = [session for session in sessions if len(session)]
+    peaks = [_range(spec, session) for session in whole]
+    limit = _lowest(spec, whole, peaks, allowed)
     if part > LEAST_PART:
-        limit -= part * (limit - _lowest(spec, held, peaks, allowed + 1))
+        limit -= part * (limit - _lowest(spec, whole, peaks, allowed + 1))
     # A session whose largest statistic does not pass a limit has no alarm at it.
-    loud = [session for session, (_, most) in zip(held, peaks, strict=True) if most > limit]
+    loud = [session for session, (_, most) in zip(whole, peaks, strict=True) if most > limit]
     count = int(_counts(spec, loud, np.array([limit]))[0])
     return AlarmLimit(limit, count, hours, promised_hours, *hours_between(count, hours))
 
