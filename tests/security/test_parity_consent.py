@@ -54,4 +54,4 @@ def test_run_folders_and_their_bundles_are_ones_own(parity, tmp_path):
     assert from_own_run(tmp_path)
     assert from_own_run(tmp_path / "bundle")
     assert not from_own_run(tmp_path / "other")
-    assert "is not a bundle" in parity(tmp_path)[1]
+    assert "holds a training that is not finished" in parity(tmp_path)[1]

@@ -10,7 +10,7 @@ import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any
 
 import typer
@@ -269,10 +269,9 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
     try:
         refuse_empty(sys.argv[1:])
         # Click would end the process itself; errors are to be told here.
-        command = _command(app) if isinstance(app, typer.Typer) else app
-        code = command(
-            prog_name="edp", standalone_mode=False
-        )  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
+        command = partial(_command(app), prog_name="edp") if isinstance(app, typer.Typer) else app
+        # The code of a command that raised typer.Exit; 130 after Ctrl-C; else None.
+        code = command(standalone_mode=False)
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:
