@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import nnls
 
 from edp.config.experiment import build
 from edp.data.features import FeatureSet
@@ -275,6 +276,25 @@ def test_further_learners_must_earn_their_place():
     better = stacking_weights([*usual, truth + noise[3]], truth, owner, [False, False, True])
     assert better[2, 0] > 0.1
     assert stacking_weights([], truth, owner, []).shape == (0, 1)
+
+
+def test_the_liveliest_fold_does_not_choose_for_all():
+    rng = np.random.default_rng(3)
+    owner = np.repeat(np.arange(5), 200)
+    size = np.where(owner == 4, 5.0, 1.0)[:, None]
+    truth = size * rng.normal(size=(1000, 1))
+    # The first model is right to a tenth but in the lively fold, the second one to a fifth everywhere.
+    first = truth + size * np.where(owner == 4, 0.4, 0.1)[:, None] * rng.normal(size=(1000, 1))
+    second = truth + size * 0.2 * rng.normal(size=(1000, 1))
+    by_squares = nnls(np.hstack([first, second]), truth[:, 0])[0]
+    shares = stacking_weights([first, second], truth, owner, [False, False])[:, 0]
+    assert shares[0] > 1.2 * by_squares[0]
+    assert shares.sum() == pytest.approx(1.0, abs=0.1)
+    # A fold that stands still counts little, and nothing is divided by nothing.
+    still = np.where(owner[:, None] == 0, 0.0, 1.0)
+    assert np.isfinite(stacking_weights([still * first, still * second], still * truth, owner, [False, False])).all()
+    zeros = np.zeros((1000, 1))
+    assert (stacking_weights([zeros], zeros, owner, [False]) == 0.0).all()
 
 
 def test_members_of_two_losses_are_a_multiple_of_twice_the_folds():
