@@ -154,6 +154,33 @@ def test_a_log_that_cannot_be_read_is_listed_and_tried_again(logs, tmp_path):
     assert_same(read_store(tmp_path / "store"), read_data_set(logs))
 
 
+@pytest.mark.parametrize("damage", [b"{", b"[]", b"null", "places", "lists", "cut"])
+def test_a_damaged_record_of_a_stopped_build_is_made_again(logs, tmp_path, monkeypatch, damage):
+    monkeypatch.setattr("edp.logs.store.building.BATCH_LOG_BYTES", 1)
+
+    def stop(progress):
+        if progress.logs == 2:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        build(logs, tmp_path / "store", on_progress=stop)
+    record = sorted((tmp_path / "store" / "rows").glob("*.json"))[0]
+    if isinstance(damage, bytes):
+        record.write_bytes(damage)
+    elif damage == "cut":
+        rows = record.with_suffix(".f32")
+        rows.write_bytes(rows.read_bytes()[:-4])
+    else:
+        table = json.loads(record.read_text())
+        if damage == "places":
+            table["recordings"][0]["first"] = 10**9
+        else:
+            table["lists"] = []
+        record.write_text(json.dumps(table))
+    build(logs, tmp_path / "store")
+    assert_same(read_store(tmp_path / "store"), read_data_set(logs))
+
+
 class Stopped(Exception):
     """Somebody pressed Ctrl-C."""
 
@@ -232,6 +259,9 @@ def test_a_file_that_was_cut_or_changed_is_refused_and_a_copied_one_is_taken(log
     rows.unlink()
     with pytest.raises(DataError, match=r"a file of the store, cannot be read"):
         read_store(tmp_path / "store")
+    # What the messages advise: remove the file, build again.
+    build(logs, tmp_path / "store")
+    assert_same(read_store(tmp_path / "store"), read_data_set(logs))
 
 
 def test_a_store_is_built_by_one_process_into_a_folder_of_its_own(logs, tmp_path):

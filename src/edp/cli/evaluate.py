@@ -54,8 +54,7 @@ def evaluate(
         if baselines is not None or channel_importance or minutes is not None:
             raise ConfigError(
                 f"'{run}' holds a twin, which has no --baselines, --minutes or --channel-importance; leave them out: "
-                "its "
-                "floors are those of its settings, judge.floors"
+                "its floors are those of its settings, judge.floors"
             )
         evaluate_twin_run(run, source, predictor, as_json)
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from edp.logs.store.index import (
     RowsFile,
     StoreEntry,
     StoreIndex,
+    check_places,
     index_of,
     is_store,
     listed,
@@ -154,7 +156,7 @@ def _built(
     logs: dict[str, StoredLog], top: Path, workers: int, on_progress: Callable[[StoreProgress], None]
 ) -> StoreIndex:
     before = read_index(top) if (top / INDEX).is_file() else StoreIndex()
-    index = _without_replaced(before, logs)
+    index = _without_replaced(_without_lost(before, top), logs)
     for record in _records_beside(top, index):
         index = _with_record(index, record, logs)
     stored = {entry.log_key for entry in index.recordings}
@@ -188,6 +190,18 @@ def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreInd
     unchanged = tuple(entry for entry in index.recordings if entry.log not in paths or entry.log_key in logs)
     used = {entry.rows for entry in unchanged}
     return replace(index, recordings=unchanged, files=tuple(file for file in index.files if file.key in used))
+
+
+def _without_lost(index: StoreIndex, top: Path) -> StoreIndex:
+    """The index less recordings whose file of rows was removed or cut: their logs are read again."""
+    whole = {file.key for file in index.files if _size(rows_path(top, file.key)) == file.bytes}
+    recordings = tuple(entry for entry in index.recordings if entry.rows in whole)
+    return replace(index, recordings=recordings, files=tuple(file for file in index.files if file.key in whole))
+
+
+def _size(path: Path) -> int:
+    """Bytes of a regular file; -1 for anything else."""
+    return path.stat().st_size if path.is_file() and not path.is_symlink() else -1
 
 
 def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[LogBatch]:
@@ -300,14 +314,19 @@ def _check_digest(assembly: Assembly, digest: str) -> None:
 
 
 def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
-    """Records of batches that an earlier build finished and no index lists."""
+    """Records of batches that an earlier build finished and no index lists; logs of a damaged one are read again."""
     present = {file.key for file in index.files}
     for path in sorted((top / ROWS).glob("*.json")):
         if path.stem in present or not rows_path(top, path.stem).is_file():
             continue
         where = f"record of the store '{path}'"
-        table = parse_json(read_text(path, BATCH_BYTES, where, DataError), where, DataError)
-        yield object_with(table, ("files", "recordings"), where, DataError)
+        with suppress(DataError):
+            table = parse_json(read_text(path, BATCH_BYTES, where, DataError), where, DataError)
+            record = object_with(table, ("files", "recordings"), where, DataError)
+            batch = index_of(record, where)
+            check_places(batch, where)
+            if [(file.key, file.bytes) for file in batch.files] == [(path.stem, _size(rows_path(top, path.stem)))]:
+                yield record
 
 
 def _with_record(index: StoreIndex, record: dict[str, Any], logs: dict[str, StoredLog]) -> StoreIndex:

@@ -136,11 +136,11 @@ def read_index(folder: str | Path) -> StoreIndex:
         raise DataError(f"{where}: kind = {str(table['kind'])[:40]!r}, expected '{KIND}'; it is no store of EDP")
     if table["schema"] != SCHEMA:
         raise DataError(
-            f"{where}: schema {str(table['schema'])[:40]}, this version of EDP reads {SCHEMA}; build the store again "
-            "from its logs"
+            f"{where}: schema {str(table['schema'])[:40]}, this version of EDP reads {SCHEMA}; remove the store and "
+            "build it again from its logs"
         )
     index = index_of(table, where)
-    _check_places(index, where)
+    check_places(index, where)
     return index
 
 
@@ -153,7 +153,7 @@ def index_of(table: dict[str, Any], where: str) -> StoreIndex:
     try:
         index = _TREE.build(StoreIndex, table, where)
     except ConfigError as error:
-        raise DataError(f"{error}; build the store again from its logs") from error
+        raise DataError(f"{error}; remove the store and build it again from its logs") from error
     for channels in index.lists:
         check_names(Path(where), [channel.name for channel in channels])
     return index
@@ -170,7 +170,7 @@ def write_plain(path: Path, plain: dict[str, Any]) -> None:
     write_bytes(path, json.dumps(plain, allow_nan=False, separators=(",", ":")).encode())
 
 
-def _check_places(index: StoreIndex, where: str) -> None:
+def check_places(index: StoreIndex, where: str) -> None:
     """Refuse recordings that lie outside their files, and files outside the store."""
     sizes = {file.key: file.bytes // NUMBER_BYTES for file in index.files}
     for key in sizes:
@@ -180,7 +180,7 @@ def _check_places(index: StoreIndex, where: str) -> None:
         if not 0 <= entry.channels < len(index.lists) or not index.lists[entry.channels]:
             raise DataError(
                 f"{where}: recording {entry.name[:80]!r} has the list of channels {entry.channels}, there are "
-                f"{len(index.lists)}, and none may be empty; build the store again from its logs"
+                f"{len(index.lists)}, and none may be empty; remove the store and build it again from its logs"
             )
         if not 0.0 < entry.rate_hz < float("inf"):
             raise DataError(
@@ -190,7 +190,7 @@ def _check_places(index: StoreIndex, where: str) -> None:
         if entry.rows not in sizes or entry.first < 0 or entry.samples < 1 or stop > sizes[entry.rows]:
             raise DataError(
                 f"{where}: recording {entry.name[:80]!r} lies at values {entry.first} to {stop} of file "
-                f"{entry.rows[:40]!r}, which the store does not have; build the store again from its logs"
+                f"{entry.rows[:40]!r}, which the store does not have; remove the store and build it again from its logs"
             )
 
 
