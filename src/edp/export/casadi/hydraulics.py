@@ -177,24 +177,24 @@ class HydraulicMachine:
         p = y[: self.nodes]
         return ca.vertcat(p - self.air / (p + ATMOSPHERE), y[self.nodes :])
 
-    def pressures(self, held: Any) -> Any:
+    def pressures(self, content: Any) -> Any:
         """The pressures at which nodes hold so much oil, and the velocities: the inverse of `contents`.
 
-        Above a vacuum, whatever is held; a stage is solved for what is held, since it is nearly linear in that.
+        Above a vacuum, whatever is content; a stage is solved for what is content, since it is nearly linear in that.
         """
-        least = held[: self.nodes] + ATMOSPHERE
+        least = content[: self.nodes] + ATMOSPHERE
         root = ca.sqrt(least * least + 4.0 * self.air)
         # Each half is free of cancellation on its side.
         absolute = ca.if_else(least > 0.0, 0.5 * (root + least), 2.0 * self.air / (root - ca.fmin(least, 0.0)))
-        return ca.vertcat(absolute - ATMOSPHERE, held[self.nodes :])
+        return ca.vertcat(absolute - ATMOSPHERE, content[self.nodes :])
 
     def _stage(self, step: float) -> tuple[ca.Function, ca.Function]:
         """The root of a stage ``(guess, parameters) -> contents``, and the largest residual there."""
         n, sizes = self.n, (self.unknown, self.n, self.valves, self.pumps, self.n, self.n * self.n, self.n, self.n, 1)
-        held, given = ca.SX.sym("held", self.unknown), ca.SX.sym("given", sum(sizes))
+        content, given = ca.SX.sym("content", self.unknown), ca.SX.sym("given", sum(sizes))
         base, bristle, x, d, s, mass, force, reached, half = ca.vertsplit(given, [0, *np.cumsum(sizes).tolist()])
-        y = self.pressures(held)
-        p, v = [y[k] for k in range(self.nodes)], held[self.nodes :]
+        y = self.pressures(content)
+        p, v = [y[k] for k in range(self.nodes)], content[self.nodes :]
         net = self._flows([*p, self.circuit[TANK], self.circuit[SUPPLY]], x, d, s)
         rows = []
         for k in range(self.nodes):
@@ -206,7 +206,7 @@ class HydraulicMachine:
                 volume, into = self.actuator[i][HEAD_DEAD + side] + area * room, net[k] - way * area * v[i]
             else:
                 volume, into = self.pump[k - 2 * n][LINE], net[k]
-            rows.append(held[k] - base[k] - step * self.circuit[BULK] / volume * into)
+            rows.append(content[k] - base[k] - step * self.circuit[BULK] / volume * into)
         inertial = ca.reshape(mass, n, n) @ (v - base[self.nodes :])
         for i in range(n):
             push = self.actuator[i][HEAD_AREA] * p[i] - self.actuator[i][ROD_AREA] * p[n + i] - force[i]
@@ -215,9 +215,9 @@ class HydraulicMachine:
             rubbing = self._friction(i, v[i], bristle[i], step)[1]
             rows.append(inertial[i] - step * (push - rubbing - self.actuator[i][STOP_STIFFNESS] * depth))
         residual = ca.vertcat(*rows)
-        root = ca.rootfinder("stage", "newton", {"x": held, "p": given, "g": residual}, ROOT)
-        left = ca.Function("left", [held, given], [ca.mmax(ca.fabs(residual))])
-        slopes = ca.Function("slopes", [held, given], [residual, ca.jacobian(residual, held)])
+        root = ca.rootfinder("stage", "newton", {"x": content, "p": given, "g": residual}, ROOT)
+        left = ca.Function("left", [content, given], [ca.mmax(ca.fabs(residual))])
+        slopes = ca.Function("slopes", [content, given], [residual, ca.jacobian(residual, content)])
         return patient(root, left, slopes), left
 
     def _flows(self, p: list[Any], x: Any, d: Any, s: Any) -> list[Any]:
@@ -308,7 +308,7 @@ class HydraulicMachine:
         length, before = self.tick_s / self.steps, y[self.nodes :]
         frozen = s + 0.5 * length * self.moved * before
         mass, force = self.load(frozen, before)
-        held = base = self.contents(y)
+        content = base = self.contents(y)
         base_z = z
         for which in range(2):
             rows = self.advance[which](rows, history)
@@ -317,13 +317,13 @@ class HydraulicMachine:
             half = 0.5 * (GAMMA * length if which == 0 else length)
             spools = rows[SPOOL, :].T
             given = ca.vertcat(base, base_z, spools, d, frozen, ca.vec(mass), force, s + half * before, half)
-            found = self.root(held, given)
-            held = ca.if_else(self.left(found, given) < LEFT, found, math.nan)
-            after = self.bristles(held[self.nodes :], base_z)
+            found = self.root(content, given)
+            content = ca.if_else(self.left(found, given) < LEFT, found, math.nan)
+            after = self.bristles(content[self.nodes :], base_z)
             if which == 0:
-                base = base + AHEAD * (held - base)
+                base = base + AHEAD * (content - base)
                 base_z = z + AHEAD * (after - z)
-        y = self.pressures(held)
+        y = self.pressures(content)
         return y, s + 0.5 * length * self.moved * (before + y[self.nodes :]), after, d, rows
 
     def tick(self, m: dict[str, Any], commands: Any, fed: Any) -> Any:
@@ -354,12 +354,12 @@ def patient(root: ca.Function, left: ca.Function, slopes: ca.Function) -> ca.Fun
     `left` is the largest residual at a root, `slopes` gives residuals and their Jacobian.
     """
     guess, given = (ca.MX.sym(name, root.size1_in(k)) for k, name in enumerate(("guess", "given")))
-    held, before, share = ca.MX.sym("held", guess.numel()), ca.MX.sym("before", guess.numel()), ca.MX.sym("share")
-    residual, jacobian = slopes(held, given)
+    content, before, share = ca.MX.sym("content", guess.numel()), ca.MX.sym("before", guess.numel()), ca.MX.sym("share")
+    residual, jacobian = slopes(content, given)
     step = -ca.solve(jacobian, residual)
     back = ca.logic_and(ca.dot(step, before) < 0.0, ca.norm_2(step) > 0.5 * ca.norm_2(before))
     shared = ca.if_else(back, ca.fmax(0.5 * share, LEAST_SHARE), ca.fmin(2.0 * share, 1.0))
-    one = ca.Function("one", [held, before, share, given], [held + shared * step, step, shared])
+    one = ca.Function("one", [content, before, share, given], [content + shared * step, step, shared])
     state = guess, ca.MX.zeros(guess.numel()), ca.MX(1.0)
     whole = one.mapaccum("whole", DAMPED, 3, {"base": DAMPED})(*state, given)
     names = [ca.MX.sym("found", guess.numel()), guess, given]
