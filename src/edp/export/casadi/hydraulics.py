@@ -70,7 +70,7 @@ class HydraulicMachine:
         self.circuit = q[self.circuit_at :]
         self.actuator = [q[first:] for first in self.at["actuator_at"]]
         self.pump = [q[first:] for first in self.at["pump_at"][: self.pumps]]
-        self.valve = [[q[place] if place != NONE else math.nan for place in row] for row in self.at["valve_at"]]
+        self.valve = [[q[k] if k != NONE else math.nan for k in row] for row in self.at["valve_at"]]
         self.air = max(self.circuit[BULK] * self.circuit[AIR] * ATMOSPHERE, 1e-9)
         step = self.tick_s / self.steps
         self.moved = np.where(self.w["scale"] > 0.0, 1.0, 0.0)
@@ -191,8 +191,8 @@ class HydraulicMachine:
     def _stage(self, step: float) -> tuple[ca.Function, ca.Function]:
         """The root of a stage ``(guess, parameters) -> contents``, and the largest residual there."""
         n, sizes = self.n, (self.unknown, self.n, self.valves, self.pumps, self.n, self.n * self.n, self.n, self.n, 1)
-        content, given = ca.SX.sym("content", self.unknown), ca.SX.sym("given", sum(sizes))
-        base, bristle, x, d, s, mass, force, reached, half = ca.vertsplit(given, [0, *np.cumsum(sizes).tolist()])
+        content, fixed = ca.SX.sym("content", self.unknown), ca.SX.sym("fixed", sum(sizes))
+        base, bristle, x, d, s, mass, force, reached, half = ca.vertsplit(fixed, [0, *np.cumsum(sizes).tolist()])
         y = self.pressures(content)
         p, v = [y[k] for k in range(self.nodes)], content[self.nodes :]
         net = self._flows([*p, self.circuit[TANK], self.circuit[SUPPLY]], x, d, s)
@@ -210,14 +210,14 @@ class HydraulicMachine:
         inertial = ca.reshape(mass, n, n) @ (v - base[self.nodes :])
         for i in range(n):
             push = self.actuator[i][HEAD_AREA] * p[i] - self.actuator[i][ROD_AREA] * p[n + i] - force[i]
-            place = reached[i] + half * v[i]
-            depth = ca.fmin(place - self.actuator[i][STOP_LOW], 0.0) + ca.fmax(place - self.actuator[i][STOP_HIGH], 0.0)
+            stroke, low, high = reached[i] + half * v[i], self.actuator[i][STOP_LOW], self.actuator[i][STOP_HIGH]
+            depth = ca.fmin(stroke - low, 0.0) + ca.fmax(stroke - high, 0.0)
             rubbing = self._friction(i, v[i], bristle[i], step)[1]
             rows.append(inertial[i] - step * (push - rubbing - self.actuator[i][STOP_STIFFNESS] * depth))
         residual = ca.vertcat(*rows)
-        root = ca.rootfinder("stage", "newton", {"x": content, "p": given, "g": residual}, ROOT)
-        left = ca.Function("left", [content, given], [ca.mmax(ca.fabs(residual))])
-        slopes = ca.Function("slopes", [content, given], [residual, ca.jacobian(residual, content)])
+        root = ca.rootfinder("stage", "newton", {"x": content, "p": fixed, "g": residual}, ROOT)
+        left = ca.Function("left", [content, fixed], [ca.mmax(ca.fabs(residual))])
+        slopes = ca.Function("slopes", [content, fixed], [residual, ca.jacobian(residual, content)])
         return patient(root, left, slopes), left
 
     def _flows(self, p: list[Any], x: Any, d: Any, s: Any) -> list[Any]:
@@ -316,9 +316,9 @@ class HydraulicMachine:
                 d = self.displaced(d, rows, y[2 * self.n : self.nodes])
             half = 0.5 * (GAMMA * length if which == 0 else length)
             spools = rows[SPOOL, :].T
-            given = ca.vertcat(base, base_z, spools, d, frozen, ca.vec(mass), force, s + half * before, half)
-            found = self.root(content, given)
-            content = ca.if_else(self.left(found, given) < LEFT, found, math.nan)
+            fixed = ca.vertcat(base, base_z, spools, d, frozen, ca.vec(mass), force, s + half * before, half)
+            solution = self.root(content, fixed)
+            content = ca.if_else(self.left(solution, fixed) < LEFT, solution, math.nan)
             after = self.bristles(content[self.nodes :], base_z)
             if which == 0:
                 base = base + AHEAD * (content - base)
@@ -353,22 +353,22 @@ def patient(root: ca.Function, left: ca.Function, slopes: ca.Function) -> ca.Fun
     Where a check or a relief toggles no step makes every residual less; steps that go to and fro are halved instead.
     `left` is the largest residual at a root, `slopes` gives residuals and their Jacobian.
     """
-    guess, given = (ca.MX.sym(name, root.size1_in(k)) for k, name in enumerate(("guess", "given")))
+    guess, fixed = (ca.MX.sym(name, root.size1_in(k)) for k, name in enumerate(("guess", "fixed")))
     content, before, share = ca.MX.sym("content", guess.numel()), ca.MX.sym("before", guess.numel()), ca.MX.sym("share")
-    residual, jacobian = slopes(content, given)
+    residual, jacobian = slopes(content, fixed)
     step = -ca.solve(jacobian, residual)
     back = ca.logic_and(ca.dot(step, before) < 0.0, ca.norm_2(step) > 0.5 * ca.norm_2(before))
     shared = ca.if_else(back, ca.fmax(0.5 * share, LEAST_SHARE), ca.fmin(2.0 * share, 1.0))
-    one = ca.Function("one", [content, before, share, given], [content + shared * step, step, shared])
+    one = ca.Function("one", [content, before, share, fixed], [content + shared * step, step, shared])
     state = guess, ca.MX.zeros(guess.numel()), ca.MX(1.0)
-    whole = one.mapaccum("whole", DAMPED, 3, {"base": DAMPED})(*state, given)
-    names = [ca.MX.sym("found", guess.numel()), guess, given]
+    whole = one.mapaccum("whole", DAMPED, 3, {"base": DAMPED})(*state, fixed)
+    names = [ca.MX.sym("solution", guess.numel()), guess, fixed]
     keep = ca.Function("keep", names, [names[0]])
     again = ca.Function("again", names, [whole[0][:, -1]])
-    found = root(guess, given)
+    solution = root(guess, fixed)
     # One branch is computed, as a rule the short one; derivatives are those of the last root, whatever it began with.
-    chosen = ca.Function.if_else("chosen", keep, again)(left(found, given) < LEFT, found, guess, given)
-    return ca.Function("patient", [guess, given], [root(chosen, given)])
+    chosen = ca.Function.if_else("chosen", keep, again)(left(solution, fixed) < LEFT, solution, guess, fixed)
+    return ca.Function("patient", [guess, fixed], [root(chosen, fixed)])
 
 
 def joint_angle(stroke: Any, knots: np.ndarray) -> Any:
