@@ -22,6 +22,7 @@ from edp.cli import (
     export,
     finetune,
     footprint,
+    forecast,
     identify,
     init,
     inspect,
@@ -63,6 +64,7 @@ app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.command("twin")(twin.twin)
 app.command("rollout")(twin.rollout)
+app.command("forecast")(forecast.forecast)
 app.command("control")(control.control)
 app.command("live")(live.live)
 app.command("tune")(control.tune)

@@ -1,0 +1,76 @@
+"""``edp forecast``: logs with what a twin says of the ticks to come as further channels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+MODELS = ("twin", "persistence")
+"""In the scores, in the order of the table's columns."""
+
+
+def forecast(
+    run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    folder: Annotated[Path, typer.Option("--out", help="New folder for the logs with forecasts (Parquet).")],
+    ahead: Annotated[list[int], typer.Option(help="Ticks ahead; give it again for more.")] = [10],  # noqa: B006
+    answer: Annotated[
+        list[str], typer.Option(help="A channel that is forecast; give it again for more. Default: the velocities.")
+    ] = [],  # noqa: B006
+    gain: Annotated[
+        float | None,
+        typer.Option(help="Share by which a tick's measurement moves the observer, 0 to 1; default: the logs choose."),
+    ] = None,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Add forecasts of a twin to logs, from which a network learns what the twin leaves.
+
+    At each tick an observer has followed the measured machine; from there the twin runs free with the commands held.
+    The channel CylVels_1_in_10 is what it then says of CylVels_1 in ten ticks: a network with task.features = "all"
+    reads it like any other channel. Prints how far off the forecasts are, beside holding the present value.
+
+    Example: `edp forecast runs/twin logs --out logs_ahead --ahead 10`
+    """
+    from edp.workflows.twin import forecast_logs
+
+    with progress(as_json) as shown:
+        bar, steps = shown.add_task("forecast", total=None, note="reading logs"), Steps(as_json)
+
+        def note(name: str, number: int, of: int) -> None:
+            shown.update(bar, total=of, completed=number - 1, note=name)
+            steps.say(f"forecast: log {number} of {of}, {name}")
+
+        result = forecast_logs(run, source_of(data, signal_map, repair), ahead, folder, answer, gain, note)
+    facts = {
+        "folder": str(folder),
+        "logs": len(result.files),
+        "channels": result.channels,
+        "gain": result.gain,
+        "ahead": result.scores,
+    }
+
+    def show() -> None:
+        for row in result.scores.values():
+            unit = row["twin"]["unit"]
+            errors = [
+                [
+                    name,
+                    row["twin"].get("units", {}).get(name, unit),
+                    *(f"{row[m]['by_channel'][name]:.3g}" for m in MODELS),
+                ]
+                for name in row["twin"]["by_channel"]
+            ]
+            title = f"{row['seconds']:g} s ahead, commands held: mean absolute error at {row['moments']:,} moments"
+            table(title, ["", "unit", "twin", "present value held"], errors)
+        out.print(f"gain of the observer: {result.gain:g}")
+        out.print(f"{len(result.files)} logs in {folder}, each with {', '.join(result.channels)}")
+        out.print(f"next: edp train {folder} --preset standard --set task.features=all --out runs/ahead")
+
+    emit(as_json, facts, show)

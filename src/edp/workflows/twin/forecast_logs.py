@@ -1,0 +1,205 @@
+"""Logs with what a twin forecasts as further channels, which networks read like measured ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edp.data.derived_velocities import matched
+from edp.errors import ConfigError, DataError, closest
+from edp.evaluation.free_run_parts import by_channel
+from edp.logs import write_recording
+from edp.logs.source import DataSource
+from edp.networks.twin import Twin
+from edp.networks.twin.forecast import CHOICE_LOGS, check_gain, check_horizons, choose_gain, forecast
+from edp.recording import Recording
+from edp.report.common.picture import file_name
+from edp.signals import Channel
+from edp.storage import make_folder
+from edp.training.twin_bundle import TwinBundle, load_twin
+
+AHEAD = "_in_"
+"""Between the name of an answer and the ticks ahead, in the name of a forecast."""
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastLogs:
+    """What was written, and how far off the forecasts are.
+
+    Attributes:
+        files: a log each.
+        channels: names of the forecasts.
+        gain: of the observer.
+        scores: by horizon as text: ticks, seconds, and under ``twin`` and ``persistence`` the mean absolute error of
+            the forecast answers, by channel and, where all have one unit, its mean.
+    """
+
+    files: tuple[Path, ...]
+    channels: tuple[str, ...]
+    gain: float
+    scores: dict[str, Any]
+
+
+def forecast_logs(
+    run: str | Path,
+    source: DataSource,
+    horizons: Sequence[int],
+    out: str | Path,
+    answers: Sequence[str] = (),
+    gain: float | None = None,
+    on_log: Callable[[str, int, int], None] | None = None,
+) -> ForecastLogs:
+    """Write logs anew with a channel for each forecast of a twin: ``CylVels_1_in_10`` is CylVels_1 in ten ticks.
+
+    In the first ticks of a log, before the twin's prefix, a forecast is the present value.
+
+    Args:
+        run: run folder of a twin.
+        source: the logs.
+        horizons: ticks ahead.
+        out: folder of the new logs (Parquet); it must not hold anything yet.
+        answers: what is forecast; empty: the velocities.
+        gain: of the observer; None: chosen on logs from which the twin learned, where these are among them, else on
+            the first ones.
+        on_log: called with the name of a log before it is read, its number and how many there are.
+
+    Raises:
+        EdpError: logs of other channels or another rate, a channel that the twin does not answer, or a folder in use.
+    """
+    check_horizons(horizons)
+    if gain is not None:
+        check_gain(gain)
+    bundle = load_twin(run)
+    twin = bundle.twin
+    columns = _columns(twin, answers)
+    folder = _empty(Path(out))
+    recordings = source.read()
+    if gain is None:
+        gain = _chosen_gain(bundle, recordings, horizons)
+    files, errors = [], []
+    for number, logged in enumerate(recordings, start=1):
+        if on_log is not None:
+            on_log(logged.name, number, len(recordings))
+        recording = _checked(twin, logged)
+        values, measured = _forecasts(twin, recording, horizons, columns, gain)
+        errors.append(_errors(values, measured, horizons, twin.prefix_ticks))
+        extended = _extended(twin, recording, values, horizons, columns)
+        # The name comes from a file: as it is, it could be a path out of the folder, or that of another log.
+        files.append(write_recording(extended, folder / f"{number:04d}_{file_name(recording.name)}.parquet"))
+    names = tuple(channel.name for channel in _channels(twin, horizons, columns))
+    return ForecastLogs(tuple(files), names, gain, _scores(twin, errors, horizons, columns))
+
+
+def _chosen_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
+    """A gain by logs from which the twin learned; where none of these is among the logs, by the first ones."""
+    parts = bundle.provenance.get("data", {}).get("names", {})
+    known = {name for part in ("train", "validation") for name in parts.get(part, ())}
+    chosen = [logged for logged in recordings if logged.name in known] or list(recordings)
+    task = bundle.twin.channels.task()
+    series = [task.series(_checked(bundle.twin, logged)) for logged in chosen[:CHOICE_LOGS]]
+    return choose_gain(bundle.twin, series, horizons)
+
+
+def _columns(twin: Twin, answers: Sequence[str]) -> list[int]:
+    names = [channel.name for channel in twin.channels.answers]
+    for name in answers:
+        if name not in names:
+            raise ConfigError(f"--answer {name}: the twin does not answer this channel{closest(name, names)}")
+    velocities = [channel.name for channel in twin.channels.velocities]
+    return [names.index(name) for name in dict.fromkeys(answers or velocities)]
+
+
+def _empty(folder: Path) -> Path:
+    """A folder in which nothing can be lost."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"--out '{folder}' holds something already; name a folder that is new or empty")
+    return make_folder(folder)
+
+
+def _checked(twin: Twin, logged: Recording) -> Recording:
+    if logged.rate_hz != twin.channels.rate_hz:
+        raise DataError(
+            f"recording '{logged.name}' has {logged.rate_hz:g} Hz, the twin {twin.channels.rate_hz:g} Hz; train a twin "
+            "on logs of this rate"
+        )
+    return matched(twin.channels, logged)
+
+
+def _forecasts(
+    twin: Twin, recording: Recording, horizons: Sequence[int], columns: list[int], gain: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Forecasts ``(tick, horizon, column)`` and what was measured ``(tick, column)``."""
+    commands, measured = (
+        np.ascontiguousarray(recording.select([channel.name for channel in part]))
+        for part in (twin.channels.commands, twin.channels.answers)
+    )
+    try:
+        values = forecast(twin, commands, measured, horizons, gain)[..., columns]
+    except DataError as error:
+        raise DataError(f"recording '{recording.name}': {error}") from error
+    present = measured[:, columns]
+    # A network that trains on the log reads a number at every tick; nothing better than the present value is known.
+    early = np.arange(len(values)) < twin.prefix_ticks
+    values[early] = present[early, None]
+    return values, present
+
+
+def _channels(twin: Twin, horizons: Sequence[int], columns: list[int]) -> list[Channel]:
+    rate, described = twin.channels.rate_hz, []
+    for k in horizons:
+        for column in columns:
+            answer = twin.channels.answers[column]
+            text = f"{answer.name} in {k / rate:g} s, as a twin forecasts it with the commands held"
+            described.append(Channel(f"{answer.name}{AHEAD}{k}", answer.kind, text))
+    return described
+
+
+def _extended(
+    twin: Twin, recording: Recording, values: np.ndarray, horizons: Sequence[int], columns: list[int]
+) -> Recording:
+    """The recording with its forecasts behind its own channels."""
+    added = _channels(twin, horizons, columns)
+    taken = [channel.name for channel in added if channel.name in recording.channel_names]
+    if taken:
+        raise DataError(
+            f"recording '{recording.name}' ({recording.source}) has a channel '{taken[0]}' already; give the logs as "
+            "they were before they had forecasts"
+        )
+    whole = np.concatenate([recording.values, values.reshape(len(values), -1)], axis=1, dtype=np.float32)
+    return replace(recording, channels=recording.channels + tuple(added), values=whole)
+
+
+def _errors(
+    values: np.ndarray, measured: np.ndarray, horizons: Sequence[int], prefix: int
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """For each horizon, sums of absolute errors of forecast and present value ``(column,)``, and how many count."""
+    sums = []
+    for place, k in enumerate(horizons):
+        truth = measured[prefix + k :]
+        pair = np.stack([values[prefix : len(values) - k, place], measured[prefix : len(measured) - k]])
+        apart = np.abs(pair[:, : len(truth)] - truth).astype(np.float64)
+        known = np.isfinite(apart).all(axis=0)
+        ours, present = np.where(known, apart, 0.0).sum(axis=1)
+        sums.append((ours, present, known.sum(axis=0)))
+    return sums
+
+
+def _scores(
+    twin: Twin,
+    errors: list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]],
+    horizons: Sequence[int],
+    columns: list[int],
+) -> dict[str, Any]:
+    forecast_channels = [twin.channels.answers[column] for column in columns]
+    rows: dict[str, Any] = {}
+    for place, k in enumerate(horizons):
+        ours, present, counted = (sum(each) for each in zip(*(log[place] for log in errors), strict=True))
+        row: dict[str, Any] = {"ticks": k, "seconds": k / twin.channels.rate_hz, "moments": int(np.min(counted))}
+        for name, total in (("twin", ours), ("persistence", present)):
+            row[name] = by_channel(forecast_channels, np.divide(total, np.maximum(counted, 1)))
+        rows[str(k)] = row
+    return rows
