@@ -9,8 +9,11 @@ Part nmpc sets predictive control on a well-trained twin beside a PI loop that i
 inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part
 o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
 plant; part o4_other the same for C14 in loam. Part grey asks parts nmpc, but for C14, and o4 of a grey box with a known
-linkage, fitted to 45 min of logs in free air, in place of the network. Their models are trained where --data has none:
-3 h of recordings, some ten processor minutes.
+linkage, fitted to 45 min of logs in free air, in place of the network. Part grey_other does so for C14: predictive
+control on a grey box of 20 min of its logs in free air, and gains in loam on grey boxes of 5, 20 and 45. Their models
+are trained where --data has none: 3 h of recordings, some ten processor minutes.
+
+Results are kept part by part, `closed_loop_PART.json`.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ from edp.workflows.twin import train_twin
 
 MACHINE = "M22"
 LEAD_TICKS = 20
-PARTS = ("lines", "nmpc", "grey", "o4", "o4_other")
+PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_other")
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,10 @@ def main() -> None:
             details["grey"], answers = predictive(models, of_loops, arguments.quick, arguments.seed, grey)
             details["grey"]["o4"] = {"twin": tuning_of.tuning_on(grey, of_tuning, arguments.seed)}
             verdicts.extend([*answers, *tuning_of.tuning_verdicts(details["grey"]["o4"], arguments.quick)])
+        if "grey_other" in parts:
+            of_loops = nmpc_of.QUICK if arguments.quick else replace(nmpc_of.FULL, draws=arguments.draws)
+            details["grey_other"], answers = grey_other(models, of_loops, arguments.quick, arguments.seed)
+            verdicts.extend(answers)
         for part, of in {"o4": tuning_of.tuning, "o4_other": tuning_of.tuning_other}.items():
             if part in parts:
                 of_tuning = tuning_of.QUICK if arguments.quick else tuning_of.FULL
@@ -120,6 +127,22 @@ def predictive(
             name = f"velocities {ticks} ticks ahead, told the commands, {part}"
             verdicts.append(verdict(name, ahead[part][str(ticks)], goal, "<= 1", "mm/s", quick))
     return {"ahead_mm_s": ahead, "loops": rows, "tick_ms": times, "size": asdict(size)}, verdicts
+
+
+def grey_other(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
+    """C14: predictive control on a grey box of it, and gains in loam on grey boxes of more and fewer minutes."""
+    fit = (models_of.QUICK_GREY if quick else models_of.GREY).fit
+    name, run = nmpc_of.OTHER_NAME, models.other_grey(models.size.other[0], fit)
+    named = (name, nmpc_of.variants(models.folder)[name])
+    rows = {name: nmpc_of.on_variant(models.folder, named, size, seed, CONTROLLERS["nmpc"](), run)}
+    verdicts = nmpc_of.loop_verdicts(rows, quick)
+    minutes = sorted(models.size.other)
+    on_grey = {f"grey box of {count} min": models.other_grey(count, fit) for count in minutes}
+    of_tuning = tuning_of.QUICK if quick else tuning_of.FULL
+    o4 = tuning_of.tuning_in_soil(on_grey, of_tuning, seed)
+    for name in on_grey:
+        verdicts.extend(tuning_of.tuning_verdicts({"twin": o4[name]}, quick, f", C14 in loam, {name}"))
+    return {"loops": rows, "o4": o4, "size": asdict(size)}, verdicts
 
 
 def trained(folder: Path, size: Size, seed: int) -> dict[str, Path]:
