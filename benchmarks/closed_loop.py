@@ -18,8 +18,10 @@ Results are kept part by part, `closed_loop_PART.json`.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,41 +75,37 @@ def main() -> None:
     arguments_of.add_argument("--part", choices=["all", *PARTS], default="all")
     arguments_of.add_argument("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines, in part nmpc")
     arguments = arguments_of.parse_args()
-    size = QUICK if arguments.quick else FULL
-    verdicts: list[Verdict] = []
+    for part in PARTS if arguments.part == "all" else (arguments.part,):
+        in_folder(arguments.data, partial(measured, part, arguments))
+
+
+def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
+    """One part, whose results are kept in a file of its own."""
+    quick, seed = arguments.quick, arguments.seed
+    size = QUICK if quick else FULL
+    of_loops = nmpc_of.QUICK if quick else replace(nmpc_of.FULL, draws=arguments.draws)
+    of_tuning = tuning_of.QUICK if quick else tuning_of.FULL
+    models = Models(folder, models_of.QUICK if quick else models_of.FULL, seed)
     details: dict[str, Any] = {"size": asdict(size)}
-
-    def measure(folder: Path) -> None:
-        parts = PARTS if arguments.part == "all" else (arguments.part,)
-        if "lines" in parts:
-            details["lines"] = rows = lines(folder, trained(folder, size, arguments.seed), size)
-            verdicts.extend(line_verdicts(rows, arguments.quick))
-        models = Models(folder, models_of.QUICK if arguments.quick else models_of.FULL, arguments.seed)
-        if "nmpc" in parts:
-            of_loops = nmpc_of.QUICK if arguments.quick else replace(nmpc_of.FULL, draws=arguments.draws)
-            details["nmpc"], answers = predictive(models, of_loops, arguments.quick, arguments.seed)
-            verdicts.extend(answers)
-        if "grey" in parts:
-            of_loops = nmpc_of.QUICK if arguments.quick else replace(nmpc_of.FULL, draws=arguments.draws)
-            grey = models.grey(models_of.QUICK_GREY if arguments.quick else models_of.GREY)
-            of_tuning = tuning_of.QUICK if arguments.quick else tuning_of.FULL
-            details["grey"], answers = predictive(models, of_loops, arguments.quick, arguments.seed, grey)
-            details["grey"]["o4"] = {"twin": tuning_of.tuning_on(grey, of_tuning, arguments.seed)}
-            verdicts.extend([*answers, *tuning_of.tuning_verdicts(details["grey"]["o4"], arguments.quick)])
-        if "grey_other" in parts:
-            of_loops = nmpc_of.QUICK if arguments.quick else replace(nmpc_of.FULL, draws=arguments.draws)
-            details["grey_other"], answers = grey_other(models, of_loops, arguments.quick, arguments.seed)
-            verdicts.extend(answers)
-        for part, of in {"o4": tuning_of.tuning, "o4_other": tuning_of.tuning_other}.items():
-            if part in parts:
-                of_tuning = tuning_of.QUICK if arguments.quick else tuning_of.FULL
-                details[part] = rows = of(models, of_tuning, arguments.seed)
-        if "o4" in parts:
-            verdicts.extend(tuning_of.tuning_verdicts(details["o4"], arguments.quick))
-
-    in_folder(arguments.data, measure)
-    name = "closed_loop" if arguments.part == "all" else f"closed_loop_{arguments.part}"
-    finish(name, verdicts, arguments.seed, details)
+    verdicts: list[Verdict] = []
+    if part == "lines":
+        details[part] = lines(folder, trained(folder, size, seed), size)
+        verdicts = line_verdicts(details[part], quick)
+    elif part == "nmpc":
+        details[part], verdicts = predictive(models, of_loops, quick, seed)
+    elif part == "grey":
+        grey = models.grey(models_of.QUICK_GREY if quick else models_of.GREY)
+        details[part], verdicts = predictive(models, of_loops, quick, seed, grey)
+        details[part]["o4"] = {"twin": tuning_of.tuning_on(grey, of_tuning, seed)}
+        verdicts += tuning_of.tuning_verdicts(details[part]["o4"], quick)
+    elif part == "grey_other":
+        details[part], verdicts = grey_other(models, of_loops, quick, seed)
+    elif part == "o4":
+        details[part] = tuning_of.tuning(models, of_tuning, seed)
+        verdicts = tuning_of.tuning_verdicts(details[part], quick)
+    else:
+        details[part] = tuning_of.tuning_other(models, of_tuning, seed)
+    finish(f"closed_loop_{part}", verdicts, seed, details)
 
 
 def predictive(

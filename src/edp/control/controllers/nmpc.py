@@ -197,7 +197,7 @@ class NmpcController(Controller):
 
     @property
     def memory(self) -> Array:
-        """Speeds of the plan (m/s), block by block, those asked for last, sums of the PI loop, disturbance, load (N)."""
+        """Speeds of the plan (m/s) by block, those asked for last, sums of the PI loop, disturbance, load (N)."""
         sums = np.zeros(AXES) if self._fallback is None else self._fallback.memory
         return np.concatenate((self._speeds.ravel(), self._latest, sums, self.model.disturbance, self.model.load))
 

@@ -45,7 +45,8 @@ PRIVATE = """\
     bool between;
     uint8_t differs[{NAME}_CONTROL_LANES * {PLANT}_VALVES];
     float demands[{NAME}_CONTROL_LANES][{NAME}_CONTROL_SPAN][{PLANT}_VALVES];
-    double room[{PLANT}_ROOM + EDP_NEAR_ROOM({PLANT}_ACTUATORS, {PLANT}_VALVES, {PLANT}_PUMPS, {NAME}_CONTROL_VARIABLES)];
+    double room[{PLANT}_ROOM +
+                EDP_NEAR_ROOM({PLANT}_ACTUATORS, {PLANT}_VALVES, {PLANT}_PUMPS, {NAME}_CONTROL_VARIABLES)];
 """
 """Fields of the state of a controller on a grey box."""
 PRESSURE_ROWS = """\
@@ -91,12 +92,14 @@ class NearModel:
 
     def cost(self, plan: PlanParts) -> str:
         """What a tick of the plan costs, for the header."""
-        return (
-            f" * COST. A tick solves the model's equations by up to {plan.newton} iterations of Newton's method together,\n"
-            f" * of {self.machine.unknown} unknowns each, in double precision, and one more for each stage where these are\n"
-            f" * spent: then the plan is dropped. DAQP has up to {plan.iterations} iterations (see edp_qp.h). No other\n"
-            " * loop has a length that varies."
+        unknown = self.machine.unknown
+        lines = (
+            f" * COST. A tick solves the model's equations, of {unknown} unknowns, by up to {plan.newton} iterations",
+            " * of Newton's method together, in double precision, and one more for each stage where these are spent:",
+            f" * then the plan is dropped. DAQP has up to {plan.iterations} iterations (see edp_qp.h). No other loop",
+            " * has a length that varies.",
         )
+        return "\n".join(lines)
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
