@@ -36,12 +36,14 @@ TRACED, SHORT = (2, 3), (2, 4, 6)
 
 
 def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
+    arguments_of = parser(__doc__ or "")
+    arguments_of.add_argument("--twin", type=Path, default=None, help="run folder of a grey box, in place of a fit")
+    arguments = arguments_of.parse_args()
     found: dict[str, Any] = {}
 
     def measure(folder: Path) -> None:
         models = models_of.Models(folder, models_of.FULL, arguments.seed)
-        run = models.grey(models_of.QUICK_GREY if arguments.quick else models_of.GREY)
+        run = arguments.twin or models.grey(models_of.QUICK_GREY if arguments.quick else models_of.GREY)
         found.update(costs(load_twin(run), make_folder(folder / "controllers"), arguments.seed, arguments.quick))
 
     in_folder(arguments.data, measure)
