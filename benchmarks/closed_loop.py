@@ -9,14 +9,19 @@ Part nmpc sets predictive control on a well-trained twin beside a PI loop that i
 inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part
 o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
 plant; part o4_other the same for C14 in loam. Part grey asks parts nmpc, but for C14, and o4 of a grey box with a known
-linkage, fitted to 45 min of logs in free air, in place of the network. Their models are trained where --data has none:
-3 h of recordings, some ten processor minutes.
+linkage, fitted to 45 min of logs in free air, in place of the network. Part grey_other does so for C14: predictive
+control on a grey box of 20 min of its logs in free air, and gains in loam on grey boxes of 5, 20 and 45. Their models
+are trained where --data has none: 3 h of recordings, some ten processor minutes.
+
+Results are kept part by part, `closed_loop_PART.json`.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +47,7 @@ from edp.workflows.twin import train_twin
 
 MACHINE = "M22"
 LEAD_TICKS = 20
-PARTS = ("lines", "nmpc", "grey", "o4", "o4_other")
+PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_other")
 
 
 @dataclass(frozen=True)
@@ -70,37 +75,37 @@ def main() -> None:
     arguments_of.add_argument("--part", choices=["all", *PARTS], default="all")
     arguments_of.add_argument("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines, in part nmpc")
     arguments = arguments_of.parse_args()
-    size = QUICK if arguments.quick else FULL
-    verdicts: list[Verdict] = []
+    for part in PARTS if arguments.part == "all" else (arguments.part,):
+        in_folder(arguments.data, partial(measured, part, arguments))
+
+
+def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
+    """One part, whose results are kept in a file of its own."""
+    quick, seed = arguments.quick, arguments.seed
+    size = QUICK if quick else FULL
+    of_loops = nmpc_of.QUICK if quick else replace(nmpc_of.FULL, draws=arguments.draws)
+    of_tuning = tuning_of.QUICK if quick else tuning_of.FULL
+    models = Models(folder, models_of.QUICK if quick else models_of.FULL, seed)
     details: dict[str, Any] = {"size": asdict(size)}
-
-    def measure(folder: Path) -> None:
-        parts = PARTS if arguments.part == "all" else (arguments.part,)
-        if "lines" in parts:
-            details["lines"] = rows = lines(folder, trained(folder, size, arguments.seed), size)
-            verdicts.extend(line_verdicts(rows, arguments.quick))
-        models = Models(folder, models_of.QUICK if arguments.quick else models_of.FULL, arguments.seed)
-        if "nmpc" in parts:
-            of_loops = nmpc_of.QUICK if arguments.quick else replace(nmpc_of.FULL, draws=arguments.draws)
-            details["nmpc"], answers = predictive(models, of_loops, arguments.quick, arguments.seed)
-            verdicts.extend(answers)
-        if "grey" in parts:
-            of_loops = nmpc_of.QUICK if arguments.quick else replace(nmpc_of.FULL, draws=arguments.draws)
-            grey = models.grey(models_of.QUICK_GREY if arguments.quick else models_of.GREY)
-            of_tuning = tuning_of.QUICK if arguments.quick else tuning_of.FULL
-            details["grey"], answers = predictive(models, of_loops, arguments.quick, arguments.seed, grey)
-            details["grey"]["o4"] = {"twin": tuning_of.tuning_on(grey, of_tuning, arguments.seed)}
-            verdicts.extend([*answers, *tuning_of.tuning_verdicts(details["grey"]["o4"], arguments.quick)])
-        for part, of in {"o4": tuning_of.tuning, "o4_other": tuning_of.tuning_other}.items():
-            if part in parts:
-                of_tuning = tuning_of.QUICK if arguments.quick else tuning_of.FULL
-                details[part] = rows = of(models, of_tuning, arguments.seed)
-        if "o4" in parts:
-            verdicts.extend(tuning_of.tuning_verdicts(details["o4"], arguments.quick))
-
-    in_folder(arguments.data, measure)
-    name = "closed_loop" if arguments.part == "all" else f"closed_loop_{arguments.part}"
-    finish(name, verdicts, arguments.seed, details)
+    verdicts: list[Verdict] = []
+    if part == "lines":
+        details[part] = lines(folder, trained(folder, size, seed), size)
+        verdicts = line_verdicts(details[part], quick)
+    elif part == "nmpc":
+        details[part], verdicts = predictive(models, of_loops, quick, seed)
+    elif part == "grey":
+        grey = models.grey(models_of.QUICK_GREY if quick else models_of.GREY)
+        details[part], verdicts = predictive(models, of_loops, quick, seed, grey)
+        details[part]["o4"] = {"twin": tuning_of.tuning_on(grey, of_tuning, seed)}
+        verdicts += tuning_of.tuning_verdicts(details[part]["o4"], quick)
+    elif part == "grey_other":
+        details[part], verdicts = grey_other(models, of_loops, quick, seed)
+    elif part == "o4":
+        details[part] = tuning_of.tuning(models, of_tuning, seed)
+        verdicts = tuning_of.tuning_verdicts(details[part], quick)
+    else:
+        details[part] = tuning_of.tuning_other(models, of_tuning, seed)
+    finish(f"closed_loop_{part}", verdicts, seed, details)
 
 
 def predictive(
@@ -120,6 +125,22 @@ def predictive(
             name = f"velocities {ticks} ticks ahead, told the commands, {part}"
             verdicts.append(verdict(name, ahead[part][str(ticks)], goal, "<= 1", "mm/s", quick))
     return {"ahead_mm_s": ahead, "loops": rows, "tick_ms": times, "size": asdict(size)}, verdicts
+
+
+def grey_other(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
+    """C14: predictive control on a grey box of it, and gains in loam on grey boxes of more and fewer minutes."""
+    fit = (models_of.QUICK_GREY if quick else models_of.GREY).fit
+    name, run = nmpc_of.OTHER_NAME, models.other_grey(models.size.other[0], fit)
+    named = (name, nmpc_of.variants(models.folder)[name])
+    rows = {name: nmpc_of.on_variant(models.folder, named, size, seed, CONTROLLERS["nmpc"](), run)}
+    verdicts = nmpc_of.loop_verdicts(rows, quick)
+    minutes = sorted(models.size.other)
+    on_grey = {f"grey box of {count} min": models.other_grey(count, fit) for count in minutes}
+    of_tuning = tuning_of.QUICK if quick else tuning_of.FULL
+    o4 = tuning_of.tuning_in_soil(on_grey, of_tuning, seed)
+    for name in on_grey:
+        verdicts.extend(tuning_of.tuning_verdicts({"twin": o4[name]}, quick, f", C14 in loam, {name}"))
+    return {"loops": rows, "o4": o4, "size": asdict(size)}, verdicts
 
 
 def trained(folder: Path, size: Size, seed: int) -> dict[str, Path]:

@@ -138,13 +138,28 @@ class Models:
         order = SimulationOrder(
             minutes=size.minutes, recordings=size.recordings, seed=self.seed + 31, mix=MIX, materials={"air": 1.0}
         )
-        source, guess = self._simulated("air", order), self.folder / "guess.toml"
-        machine = tomllib.loads((resources.files("edp.sim") / "machines" / "m22.toml").read_text(encoding="utf-8"))
+        return self._grey(self._simulated("air", order), "m22", self.folder / "guess.toml", "grey_twin", size.fit)
+
+    def other_grey(self, minutes: int, fit: Sequence[str]) -> Path:
+        """The like of C14 from minutes of its own logs in free air, and nothing of M22."""
+        order = SimulationOrder(
+            machine="C14",
+            minutes=float(minutes),
+            recordings=max(5, minutes // 2),
+            seed=self.seed + 41,
+            mix=MIX,
+            materials={"air": 1.0},
+        )
+        source, guess = self._simulated(f"c14_air_{minutes}", order), self.folder / "guess_c14.toml"
+        return self._grey(source, "c14", guess, f"c14_grey_{minutes}", fit)
+
+    def _grey(self, source: DataSource, machine: str, guess: Path, name: str, fit: Sequence[str]) -> Path:
+        told = tomllib.loads((resources.files("edp.sim") / "machines" / f"{machine}.toml").read_text(encoding="utf-8"))
         for key, factors in WRONG.items():
-            bodies = machine["bodies"]
+            bodies = told["bodies"]
             bodies[key] = [value * factor for value, factor in zip(bodies[key], factors, strict=True)]
-        guess.write_text(tomli_w.dumps(machine), encoding="utf-8")
-        return self._twin(source, "grey_twin", ("twin.kind=greybox", f"twin.linkage={guess}", *size.fit))
+        guess.write_text(tomli_w.dumps(told), encoding="utf-8")
+        return self._twin(source, name, ("twin.kind=greybox", f"twin.linkage={guess}", *fit))
 
     def beside(self, name: str) -> Path:
         """A model that stands beside it: ``static``, ``arx`` or ``one_step``."""

@@ -67,6 +67,12 @@ def tuning_on(run: Path, size: TuningSize, seed: int) -> dict[str, Any]:
 
 def tuning_other(models: Models, size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
     """C14 in soil, on twins of M22 that went on with minutes of its logs; they know no soil but that of their logs."""
+    runs = {f"twin after {minutes} min": models.other_twin(minutes) for minutes in sorted(models.size.other)}
+    return tuning_in_soil(runs, size, seed)
+
+
+def tuning_in_soil(runs: Mapping[str, Path], size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
+    """C14 in soil, on twins of it, which know no soil but that of their logs."""
     experiment = ControlExperiment(
         task=TASKS["grade"](material=SOIL), controller=CONTROLLERS["pi"](), machine=OTHER, loops=size.lines, seed=SEED
     )
@@ -75,10 +81,9 @@ def tuning_other(models: Models, size: TuningSize, seed: int) -> dict[str, dict[
     on_plant = costs_of(plant, settings)
     air = without_soil(ControlBench(experiment, ControlSources(), plant.models))
     rows = {"the plant, in free air": _row(costs_of(air, settings), on_plant)}
-    for minutes in sorted(models.size.other):
-        run = models.other_twin(minutes)
+    for name, run in runs.items():
         bench = without_soil(ControlBench(experiment, ControlSources(plant=run), plant.models))
-        rows[f"twin after {minutes} min"] = _row(costs_of(bench, settings), on_plant)
+        rows[name] = _row(costs_of(bench, settings), on_plant)
     show("gains of pi, C14 in loam", rows)
     return rows
 
@@ -120,12 +125,14 @@ def show(title: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
     )
 
 
-def tuning_verdicts(rows: Mapping[str, Mapping[str, Any]], quick: bool) -> list[Verdict]:
+def tuning_verdicts(rows: Mapping[str, Mapping[str, Any]], quick: bool, where: str = "") -> list[Verdict]:
+    """Of the model `twin` beside the others; `where` closes the questions."""
     ours = rows["twin"]
     rivals = [row["rank_correlation"] for name, row in rows.items() if name in ("static", "arx", "one_step")]
-    name = "o4: cost on the plant of the gains that the twin calls best, over the least cost"
+    name = f"o4: cost on the plant of the gains that the twin calls best, over the least cost{where}"
+    ranks = f"o4: rank correlation of costs on the twin{where}"
     verdicts = [
-        verdict("o4: rank correlation of costs on the twin", ours["rank_correlation"], 1.0, ">= 0.9", "1", quick),
+        verdict(ranks, ours["rank_correlation"], 1.0, ">= 0.9", "1", quick),
         verdict(name, ours["regret"], 1.0, "<= 1.15", "1", quick),
     ]
     if rivals:

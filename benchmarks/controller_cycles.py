@@ -109,8 +109,13 @@ TAKEN = set(
 )
 
 
-def disassembled(folder: Path) -> dict[int, tuple[int, bool, bool, int]]:
-    """Cycles, whether a single load or store, whether a branch, and length of the instruction at each address."""
+def disassembled(folder: Path, double: tuple[int, int] = (0, 0)) -> dict[int, tuple[int, bool, bool, int]]:
+    """Cycles, whether a single load or store, whether a branch, and length of the instruction at each address.
+
+    Args:
+        folder: with ``image.elf``.
+        double: cycles that a product or sum, and a division or root, takes more in double precision.
+    """
     said = subprocess.run(
         ["arm-none-eabi-objdump", "-d", "image.elf"], cwd=folder, check=True, capture_output=True, text=True
     )
@@ -121,6 +126,8 @@ def disassembled(folder: Path) -> dict[int, tuple[int, bool, bool, int]]:
             continue
         word, operands = match[2], match[3].strip()
         cycles, single = fixed_cycles(word, operands)
+        if ".f64" in word and not word.startswith(("vldr", "vstr", "vmov")):
+            cycles += double[1] if word.startswith(("vdiv", "vsqrt")) else double[0]
         plain = word.partition(".")[0]
         jumps = bool(BRANCHES.match(plain)) or "pc}" in operands or operands.startswith("pc,")
         codes = re.match(r"^\s*[0-9a-f]+:\s+([0-9a-f]{4})( [0-9a-f]{4})?", line)
@@ -136,9 +143,9 @@ def traced(folder: Path, ticks: int) -> tuple[int, int]:
     return traced_image(folder, QEMU)
 
 
-def traced_image(folder: Path, emulator: tuple[str, ...]) -> tuple[int, int]:
-    """Instructions and cycles of a whole run of ``image.elf``, start-up included."""
-    known = disassembled(folder)
+def traced_image(folder: Path, emulator: tuple[str, ...], double: tuple[int, int] = (0, 0)) -> tuple[int, int]:
+    """Instructions and cycles of a whole run of ``image.elf``, start-up included; `double` as in `disassembled`."""
+    known = disassembled(folder, double)
     command = [*emulator, *TRACE, "-kernel", "image.elf"]
     instructions, cycles, before, behind = 0, 0, None, False
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as running:

@@ -221,6 +221,16 @@ def exported_plan(c, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def exported_grey(c, tmp_path_factory):
+    """A predictive controller on a grey box, in the same way."""
+    pytest.importorskip("daqp", reason="the solver is an optional package")
+    c.need("gcc")
+    from exported_controllers import exported_run
+
+    return exported_run(c, tmp_path_factory.mktemp("grey"), "nmpc", grey=True)
+
+
+@pytest.fixture(scope="session")
 def exported_loop(c, tmp_path_factory):
     """A PI loop, in the same way."""
     c.need("gcc")

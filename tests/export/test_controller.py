@@ -21,6 +21,7 @@ from edp.errors import BundleError, ConfigError, EdpError, ExportError, StorageE
 from edp.export.c.target import CTarget
 from edp.export.controller import write_controller
 from edp.export.controller.lanes import lane_model
+from edp.export.controller.near import near_model
 from edp.export.golden import random_inputs
 from edp.networks.twin import TWINS
 from edp.networks.twin.recurrent import Recurrent
@@ -33,7 +34,10 @@ from edp.workflows.control.kept import load_kept
 
 OK, FALLBACK, NEUTRAL, NOT_BEGUN, REFUSED = range(5)
 M7 = ("-mthumb", "-mcpu=cortex-m7", "-mfloat-abi=hard", "-mfpu=fpv5-d16")
-ALLOWED = {"memset", "memcpy", "floorf", "sqrt", "sqrtf", "expf", "logf", "fabsf", "erff", "log1pf"}
+ALLOWED = {
+    *("memset", "memcpy", "floorf", "sqrt", "sqrtf", "expf", "logf", "fabsf", "erff", "log1pf"),
+    *("exp", "tanh", "sin", "cos", "sincos"),
+}
 """What a controller may ask of the C library: none of it allocates."""
 HOSTILE = ('x*/ int y; /*"\\', "??/\n#error no", "%n ${name} `id`", "\u202eesrever", "x" * 700)
 BOARD = Path(__file__).parent / "board"
@@ -41,6 +45,7 @@ STORED = 11_450_000
 """Instructions of a tick on the M7 with GCC 12, -O2: 40 ticks in six blocks on a twin of eight units and a map."""
 SAME_LEVER = 2e-3
 """Of a tick from the same memory, a share of full."""
+KINDS = ("exported_plan", "exported_grey", "exported_loop")
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +67,7 @@ def task(kept, env):
     return draw_task(kept.experiment.task, interface_of(env).geometry, 100.0, 3)
 
 
-@pytest.mark.parametrize("kind", ["exported_plan", "exported_loop"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_each_tick_is_that_of_the_controller_and_every_rule_holds(c, kind, request, tmp_path):
     exported = request.getfixturevalue(kind)
     program = [*compiled(c, exported.folder, tmp_path), "host_test.c", "-lm", "-o", tmp_path / "program"]
@@ -73,7 +78,7 @@ def test_each_tick_is_that_of_the_controller_and_every_rule_holds(c, kind, reque
     assert float(re.search(r"difference of a lever: (\S+)", told)[1]) < SAME_LEVER / 2
 
 
-@pytest.mark.parametrize("kind", ["exported_plan", "exported_loop"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("compiler", "flags"), [("clang", ()), ("arm-none-eabi-gcc", M7), ("gcc", ("-O3",))])
 def test_it_compiles_without_a_warning_and_asks_for_no_heap(c, kind, compiler, flags, request, tmp_path):
     c.need(compiler)
@@ -158,6 +163,31 @@ def test_whatever_comes_levers_stay_within_range_and_slew(exported_plan, kept, t
     assert [ours.step(kept.observed[0], 0) is not None and ours.statuses[-1] for _ in range(3)] == [OK] * 3
 
 
+def test_a_loop_on_a_grey_box_in_c_is_as_good_as_that_in_python(exported_grey):
+    kept = load_kept(exported_grey.run)
+    env = plant_of("M22", 40.0, 100.0)
+    task = draw_task(kept.experiment.task, interface_of(env).geometry, 100.0, 3)
+    python = built(kept)
+    ours = Compiled(exported_grey.library, python.plant, python.reads)
+    expected, found = (run_loop(env, controller, task, 3) for controller in (python, ours))
+    assert found.score.position_rms_mm == pytest.approx(expected.score.position_rms_mm, rel=0.15, abs=0.5)
+    assert found.score.path_rms_mm == pytest.approx(expected.score.path_rms_mm, rel=0.15, abs=0.5)
+    assert set(ours.statuses) == {OK}
+
+
+def test_equations_that_take_too_long_bring_the_pi_loop_in_time(c, exported_grey, tmp_path):
+    export_controller(exported_grey.run, tmp_path / "c", "machine", {"newton": "2"})
+    assert "#define MACHINE_CONTROL_NEWTON 2u" in (tmp_path / "c" / "machine_control.h").read_text()
+    kept = load_kept(exported_grey.run)
+    python = built(kept)
+    ours = Compiled(library_of(c, tmp_path / "c", tmp_path / "objects"), python.plant, python.reads)
+    assert ours.reset(kept.observed[0], reference_of(kept)) == OK
+    for tick in range(5):
+        levers = ours.step(kept.observed[tick], tick)
+        assert np.abs(levers).max() <= 1.0
+    assert set(ours.statuses) == {FALLBACK}
+
+
 def test_an_input_that_is_missing_leaves_the_model_running_as_in_python(exported_plan, kept):
     python = built(kept)
     ours = Compiled(exported_plan.library, python.plant, python.reads)
@@ -208,7 +238,7 @@ def sanitised_stream(c, exported, tmp_path, rows):
     return np.frombuffer(told, np.float32).reshape(len(rows), 4)
 
 
-@pytest.mark.parametrize("kind", ["exported_plan", "exported_loop"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_any_bits_of_inputs_break_no_rule_of_c(c, kind, request, tmp_path):
     exported = request.getfixturevalue(kind)
     kept = load_kept(exported.run)
@@ -355,7 +385,7 @@ def test_names_that_c_cannot_carry_are_refused(name, exported_plan, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "text"),
-    [({"tangent": "true"}, "no such option"), ({"iterations": "1"}, "from 2 to"), ({"iterations": "-5"}, "from 2 to")],
+    [({"tangent": "true"}, "no such option"), ({"iterations": "1"}, "from 2 to"), ({"newton": "-5"}, "from 2 to")],
 )
 def test_options_that_cannot_be_are_refused(options, text, exported_plan, tmp_path):
     with pytest.raises(ConfigError, match=text):
@@ -367,12 +397,13 @@ def test_a_run_that_kept_no_controller_is_refused(tmp_path):
         export_controller(tmp_path, tmp_path / "c", "machine")
 
 
-def test_a_twin_whose_equations_are_iterated_is_refused(kept):
-    spec = TWINS["greybox"]()
+def test_a_network_on_a_grey_box_is_refused(kept):
+    spec = TWINS["residual"]()
     parts = parts_of(kept.experiment, kept.plant, kept.models, kept.twin)
-    grey = plant_bundle(TwinBundle(spec, sample_twin(spec)[0]))
-    with pytest.raises(ExportError, match="no bounded time"):
-        lane_model("machine_plant", grey)
+    residual = plant_bundle(TwinBundle(spec, sample_twin(spec)[0]))
+    assert near_model("machine_plant", replace(parts.plan, plant=residual)) is None
+    with pytest.raises(ExportError, match="network on a grey box"):
+        lane_model("machine_plant", residual)
     assert parts.plan.lane_ticks == 40 + 3 * (40 + 38 + 35 + 31 + 25 + 15) + 1 + 20
 
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from edp.config.control import load_control_experiment
-from edp.testing.control import sample_recurrent_twin
+from edp.testing.control import sample_grey_box, sample_recurrent_twin
 from edp.training.twin_bundle import save_twin
 from edp.workflows.control import ControlSources, control_loops, export_controller
 
@@ -21,11 +21,11 @@ SOLVER = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-O2")
 """DAQP's own files convert numbers implicitly."""
 
 
-def control_run(folder: Path, kind: str, options: dict | None = None) -> Path:
-    """A finished run of one loop on the simulator."""
+def control_run(folder: Path, kind: str, options: dict | None = None, grey: bool = False) -> Path:
+    """A finished run of one loop on the simulator; `grey`: a plan on a grey box."""
     twin = None
     if kind == "nmpc":
-        twin = save_twin(sample_recurrent_twin(UNITS), folder / "twin")
+        twin = save_twin(sample_grey_box() if grey else sample_recurrent_twin(UNITS), folder / "twin")
     settings = {"controller": {"kind": kind, **(options or {})}, "loops": 1, "task": TASK}
     control_loops(load_control_experiment(None, [], settings), folder / "run", ControlSources(twin=twin))
     return folder / "run"
@@ -95,9 +95,9 @@ class Compiled:
         return self._last.ctypes.data_as(ctypes.c_void_p)
 
 
-def exported_run(c, root: Path, kind: str) -> SimpleNamespace:
+def exported_run(c, root: Path, kind: str, grey: bool = False) -> SimpleNamespace:
     """A run, its export and its library."""
-    run = control_run(root, kind)
+    run = control_run(root, kind, grey=grey)
     files = export_controller(run, root / "c", "machine")
     library = library_of(c, root / "c", root / "objects")
     return SimpleNamespace(run=run, folder=root / "c", files=files, library=library, kind=kind)

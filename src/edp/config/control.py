@@ -12,7 +12,8 @@ from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.control.controllers.pi import ProportionalIntegral
 from edp.control.tasks import TASKS, TaskSpec
 from edp.control.tasks.grade import Grade
-from edp.settings.bounds import MOST_SEED, above, check_bounds, integer
+from edp.errors import ConfigError
+from edp.settings.bounds import MOST_SEED, above, check_bounds, integer, span
 from edp.settings.tree import SettingsTree, Table
 
 CONTROL_SETTINGS = SettingsTree(
@@ -32,6 +33,8 @@ class ControlExperiment:
         loops: number of loops, each of a seed of its own.
         seed: of the first loop; the next ones count on.
         rate_hz: ticks per second.
+        deadline_ms: time of the clock after which an answer of the controller counts as missing, and levers go towards
+            neutral; 0: none. With one, loops depend on what else the computer does.
     """
 
     task: TaskSpec = field(default_factory=Grade)
@@ -40,6 +43,7 @@ class ControlExperiment:
     loops: int = 6
     seed: int = 0
     rate_hz: float = 100.0
+    deadline_ms: float = 0.0
 
     def __post_init__(self) -> None:
         # The last loop's seed must be one, too.
@@ -49,7 +53,13 @@ class ControlExperiment:
             loops=integer(1, MOST_LOOPS),
             seed=integer(0, MOST_SEED - MOST_LOOPS),
             rate_hz=above(0.0, 1000.0),
+            deadline_ms=span(0.0, 1e6),
         )
+        if self.deadline_ms > 1e3 / self.rate_hz:
+            raise ConfigError(
+                f"control: deadline_ms = {self.deadline_ms:g}, but a tick has {1e3 / self.rate_hz:g} ms at rate_hz = "
+                f"{self.rate_hz:g}; give a deadline within it, or 0 for none"
+            )
 
 
 def load_control_experiment(

@@ -172,6 +172,19 @@ class Controller(ABC):
         self._before = self.limits.applied(asked, self._before, self.plant.rate_hz)
         return self._before.copy()
 
+    def late(self, before: Array, tick: int, reason: str) -> Array:
+        """Levers in place of those of `step` where they came too late: towards neutral; an event is logged.
+
+        Args:
+            before: levers of the tick before, shape (3,).
+            tick: row of the reference that belongs to now.
+            reason: for the log.
+        """
+        self._log(tick, f"{reason}: spools to neutral")
+        self.missed(tick)
+        self._before = self.limits.applied(np.zeros(AXES), before, self.plant.rate_hz)
+        return self._before.copy()
+
     def _asked(self, observation: Array, tick: int, verdict: GuardVerdict) -> tuple[Array, str]:
         """Levers before limits, and the fault for which they are neutral; empty without one."""
         values = np.asarray(observation, float)

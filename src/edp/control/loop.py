@@ -71,6 +71,7 @@ def run_loop(
     seed: int,
     options: Mapping[str, Any] | None = None,
     guard: LoopGuard | None = None,
+    deadline_s: float = 0.0,
 ) -> LoopResult:
     """Run a controller on a plant along a task.
 
@@ -82,6 +83,8 @@ def run_loop(
         seed: of the environment.
         options: further options of the environment's reset.
         guard: what says at each tick which channels the controller may read, and whether it has to fall back.
+        deadline_s: time of the clock after which an answer of the controller counts as missing: levers go towards
+            neutral in its place. 0: none. A loop with a deadline depends on what else the computer does.
 
     Raises:
         ConfigError: the environment and the controller do not fit, or a channel is missing at the start.
@@ -97,7 +100,7 @@ def run_loop(
     names = tuple(name for name in (*STROKES, *TIP, *PUMPS, *OTHERS, *GROUND_CHANNELS) if name in info["truth"])
     if guard is not None:
         guard.reset(controller.plant)
-    watched = _Watched(controller, guard)
+    watched = _Watched(controller, guard, deadline_s)
     rows, infos = _driven(env, watched, reference.ticks, names, (observation, info))
     trace = _trace(rows, names, geometry, controller)
     score = scored(trace, reference, task.limits, sum(event.ticks for event in controller.events))
@@ -108,8 +111,8 @@ def run_loop(
 class _Watched:
     """A controller and what guards it."""
 
-    def __init__(self, controller: Controller, guard: LoopGuard | None) -> None:
-        self.controller, self._guard = controller, guard
+    def __init__(self, controller: Controller, guard: LoopGuard | None, deadline_s: float) -> None:
+        self.controller, self._guard, self._deadline_s = controller, guard, deadline_s
         self.warnings: list[ControlEvent] = []
 
     def step(self, observation: Array, tick: int) -> tuple[Array, float]:
@@ -117,9 +120,12 @@ class _Watched:
         verdict = TRUSTED if self._guard is None else verdict_of(self._guard, self.controller.plant, observation)
         if verdict.untrusted or verdict.fall_back:
             log_event(self.warnings, tick, str(verdict))
-        before = time.perf_counter()
+        began, before = time.perf_counter(), self.controller.before
         levers = self.controller.step(observation, tick, verdict)
-        return levers, time.perf_counter() - before
+        spent = time.perf_counter() - began
+        if 0.0 < self._deadline_s < spent:
+            levers = self.controller.late(before, tick, f"no answer within {1e3 * self._deadline_s:g} ms")
+        return levers, spent
 
 
 def _driven(

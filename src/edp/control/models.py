@@ -41,5 +41,7 @@ class ControlModels:
             ConfigError: there is none; `who` needs it.
         """
         if self.twin is None:
-            raise ConfigError(f"controller '{who}' needs a twin; train one with edp twin and name its run folder")
+            raise ConfigError(
+                f"controller '{who}' needs a twin; train one with edp twin and name its run folder with --twin"
+            )
         return self.twin

@@ -11,6 +11,7 @@ from edp.control.plant import STROKES
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels, twin_channels
 from edp.networks.twin import TWINS, Twin, TwinScales, fit_scales
+from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.recurrent import Recurrent
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.scenario import Scenario
@@ -45,6 +46,13 @@ def sample_recurrent_twin(units: int, machine: str = "M22") -> TwinBundle:
         if twin.network.pull is not None:
             twin.network.pull.fill_(PULL)
     return TwinBundle(spec, twin)
+
+
+def sample_grey_box(machine: str = "M22") -> TwinBundle:
+    """A grey box with the linkage of a machine, as a fit begins with it: nobody fitted its numbers."""
+    channels, scales, series = _sample(machine)
+    spec = GreyBox(linkage=machine)
+    return TwinBundle(spec, spec.start(channels, scales, series, 0))
 
 
 def _sample(machine: str) -> tuple[TwinChannels, TwinScales, list[Series]]:

@@ -59,14 +59,18 @@ class FmuPlant:
         return row
 
 
+@pytest.fixture(scope="module", params=[("exported_plan", 2), ("exported_plan", 3), ("exported_grey", 3)])
+def case(request):
+    """A controller on a recurrent twin or on a grey box, and the version of FMI in which its twin is the plant."""
+    kind, version = request.param
+    exported = request.getfixturevalue(kind)
+    return exported, load_kept(exported.run), version
+
+
 @pytest.fixture(scope="module")
-def kept(exported_plan):
-    return load_kept(exported_plan.run)
-
-
-@pytest.fixture(scope="module", params=[2, 3])
-def plant(request, c, fmi, kept, tmp_path_factory):
-    folder, version = tmp_path_factory.mktemp("plant"), request.param
+def plant(case, c, fmi, tmp_path_factory):
+    _, kept, version = case
+    folder = tmp_path_factory.mktemp("plant")
     FmuTarget(version=str(version), binaries="none").write(plant_bundle(kept.twin), "plant", folder)
     with zipfile.ZipFile(folder / f"plant_fmi{version}.fmu") as archive:
         archive.extractall(folder)
@@ -77,9 +81,10 @@ def plant(request, c, fmi, kept, tmp_path_factory):
     return FmuPlant(fmi.Unit(folder, version).start(), kept)
 
 
-def test_the_compiled_controller_grades_a_line_on_the_exported_twin(exported_plan, kept, plant):
+def test_the_compiled_controller_grades_a_line_on_the_exported_twin(case, plant):
+    exported, kept, _ = case
     python = kept.experiment.controller.build(kept.plant, kept.experiment.task.limits, kept.models)
-    controller = Compiled(exported_plan.library, kept.plant, python.reads)
+    controller = Compiled(exported.library, kept.plant, python.reads)
     # The line of the run, whose start is the first kept observation.
     task = draw_task(kept.experiment.task, kept.plant.geometry, kept.plant.rate_hz, kept.experiment.seed)
     reference = task.reference

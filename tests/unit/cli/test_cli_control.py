@@ -109,6 +109,8 @@ def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, tw
         (("--set", "task.limits.pressure_pa=1e5"), "but the machine rests with CylPressures_1 at"),
         (("--set", "controller.proportional=-1"), "0 <= proportional <= 100 must hold"),
         (("--set", "task.length_m=[20,30]"), "none of 200 draws can be done"),
+        (("--set", "deadline_ms=12"), "a tick has 10 ms at rate_hz = 100; give a deadline within it"),
+        (("--controller", "nmpc"), "name its run folder with --twin"),
         (("--plant", "nowhere"), "nowhere"),
     ],
 )

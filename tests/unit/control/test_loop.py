@@ -1,5 +1,7 @@
 """Loops on the simulator and on a twin: what is recorded, what is repeated, what is refused."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,31 @@ class Still(Controller):
     def levers(self, measured, tick):
         self.info = {"tick": float(tick)}
         return np.zeros(3)
+
+
+class Slow(Still):
+    """Asks for full levers, and takes its time at two ticks."""
+
+    def levers(self, measured, tick):
+        if tick in (3, 4):
+            time.sleep(0.3)
+        return np.ones(3)
+
+
+def test_an_answer_past_its_deadline_gives_way_to_the_safe_command(env, task):
+    controller = Slow(interface_of(env), task.limits)
+    result = run_loop(env, controller, task, 7, deadline_s=0.2)
+    levers = result.recording.select(("Lever_1", "Lever_2", "Lever_3"))
+    assert [(event.tick, event.ticks) for event in result.events] == [(3, 2)]
+    assert "no answer within 200 ms: spools to neutral" in result.events[0].text
+    step = 5.0 / 100.0
+    assert levers[:6, 0] == pytest.approx(step * np.array([1, 2, 3, 2, 1, 2]))
+    assert result.score.missed == 2
+
+
+def test_a_loop_without_a_deadline_waits(env, task):
+    result = run_loop(env, Slow(interface_of(env), task.limits), task, 7)
+    assert result.events == ()
 
 
 def test_a_loop_records_what_was_seen_true_wanted_and_done(env, valves, task):

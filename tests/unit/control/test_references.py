@@ -135,7 +135,8 @@ def test_a_digging_cycle_goes_below_ground_and_ends_above_it(geometry):
 
 
 def test_a_task_that_no_draw_can_do_is_one_error_that_says_where(geometry):
-    with pytest.raises(ConfigError, match=r"task 'grade', seed 0: none of 200 draws can be done; the last: .* at t = "):
+    words = r"none of 200 draws can be done \(200 leave reach or strokes, 0 are too fast .*\): .*; the last: .* at t = "
+    with pytest.raises(ConfigError, match=rf"task 'grade', seed 0: {words}"):
         draw_task(TASKS["grade"](length_m=(20.0, 25.0)), geometry, RATE, 0)
 
 

@@ -197,9 +197,9 @@ class NmpcController(Controller):
 
     @property
     def memory(self) -> Array:
-        """Speeds of the plan (m/s), block by block, those asked for last, sums of the PI loop, disturbance."""
+        """Speeds of the plan (m/s) by block, those asked for last, sums of the PI loop, disturbance, load (N)."""
         sums = np.zeros(AXES) if self._fallback is None else self._fallback.memory
-        return np.concatenate((self._speeds.ravel(), self._latest, sums, self.model.disturbance))
+        return np.concatenate((self._speeds.ravel(), self._latest, sums, self.model.disturbance, self.model.load))
 
     def missed(self, tick: int) -> None:
         """Where no row came, the ports of the twin run free."""

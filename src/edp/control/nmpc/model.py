@@ -61,6 +61,12 @@ class TwinModel:
         self._past: deque[tuple[TwinState, NDArray[np.float32], NDArray[np.float32]]] = deque(maxlen=window)
         self._alone = np.zeros(1, np.int64)
 
+    @property
+    def load(self) -> Array:
+        """Forces (N) against boom, arm and bucket that were estimated, shape (3,); zero of a twin without a load."""
+        forces = self._runner.resistance
+        return np.zeros(AXES) if forces is None else np.asarray(forces[self._velocities])
+
     def begin(self, measured: Array) -> None:
         """Form the memory as if the machine had rested with this row of `reads` and neutral levers."""
         ticks = max(1, self.twin.prefix_ticks)

@@ -148,13 +148,17 @@ def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) 
     name = TASKS.name_of(spec)
     fastest = SPEED_RESERVE * speed_table(geometry.machine)[1][:, :, -1].T
     rng = np.random.default_rng(seed)
-    reason = ""
+    reason, within = "", 0
     for _ in range(TRIES):
         try:
             reference = spec.drawn(rng, geometry, rate_hz, name)
+            within += 1
             check_speeds(name, reference, geometry, fastest)
         except ConfigError as error:
             reason = str(error)
             continue
         return ControlTask(name, reference, spec.limits, spec.material, seed)
-    raise ConfigError(f"task '{name}', seed {seed}: none of {TRIES} draws can be done; the last: {reason}")
+    raise ConfigError(
+        f"task '{name}', seed {seed}: none of {TRIES} draws can be done ({TRIES - within} leave reach or strokes, "
+        f"{within} are too fast for a cylinder): give a shorter or slower one; the last: {reason}"
+    )

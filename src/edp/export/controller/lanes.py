@@ -13,16 +13,36 @@ from edp.errors import ExportError
 from edp.export.c.calls import Calls, constant, describe, slot
 from edp.export.c.model import Model, crc, make_model, remembered
 from edp.export.c.text import call, filled, identifier, indented, number
+from edp.export.controller.parts import PlanParts
 from edp.export.escape import Code, c_comment, fill
 from edp.export.hashes import model_hash, scale_hash
 from edp.ir import Layer, layers, memory
 from edp.ir.base import INPUT, Number
-from edp.ir.hydraulics import HydraulicTick
 from edp.networks.input_range import input_limits
 from edp.networks.twin import TwinPlant
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_lanes.h", "edp_lanes.c")
+PUBLIC = ""
+PRIVATE = """\
+    {plant}_memory model;
+    struct {{
+        {plant}_memory memory;
+        float row[{PLANT}_INPUTS];
+    }} past[{NAME}_CONTROL_WINDOW];
+    /* Scratch of a tick. */
+    {plant}_memory lanes[{NAME}_CONTROL_LANES];
+    float rows[{NAME}_CONTROL_LANES][{PLANT}_INPUTS];
+    float works[{NAME}_CONTROL_LANES][{PLANT}_WORK];
+    float answers[{NAME}_CONTROL_LANES][{PLANT}_ANSWERS];
+"""
+"""Fields of the state of a controller on a model with lanes."""
+PRESSURE_ROWS = """\
+            for (uint32_t i = 0; (i < {count}u) && (left == 1u); i++) {{
+                add_row(c, c->answers[0][pressure_answers[i]] / most_pressure, -1e30f, 1.0f, pressure_answers[i],
+                        most_pressure, variables);
+            }}
+"""
 PORTS, FED = "ports.", "ports.fed"
 """Layers of a plant that choose between measured values and last answers, and what they choose."""
 
@@ -40,6 +60,22 @@ class LaneModel:
     name: str
     model: Model
     plant: TwinPlant
+
+    fragment = "plan_lanes"
+    public, private, recalled, pressure_rows = PUBLIC, PRIVATE, "", PRESSURE_ROWS
+
+    def sizes(self, plan: PlanParts) -> dict[str, int]:
+        """Further sizes that the controller defines."""
+        return {}
+
+    def cost(self, plan: PlanParts) -> str:
+        """What a tick of the plan costs, for the header."""
+        macs = plan.lane_ticks * self.model.graph.macs
+        return (
+            f" * COST. A tick runs {plan.lane_ticks} ticks of the model, {macs} multiply-accumulates, and up to "
+            f"{plan.iterations} iterations\n * of the solver, in double precision (see edp_qp.h). No other loop has a "
+            "length that varies."
+        )
 
     @property
     def work(self) -> int:
@@ -173,17 +209,16 @@ def lane_model(name: str, bundle: Bundle) -> LaneModel:
         bundle: of a `TwinPlant`.
 
     Raises:
-        ExportError: no twin, one in integer arithmetic, or one whose equations are solved by iterations: a tick of a
-            controller must take as long whatever comes in.
+        ExportError: no twin, one in integer arithmetic, or one with a layer that solves equations by iterations.
     """
     plant = bundle.predictor
     if not isinstance(plant, TwinPlant):
         raise ExportError("the model of a controller is a twin; export a run of edp control whose twin is one")
     model = make_model(name, bundle)
-    if model.integer or any(isinstance(layer, HydraulicTick) for layer in model.graph.layers):
-        what = "computes in integer arithmetic" if model.integer else "solves its equations by iterations"
+    if model.integer or model.hydraulic:
+        what = "computes in integer arithmetic" if model.integer else "has a network on a grey box"
         raise ExportError(
-            f"the twin of the controller {what}, so that a tick of the plan has no bounded time in C; run edp control "
-            "with a recurrent twin"
+            f"the twin of the controller {what}, which no plan in C can follow; run edp control with a recurrent twin "
+            "or a grey box"
         )
     return LaneModel(name, model, plant)

@@ -65,8 +65,8 @@ class ConstantTables:
         return Code("\n".join([*self.lines, array("edp_table", "tables", self.entries)]) + "\n")
 
 
-def constants_of_controller(parts: ControllerParts) -> ConstantTables:
-    """Everything that is not the model's."""
+def constants_of_controller(parts: ControllerParts, near: bool = False) -> ConstantTables:
+    """Everything that is not the model's; `near`: a plan is on a grey box, whose load is estimated."""
     tables = ConstantTables()
     tables.floats("input_low", parts.limits_low)
     tables.floats("input_high", parts.limits_high)
@@ -82,11 +82,11 @@ def constants_of_controller(parts: ControllerParts) -> ConstantTables:
         gains = ", ".join(map(number, (*parts.gains, parts.rate_hz)))
         tables.text(f"static const edp_pi_gains gains = {{{gains}, {parts.lead}u}};")
     if parts.plan is not None:
-        _set_plan(tables, parts, parts.plan)
+        _set_plan(tables, parts, parts.plan, near)
     return tables
 
 
-def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts) -> None:
+def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts, near: bool) -> None:
     _set_sides(tables, "plan", plan.sides)
     tables.floats("slowest", plan.slowest)
     tables.floats("fastest", plan.fastest)
@@ -94,6 +94,9 @@ def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts) -
     tables.small("ports", plan.ports)
     tables.small("stroke_reads", parts.stroke_inputs)
     tables.small("stroke_answers", plan.strokes)
+    if near:
+        tables.small("velocity_reads", [plan.ports.index(answer) for answer in plan.velocities])
+        tables.small("velocity_answers", plan.velocities)
     if plan.pressures:
         tables.small("pressure_answers", plan.pressures)
     tables.text(f"static const edp_lever_shape lever_shape = {_braced(plan.lever_shape)};")
@@ -104,6 +107,7 @@ def _set_plan(tables: ConstantTables, parts: ControllerParts, plan: PlanParts) -
     tables.text(f"static const edp_pilot pilots[{len(plan.pilots)}] = {{\n{pilots}\n}};")
     names = ("along", "attitude", "change", "feedforward", "trust", "smoothing")
     scalars = dict(zip(names, plan.weights, strict=True)) | {"STEP": plan.step_m_s, "margin": plan.margin}
+    scalars |= {"load": plan.load} if near else {}
     scalars |= {"most_pressure": plan.pressure_pa} if plan.pressures else {}
     for name, value in scalars.items():
         tables.text(f"static const float {name} = {number(value)};")

@@ -44,6 +44,7 @@ class PlanParts:
         lever_shape: full pressure (Pa), dead zone of levers, demand at which conflux begins.
         ports: answer of the twin that each measured value is.
         strokes: answers that are the strokes.
+        velocities: answers that are the velocities of boom, arm and bucket.
         pressures: answers that are limited.
         sides: speeds (m/s) and levers of the continuous inverse map, by axis, extending and retracting.
         slowest: least speed (m/s) that a lever's range gives, shape (3,).
@@ -55,6 +56,8 @@ class PlanParts:
         pressure_pa: largest cylinder pressure.
         fallback: whether the PI loop answers where the plan has no solution.
         iterations: most of the solver, a tick.
+        load: share of a new error of the velocities that forces against the cylinders take over, of a grey box.
+        newton: most iterations of a grey box's equations, a tick.
     """
 
     plant: Bundle
@@ -63,6 +66,7 @@ class PlanParts:
     lever_shape: tuple[float, float, float]
     ports: tuple[int, ...]
     strokes: tuple[int, ...]
+    velocities: tuple[int, ...]
     pressures: tuple[int, ...]
     sides: Sequence[tuple[Side, Side]]
     slowest: Array
@@ -74,6 +78,8 @@ class PlanParts:
     pressure_pa: float
     fallback: bool
     iterations: int
+    load: float
+    newton: int
 
     @property
     def variables(self) -> int:
@@ -100,7 +106,7 @@ class GoldenLoop:
     Attributes:
         measured: values of the controller's inputs, shape (ticks, input).
         before: what it remembered before each tick, shape (ticks, number): levers; speeds of the plan, those asked for
-            last (of a plan only); sums of the PI loop; disturbance (of a plan only).
+            last (of a plan only); sums of the PI loop; disturbance, and forces against the cylinders (of a plan only).
         levers: that the controller gave, shape (ticks, 3).
         strokes: reference of the strokes (m), shape (rows, 3), at least as long as the ticks and the horizon.
         tip: reference of the tip, shape (rows, 3).

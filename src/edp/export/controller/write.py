@@ -13,6 +13,7 @@ from edp.export.c.model import RUNTIME
 from edp.export.c.target import check_name
 from edp.export.c.text import number
 from edp.export.controller.lanes import LaneModel, lane_model
+from edp.export.controller.near import NearModel, near_model
 from edp.export.controller.numbers import ConstantTables, constants_of_controller, golden_rows
 from edp.export.controller.parts import AXES, ControllerParts, PlanParts
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
@@ -29,13 +30,8 @@ LONGEST_NAME = 20
 """Of a controller: names of its model and functions are made from it."""
 TOLERANCE = 2e-3
 """Of a lever of the self-test, a share of full: single precision against double at a tick from the same memory."""
+PlanModel = LaneModel | NearModel
 INCLUDES = ("edp_control.h", "edp_runtime.h")
-PRESSURE_ROWS = """\
-            for (uint32_t i = 0; (i < {count}u) && (left == 1u); i++) {{
-                add_row(c, c->answers[0][pressure_answers[i]] / most_pressure, -1e30f, 1.0f, pressure_answers[i],
-                        most_pressure, variables);
-            }}
-"""
 LOOP_LEVERS = """\
     float strokes[EDP_AXES];
     for (uint32_t i = 0; i < EDP_AXES; i++) {
@@ -59,17 +55,7 @@ PRIVATE = """\
     float measured[{NAME}_CONTROL_INPUTS];
     float latest[EDP_AXES];
     float speeds[{NAME}_CONTROL_BLOCKS][EDP_AXES]; /* the plan, m/s */
-    {name}_plant_memory model;
-    struct {{
-        {name}_plant_memory memory;
-        float row[{PLANT}_INPUTS];
-    }} past[{NAME}_CONTROL_WINDOW];
-    /* Scratch of a tick. */
-    {name}_plant_memory lanes[{NAME}_CONTROL_LANES];
-    float rows[{NAME}_CONTROL_LANES][{PLANT}_INPUTS];
-    float works[{NAME}_CONTROL_LANES][{PLANT}_WORK];
-    float answers[{NAME}_CONTROL_LANES][{PLANT}_ANSWERS];
-    float moved[{NAME}_CONTROL_LANES][EDP_AXES];
+{model}    float moved[{NAME}_CONTROL_LANES][EDP_AXES];
     float targets[{NAME}_CONTROL_BLOCKS][EDP_AXES];
     float changed[{NAME}_CONTROL_BLOCKS][EDP_AXES];
     float changes[{NAME}_CONTROL_BLOCKS][EDP_AXES];
@@ -94,22 +80,22 @@ class ControllerFiles:
     Attributes:
         name: C prefix.
         parts: its numbers.
-        lanes: the model of its plan; None for a PI loop alone.
+        model: of its plan; None for a PI loop alone.
         tables: its constants.
     """
 
     name: str
     parts: ControllerParts
-    lanes: LaneModel | None
+    model: PlanModel | None
     tables: ConstantTables
 
     @property
     def sources(self) -> tuple[str, ...]:
         """C files that a program with this controller compiles."""
         own = (f"{self.name}_control.c", "edp_control.c")
-        if self.lanes is None:
+        if self.model is None:
             return (*own, *(name for name in RUNTIME if name.endswith(".c")))
-        return (*own, "edp_qp.c", *SOLVER, *self.lanes.sources)
+        return (*own, "edp_qp.c", *SOLVER, *self.model.sources)
 
     def texts(self) -> dict[str, str]:
         """Every file by name, the one to read first in front."""
@@ -119,10 +105,10 @@ class ControllerFiles:
             f"{name}_control.c": self._filled("control.c.in"),
             f"{name}_control_numbers.h": self._numbers(),
         }
-        texts |= self._runtime() if self.lanes is None else self.lanes.files()
-        for file in OWN if self.lanes is None else (*OWN, *PROGRAM):
+        texts |= self._runtime() if self.model is None else self.model.files()
+        for file in OWN if self.model is None else (*OWN, *PROGRAM):
             texts[file] = _own(f"runtime/{file}")
-        if self.lanes is not None:
+        if self.model is not None:
             texts |= {file: _own(file) for file in (*SOLVER_FILES, LICENCE)}
         if self.parts.golden is not None:
             texts[f"{name}_control_golden.h"] = self._golden()
@@ -182,7 +168,7 @@ class ControllerFiles:
         }
 
     def _plan_texts(self, plan: PlanParts, places: dict[str, str]) -> dict[str, object]:
-        name, upper = self.name, self.name.upper()
+        name, upper, model = self.name, self.name.upper(), self._plan_model
         sizes = {
             "BLOCKS": len(plan.blocks),
             "VARIABLES": plan.variables,
@@ -190,10 +176,13 @@ class ControllerFiles:
             "WINDOW": plan.window,
             "ROWS": plan.rows,
             "ITERATIONS": plan.iterations,
+            **model.sizes(plan),
         }
         spare = "EDP_CONTROL_FALLBACK" if plan.fallback else "EDP_CONTROL_NEUTRAL"
         answers = "the PI loop answers (EDP_CONTROL_FALLBACK)" if plan.fallback else "levers go to neutral"
         includes = (f"{name}_plant.h", *INCLUDES, "edp_qp.h")
+        pressures = Code(model.pressure_rows.format(count=len(plan.pressures)) if plan.pressures else "")
+        values = {**places, "pressure_rows": pressures}
         return {
             "what": Code(
                 f" * It plans {sum(plan.blocks)} ticks ahead on a twin ({name}_plant) in {len(plan.blocks)} "
@@ -203,28 +192,26 @@ class ControllerFiles:
                 f",\n * while the model runs on without them. Where the program has no solution within "
                 f"{upper}_CONTROL_ITERATIONS\n * iterations, {answers}."
             ),
-            "cost": self._plan_cost(plan),
+            "cost": Code(f"{model.cost(plan)} Constants beside the\n * model's: {self.tables.bytes} bytes."),
             "includes": Code("\n".join(f'#include "{file}"' for file in sorted(includes))),
             "sizes": Code("\n".join(f"#define {upper}_CONTROL_{key} {value}u" for key, value in sizes.items())),
-            "public_fields": Code(PUBLIC),
-            "private_fields": Code(PRIVATE.format(**places)),
+            "public_fields": Code(PUBLIC + model.public),
+            "private_fields": Code(PRIVATE.format(**places, model=model.private.format(**places))),
             "check_plant": Code(f" && {name}_plant_check()"),
-            "pressure_rows": Code(PRESSURE_ROWS.format(count=len(plan.pressures)) if plan.pressures else ""),
+            **{
+                key: fill(_own(f"templates/{model.fragment}{part}.c.in"), values)
+                for key, part in {"model": "", "slopes": "_slopes", "predict": "_predict"}.items()
+            },
             "loop_levers": Code(LOOP_LEVERS if plan.fallback else ""),
             "without_plan": Code(spare),
             "test_limit": Code(LIMIT_TEST.format(name=name, spare=spare)),
             "recall": self._recall(plan),
         }
 
-    def _plan_cost(self, plan: PlanParts) -> Code:
-        lanes = self.lanes
-        assert lanes is not None  # noqa: S101  for the type checker: a plan has a model
-        macs = plan.lane_ticks * lanes.model.graph.macs
-        return Code(
-            f" * COST. A tick runs {plan.lane_ticks} ticks of the model, {macs} multiply-accumulates, and up to "
-            f"{plan.iterations} iterations\n * of the solver, in double precision (see edp_qp.h). No other loop has a "
-            f"length that varies. Constants beside the\n * model's: {self.tables.bytes} bytes."
-        )
+    @property
+    def _plan_model(self) -> PlanModel:
+        assert self.model is not None  # noqa: S101  for the type checker: a plan has a model
+        return self.model
 
     def _recall(self, plan: PlanParts) -> Code:
         """Statements of the self-test that set what is remembered."""
@@ -234,6 +221,7 @@ class ControllerFiles:
             lines += f"    (void)memcpy(control.{field}, before + {at}, {size}u * sizeof(float));\n"
             at += size
         rest = f"    (void)memcpy(control.disturbance, before + {at + AXES}, EDP_AXES * sizeof(float));\n"
+        rest += self._plan_model.recalled.format(plant=f"{self.name}_plant", at=at + 2 * AXES)
         return Code(lines + RECALL_SUMS.format(at=at) + rest)
 
     def _input_enum(self) -> Code:
@@ -295,8 +283,11 @@ def write_controller(parts: ControllerParts, name: str, folder: Path) -> list[Pa
     if len(name) > LONGEST_NAME:
         raise ExportError(f"name '{name}' of a controller has {len(name)} characters; at most {LONGEST_NAME} must hold")
     check_sizes({"rows of the self-test": 0 if parts.golden is None else len(parts.golden.strokes)})
-    lanes = None if parts.plan is None else lane_model(f"{name}_plant", parts.plan.plant)
-    files = ControllerFiles(name, parts, lanes, constants_of_controller(parts))
+    model: PlanModel | None = None
+    if parts.plan is not None:
+        own = f"{name}_plant"
+        model = near_model(own, parts.plan) or lane_model(own, parts.plan.plant)
+    files = ControllerFiles(name, parts, model, constants_of_controller(parts, isinstance(model, NearModel)))
     return write_export(folder, {file: text.encode() for file, text in files.texts().items()})
 
 

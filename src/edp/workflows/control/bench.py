@@ -108,7 +108,8 @@ class ControlBench:
             if on_loop is not None:
                 on_loop(f"{task.name} {task.seed}", number, len(self.tasks))
             controller = chosen.build(self.plant, task.limits, self.models)
-            results.append(run_loop(self._env, controller, task, task.seed, self._options, guard))
+            late = 1e-3 * self.experiment.deadline_ms
+            results.append(run_loop(self._env, controller, task, task.seed, self._options, guard, late))
         return results
 
     def check(self) -> None:

@@ -19,7 +19,7 @@ from edp.control.limits import LoopLimits
 from edp.control.models import ControlModels
 from edp.control.nmpc.moves import SpeedToLever
 from edp.control.nmpc.tip import TipTable
-from edp.control.plant import PILOTS, STROKES, PlantInterface
+from edp.control.plant import PILOTS, STROKES, VELOCITIES, PlantInterface
 from edp.control.reference import TipReference
 from edp.control.valve_map import SIDES, ValveMap
 from edp.errors import ConfigError, ExportError
@@ -31,8 +31,8 @@ from edp.sim.machine.parameters import pack
 from edp.training.twin_bundle import TwinBundle, plant_bundle
 from edp.workflows.control.kept import KeptController, load_kept
 
-ITERATIONS = 100
-"""Of the solver, a tick: 5 to 20 were seen in loops."""
+MOST: Mapping[str, int] = {"iterations": 100, "newton": 1_000}
+"""Iterations a tick: of the solver, of which 5 to 20 were seen in loops; of a grey box's equations."""
 MOST_ITERATIONS = 100_000
 FARTHEST_M = 100.0
 """Beyond it a stroke counts as missing: no cylinder is as long."""
@@ -48,7 +48,7 @@ def export_controller(
         run: its run folder.
         folder: where to.
         name: prefix of its C functions and files.
-        options: ``iterations``, the solver's most a tick.
+        options: ``iterations``, the solver's most a tick; ``newton``, those of a grey box's equations.
 
     Returns:
         The files, the one to read first in front.
@@ -56,9 +56,9 @@ def export_controller(
     Raises:
         EdpError: not such a run, a controller or twin without a form in C, a name or an option that cannot be.
     """
-    iterations = _iterations(options or {})
+    most = _most(options or {})
     stored = load_kept(run)
-    parts = parts_of(stored.experiment, stored.plant, stored.models, stored.twin, iterations)
+    parts = parts_of(stored.experiment, stored.plant, stored.models, stored.twin, most)
     return write_controller(replace(parts, golden=golden_loop(parts, stored)), name, Path(folder))
 
 
@@ -67,7 +67,7 @@ def parts_of(
     plant: PlantInterface,
     models: ControlModels,
     twin: TwinBundle | None,
-    iterations: int = ITERATIONS,
+    most: Mapping[str, int] = MOST,
 ) -> ControllerParts:
     """The numbers of a controller, without a self-test.
 
@@ -76,7 +76,7 @@ def parts_of(
         plant: that it is for.
         models: valve map, and the twin of a plan.
         twin: the same twin with its spec.
-        iterations: most of the solver, a tick.
+        most: iterations a tick, of the solver and of a grey box's equations.
 
     Raises:
         ExportError: a controller without a form in C.
@@ -99,7 +99,7 @@ def parts_of(
         # The controller's own checks of twin and plant, and the channels that it reads.
         controller = spec.build(plant, limits, models)
         reads = controller.reads
-        plan = _plan(spec, plant, limits, valves, twin, (reads, iterations))
+        plan = _plan(spec, plant, limits, valves, twin, (reads, most))
         ends = input_limits(plan.plant.predictor)
         commands = len(twin.twin.channels.commands)
         low, high = (np.asarray(values)[[commands + port for port in plan.ports]] for values in ends)
@@ -133,9 +133,9 @@ def _plan(
     limits: LoopLimits,
     valves: ValveMap,
     twin: TwinBundle,
-    reads: tuple[tuple[str, ...], int],
+    reads: tuple[tuple[str, ...], Mapping[str, int]],
 ) -> PlanParts:
-    names, iterations = reads
+    names, most = reads
     channels = twin.twin.channels
     answers = [channel.name for channel in channels.answers]
     inverse = SpeedToLever(valves, limits)
@@ -146,6 +146,7 @@ def _plan(
         lever_shape=_lever_shape(plant.geometry.machine),
         ports=tuple(answers.index(name) for name in names),
         strokes=tuple(answers.index(name) for name in STROKES),
+        velocities=tuple(answers.index(name) for name in VELOCITIES),
         pressures=tuple(n for n, name in enumerate(answers) if name.startswith("CylPressures_")),
         sides=[(sides[0], sides[1]) for sides in inverse.tables],
         slowest=inverse.slowest,
@@ -156,7 +157,8 @@ def _plan(
         margin=limits.stroke_margin,
         pressure_pa=limits.pressure_pa,
         fallback=spec.fallback,
-        iterations=iterations,
+        load=spec.load,
+        **most,
     )
     _check_pilots(plan, plant)
     return plan
@@ -237,11 +239,15 @@ def _replayed(stored: KeptController, ticks: int) -> tuple[Array, Array]:
     return np.array(before), np.array(levers)
 
 
-def _iterations(options: Mapping[str, Any]) -> int:
-    for option in options:
-        if option != "iterations":
-            raise ConfigError(f"--set {option}: a controller has no such option (it has iterations); leave it out")
-    text = str(options.get("iterations", ITERATIONS))
-    if not text.isdecimal() or not 2 <= int(text) <= MOST_ITERATIONS:
-        raise ConfigError(f"--set iterations={text}: an integer from 2 to {MOST_ITERATIONS:,} must hold")
-    return int(text)
+def _most(options: Mapping[str, Any]) -> dict[str, int]:
+    most = dict(MOST)
+    for option, value in options.items():
+        if option not in MOST:
+            raise ConfigError(
+                f"--set {option}: a controller has no such option (it has {' and '.join(MOST)}); leave it out"
+            )
+        text = str(value)
+        if not text.isdecimal() or not 2 <= int(text) <= MOST_ITERATIONS:
+            raise ConfigError(f"--set {option}={text}: an integer from 2 to {MOST_ITERATIONS:,} must hold")
+        most[option] = int(text)
+    return most

@@ -21,6 +21,11 @@ LONGEST_S = 0.0205
 """Of such a step: the fastest swing of a load still has ten of them."""
 
 
+def goes_twice(twin: GreyTwin) -> bool:
+    """Whether a step of a plan may go over two ticks behind the first `SINGLE_TICKS`."""
+    return twin.time[1] == 1 and 2.0 * twin.time[0] <= LONGEST_S
+
+
 class GreyRunner(TwinRunner):
     """See `TwinRunner`; states that it makes are in double precision.
 
@@ -43,7 +48,7 @@ class GreyRunner(TwinRunner):
             table.exponents,
             twin.time,
         )
-        self._double = twin.time[1] == 1 and 2.0 * twin.time[0] <= LONGEST_S
+        self._double = goes_twice(twin)
         self._speeds = np.array([speed for speed, _, _, _ in wiring.columns])
         self.resistance = np.zeros(len(wiring.columns))
 

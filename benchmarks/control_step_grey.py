@@ -1,0 +1,134 @@
+"""What does a tick of a predictive controller on a grey box cost in C, and does it fit into 10 ms of a Cortex-M7?
+
+The grey box of M22 of `closed_loop.py --part grey` (fitted where --data has none; under a processor minute with
+--quick, on fewer logs), and a controller `nmpc` on it, written by `edp export --to controller`. A line on the simulator
+is graded by the controller in Python; its observations are fed to the compiled one, whose levers are compared tick by
+tick from the same memory, and whole lines are graded by both.
+
+Time, instructions and their cycles on a Cortex-M7 are measured as in `control_step.py`. The table of the Cortex-M4
+knows no double precision, in which this controller computes: the careful estimate adds 2 cycles to each product or sum
+in it and 16 to each division or root, and takes no second instruction a cycle.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import closed_loop_models as models_of
+import control_step as step_of
+from common import finish, in_folder, parser, table, verdict
+from controller_cycles import traced_image
+from edp.evaluation.controller import CORES
+from edp.storage import make_folder
+from edp.training.twin_bundle import TwinBundle, load_twin
+
+PLANS = ((2, 3, 4, 6, 10, 15), (3, 7, 10, 20), (4, 12, 24))
+DOUBLE = (2, 16)
+"""Cycles that a product or sum, and a division or root, may take more in double precision on a Cortex-M7."""
+TRACED, SHORT = (2, 3), (2, 4, 6)
+"""Ticks of two traces, and the plan that is traced: 3 million instructions of one tick are as many lines."""
+
+
+def main() -> None:
+    arguments_of = parser(__doc__ or "")
+    arguments_of.add_argument("--twin", type=Path, default=None, help="run folder of a grey box, in place of a fit")
+    arguments = arguments_of.parse_args()
+    found: dict[str, Any] = {}
+
+    def measure(folder: Path) -> None:
+        models = models_of.Models(folder, models_of.FULL, arguments.seed)
+        run = arguments.twin or models.grey(models_of.QUICK_GREY if arguments.quick else models_of.GREY)
+        found.update(costs(load_twin(run), make_folder(folder / "controllers"), arguments.seed, arguments.quick))
+
+    in_folder(arguments.data, measure)
+    first = found["plans"][0]
+    rows = [
+        ("p99 of a tick in C on this machine", found["host_us"]["p99"] / 1000.0, 2.0, "ms"),
+        ("estimated ms on a Cortex-M7 at 480 MHz, as a rule", first["typical_ms"], step_of.TICK_MS, "ms"),
+        ("the same, careful", first["careful_ms"], step_of.TICK_MS, "ms"),
+        ("largest difference of a lever from that in Python, from the same memory", found["lever"], 2e-3, "1"),
+    ]
+    verdicts = [verdict(name, ours, goal, "<= 1", unit, arguments.quick) for name, ours, goal, unit in rows]
+    finish("control_step_grey", verdicts, arguments.seed, found)
+
+
+def costs(twin: TwinBundle, folder: Path, seed: int, quick: bool) -> dict[str, Any]:
+    """Figures of the default plan, and costs by plan."""
+    bench = step_of.LoopBench(seed)
+    plans, host, lever, calls = [], np.zeros((1, 2)), 0.0, 0
+    each: Mapping[str, float] = {}
+    for blocks in PLANS[:1] if quick else PLANS:
+        own = folder / "_".join(map(str, blocks))
+        bench.exported(twin, blocks, own)
+        if not plans:
+            host, calls, lever = step_of.host_times(own), step_of.callgrind(own), self_test(own)
+            bench.exported(twin, SHORT, folder / "short")
+            each = cycles_of(folder / "short")
+        plans.append(on_m7(own, blocks, each))
+    table(
+        ["blocks", "M7 instructions", "ms, best", "ms, as a rule", "ms, careful", "code and constants", "state, bytes"],
+        [[",".join(map(str, row["blocks"])), row["instructions"], row["low_ms"], row["typical_ms"], row["careful_ms"],
+          row["flash_bytes"], row["state_bytes"]] for row in plans],
+    )  # fmt: skip
+    times = {"median": float(np.median(host[:, 0])), "p99": float(np.percentile(host[:, 0], 99))}
+    print(f"{times['median']:.0f} us a tick, p99 {times['p99']:.0f}; {calls:,} instructions on this processor")
+    return {"host_us": times, "callgrind": calls, "lever": lever, "cycles_by_instruction": dict(each), "plans": plans}
+
+
+def self_test(folder: Path) -> float:
+    """Largest difference of a lever that the exported test has seen; it must pass."""
+    step_of.run(["gcc", *step_of.FLAGS, *step_of.sources_of(folder)[1:], "host_test.c", "-lm", "-o", "tested"], folder)
+    said = subprocess.run(["./tested"], cwd=folder, capture_output=True, text=True, check=False)
+    worst = re.search(r"difference of a lever: (\S+)", said.stdout)
+    if said.returncode or worst is None:
+        raise RuntimeError(f"the self-test of the controller failed: {said.stdout[-500:]}")
+    return float(worst[1])
+
+
+def cycles_of(folder: Path) -> dict[str, float]:
+    """Cycles of an instruction by the table of the M4, doubles as singles and with what they may take more."""
+    found = {}
+    for name, double in {"table": (0, 0), "careful": DOUBLE}.items():
+        counts = []
+        for ticks in TRACED:
+            step_of.built_for_m7(folder, f"-DTICKS={ticks}u")
+            counts.append(traced_image(folder, step_of.QEMU, double))
+        (few, short), (many, long) = counts
+        found[name] = (long - short) / (many - few)
+    return found
+
+
+def on_m7(folder: Path, blocks: tuple[int, ...], each: Mapping[str, float]) -> dict[str, Any]:
+    """Instructions, milliseconds and bytes."""
+    core, count = CORES["cortex_m7"], step_of.m7_instructions(folder)
+    ms = count / (step_of.CLOCK_MHZ * 1000.0)
+    flash, state = sizes_of(folder)
+    return {
+        "blocks": blocks, "instructions": count, "low_ms": ms * each["table"] * core.low,
+        "typical_ms": ms * each["table"] * core.typical, "careful_ms": ms * each["careful"],
+        "flash_bytes": flash, "state_bytes": state,
+    }  # fmt: skip
+
+
+def sizes_of(folder: Path) -> tuple[int, int]:
+    """Bytes of code and constants on a Cortex-M7, and of the state."""
+    made = []
+    for source in step_of.sources_of(folder)[1:]:
+        made.append(f"{Path(source).stem}_m7.o")
+        step_of.run(["arm-none-eabi-gcc", *step_of.FLAGS, *step_of.M7, "-c", source, "-o", made[-1]], folder)
+    lines = step_of.run(["arm-none-eabi-size", *made], folder).splitlines()[1:]
+    flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in lines)
+    (folder / "state.c").write_text('#include "machine_control.h"\nchar state[sizeof(machine_control)];\n')
+    step_of.run(["arm-none-eabi-gcc", *step_of.FLAGS, *step_of.M7, "-c", "state.c", "-o", "state_m7.o"], folder)
+    told = step_of.run(["arm-none-eabi-size", "state_m7.o"], folder).splitlines()[1]
+    return flash, int(told.split()[2])
+
+
+if __name__ == "__main__":
+    main()
