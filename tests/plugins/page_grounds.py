@@ -53,7 +53,7 @@ SHORTER: Mapping[str, Mapping[str, str]] = {
     "control": {"duration_s=30.0": "duration_s=30.0", "num_envs=64": "num_envs=2"},
     "environment": {"num_envs=64": "num_envs=2"},
     "compress": {'"C_u64_QAT"': '"A_u32"'},
-    "screening": {"ScreeningSpec(horizon=10)": "ScreeningSpec(horizon=1, forests=False, permutations=20)"},
+    "screening": {"ScreeningSpec(horizon=10)": "ScreeningSpec(horizon=1, max_lag=20, information_samples=200)"},
 }
 """Lengths of a page that a test cannot wait for, and what it runs instead."""
 
@@ -104,7 +104,7 @@ def howto_watch(folder: Path, request: pytest.FixtureRequest) -> Names:
     save_monitor(fitted_monitor(sessions), folder / "monitors" / "rig")
     channels = sessions[0].channels
     entries = [f'[channels.{c.name}]\ncolumn = "{c.name}"\nkind = "{c.kind}"\nunit = "{c.unit}"\n' for c in channels]
-    (folder / "map.toml").write_text("rate_hz = 100.0\n" + "".join(entries), encoding="utf-8")
+    (folder / "map.toml").write_text("sample_time_s = 0.01\n" + "".join(entries), encoding="utf-8")
     (folder / "logs" / "today").mkdir(parents=True)
     names = ",".join(c.name for c in channels)
     path = folder / "logs" / "today" / "monday.csv"
@@ -119,7 +119,7 @@ def monitor(folder: Path, request: pytest.FixtureRequest) -> Names:
     named = [replace(session, channels=tuple(channels)) for session in sessions]
     save_monitor(fitted_monitor(named), folder / "monitors" / "m22")
     values = named[0].values.copy()
-    values[1000:] += 20.0 * values.std(axis=0)  # whatever that is, it is not healthy
+    values[700:, 0] += 5 * np.std(values[:, 0])  # whatever that is, it is not healthy
     return {"recording": replace(named[0], values=values)}
 
 
@@ -184,7 +184,9 @@ def tutorial(folder: Path, request: pytest.FixtureRequest) -> Names:
 
 def twin(folder: Path, request: pytest.FixtureRequest) -> Names:
     spec = next(iter(TWINS.values()))()
-    made, commands, measured = sample_twin(spec, sample_actuators(600))
+    made = sample_twin(spec, sample_actuators(600))[0]
+    series = made.channels.task().series(sample_actuators(600))
+    commands, measured = series.inputs[None], series.targets[None]
     save_twin(TwinBundle(spec, made), folder / "runs" / "twin")
     return {
         "commands": commands[:, :200],

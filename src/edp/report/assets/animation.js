@@ -116,7 +116,7 @@
     const places = Math.max(0, Math.min(6, 2 - Math.floor(Math.log10(it.high - it.low))));
     it.rows.forEach((row, i) => {
       const value = at([row.data], frame)[0];
-      it.values[i].textContent = Number.isNaN(value) ? "none" : value.toFixed(it.exact ? places : 0);
+      it.values[i].textContent = Number.isNaN(value) ? "none" : value.toFixed(it.exact ? places : 0).replace(/^-(0(?:\.0+)?)$/, "$1");
     });
   }
 
@@ -131,7 +131,7 @@
   });
   scene.forecasts.forEach((line) => chart(line.name, line.unit, [
     { name: "measured", data: line.measured, colour: "#3c4650" },
-    { name: "predicted", data: line.predicted, colour: "#0b57d0", band: line.lower && [line.lower, line.upper] },
+    { name: "predicted", data: line.predicted, colour: "#0b57d0", dashed: true, band: line.lower && [line.lower, line.upper] },
   ], true));
   chart("Cylinder velocity", "mm/s", scene.velocity.map((data, i) => ({ name: names[i], data, colour: colours[i] })));
   for (let i = 0; i < scene.pressure.length / 2; i++) {
