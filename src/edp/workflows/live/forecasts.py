@@ -40,14 +40,14 @@ def forecast_lines(run: str | Path, recording: Recording, horizon: int | None = 
         raise live.failure
     layout, rows = live.session.layout, live.session.read(0, live.session.ticks)[1]
     ahead = sorted({one.ticks for one in layout.forecasts})
-    wanted = ahead[-1] if horizon is None else horizon
-    if wanted not in ahead:
+    chosen = ahead[-1] if horizon is None else horizon
+    if chosen not in ahead:
         shown = ", ".join(map(str, ahead))
-        raise ConfigError(f"--horizon {wanted}: this run predicts {shown} samples ahead; choose one of them")
+        raise ConfigError(f"--horizon {chosen}: this run predicts {shown} samples ahead; choose one of them")
     lines = [
         _line(one, one.measured, rows, layout.rate_hz)
         for one in layout.forecasts
-        if one.ticks == wanted and one.measured is not None
+        if one.ticks == chosen and one.measured is not None
     ]
     if not lines:
         raise ConfigError(f"the log holds nothing of what '{run}' predicts; map the columns that do (--map)")

@@ -137,12 +137,12 @@ def entities(layout: LiveLayout, escaped: Any = str) -> Mapping[str, tuple[int, 
     for one in layout.forecasts:
         what = f"{one.name} [{one.unit}], {one.model}, {one.ticks} ticks ahead"
         ends = {"": one.column, ", lower": one.lower, ", upper": one.upper}
-        for end, place in ends.items():
-            if place is not None:
+        for end, at_column in ends.items():
+            if at_column is not None:
                 path = f"predicted/{escaped(what + end)}"
-                paths[path] = (place, one.factor, 0.0, one.ticks / layout.rate_hz)
-    for name, place in (layout.statistics or {}).items():
-        paths[f"monitor/{escaped(name)}"] = (place, 1.0, 0.0, 0.0)
+                paths[path] = (at_column, one.factor, 0.0, one.ticks / layout.rate_hz)
+    for name, at_column in (layout.statistics or {}).items():
+        paths[f"monitor/{escaped(name)}"] = (at_column, 1.0, 0.0, 0.0)
     return paths
 
 
@@ -160,8 +160,8 @@ def _started(folder: Path, port: int, page: int) -> subprocess.Popen[bytes]:
     if done.returncode:
         raise ConfigError(f"Rerun does not turn its telemetry off, and is not started: {_last(done.stderr)}")
     options = ["--serve-web", "--bind", LOOPBACK, "--port", str(port), "--web-viewer-port", str(page)]
-    with (folder / "said.txt").open("wb") as said:
-        process = subprocess.Popen([*call, *options, "--server-memory-limit", MEMORY], stderr=said, **quiet)
+    with (folder / "said.txt").open("wb") as errors:
+        process = subprocess.Popen([*call, *options, "--server-memory-limit", MEMORY], stderr=errors, **quiet)
     ends = time.monotonic() + START_S
     while not all(map(_listens, (port, page))):
         if process.poll() is not None or time.monotonic() > ends:
