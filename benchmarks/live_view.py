@@ -25,15 +25,17 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "plugins"))
 
-import live_browser
+from browser import chromium, opened
 from websockets.asyncio.client import ClientConnection, connect
 
 from common import finish, parser, table, verdict
 from edp.live.protocol import HEAD, ROWS
 from edp.live.server import LiveServer
+from edp.logs.source import DataSource, read_with_truth
 from edp.signals import Channel, Kind
 from edp.workflows.live.run_live import LiveOrder, LiveRun
 from edp.workflows.live.sources import LiveSource, Needs, Sink, SourceOptions, SourceStopped
+from edp.workflows.live.sources.log import LogSource
 
 CHANNELS, RATE_HZ, READERS = 40, 100.0, 6
 SETTLE_S = 5.0
@@ -84,17 +86,45 @@ class Waves(LiveSource):
 Waves.steered = False
 
 
-def serve(pipe: Connection, ticks: int | None, paced: bool) -> None:
-    """Run source and server until told to stop; figures go through the pipe."""
-    source = Waves(ticks, paced)
-    live = LiveRun(LiveOrder("", SourceOptions("")), source=source)
+class Played(LogSource):
+    """A log again and again, with the figures of `Waves`."""
+
+    given = late = 0
+    longest_s = cpu_s = 0.0
+
+    def run(self, sink: Sink) -> None:
+        """See `LiveSource`."""
+        while True:
+            for row in self.recording.values:
+                sink.take(row)
+                self.given += 1
+                self.cpu_s = time.thread_time()
+            sink.begin_anew()
+
+
+def serve(pipe: Connection, ticks: int | None, paced: bool, models: tuple[str, ...] = ()) -> None:
+    """Run source and server until told to stop; figures go through the pipe.
+
+    Args:
+        pipe: for words and figures.
+        ticks: of the waves.
+        paced: see `Waves`.
+        models: log, run folder and monitor folder in place of the waves.
+    """
+    order, source = LiveOrder("", SourceOptions("")), Waves(ticks, paced)
+    if models:
+        log, run_folder, monitor = models
+        source = Played(read_with_truth(DataSource(Path(log))))
+        source.ticks = None
+        order = LiveOrder("", SourceOptions(""), run=Path(run_folder), monitor=Path(monitor))
+    live = LiveRun(order, source=source)
     playing = threading.Thread(target=live.play, daemon=True)
 
     def facts() -> dict[str, float]:
         return {
             "ticks": live.session.ticks,
             "given": source.given,
-            "late": source.late,
+            "late": source.late + live.pace.late,
             "longest_ms": 1e3 * source.longest_s,
             "cpu_s": time.process_time(),
             "source_cpu_s": source.cpu_s,
@@ -103,7 +133,7 @@ def serve(pipe: Connection, ticks: int | None, paced: bool) -> None:
             "viewers": len(server.viewers),
         }
 
-    server = LiveServer(live.session, None)
+    server = LiveServer(live.session, live.pace if source.steered else None)
 
     async def run() -> None:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()
@@ -200,11 +230,11 @@ def narrow(host: str) -> socket.socket:
     return one
 
 
-def served(ticks: int | None, paced: bool) -> tuple[Any, Connection, str]:
+def served(ticks: int | None, paced: bool, models: tuple[str, ...] = ()) -> tuple[Any, Connection, str]:
     """A process with source and server, its pipe and its address."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=serve, args=(theirs, ticks, paced), daemon=True)
+    process = context.Process(target=serve, args=(theirs, ticks, paced, models), daemon=True)
     process.start()
     return process, ours, ours.recv()
 
@@ -216,26 +246,24 @@ def asked(pipe: Connection) -> dict[str, float]:
     return answer
 
 
-def watched(seconds: float) -> dict[str, float]:
-    """Eight viewers of a source for some time."""
-    process, pipe, address = served(None, True)
-    with live_browser.browser() as chromium:
-        page = chromium.page()
-        page.size(1280, 900)
+def watched(seconds: float, models: tuple[str, ...] = ()) -> dict[str, float]:
+    """Eight viewers of a source for some time; see `serve`."""
+    process, pipe, address = served(None, True, models)
+    with opened(chromium() or "chromium") as page:
         page.open(address)
         page.wait("Boolean(window.edpLive)")
         readers = Readers(address, READERS, 1)
         pipe.send("go")
         page.wait("edpLive.frames > 5")
         time.sleep(SETTLE_S)
-        page.value("edpLive.lags.length = 0")
+        page.run("edpLive.lags.length = 0")
         before, began = asked(pipe), time.monotonic()
-        frames = page.value("edpLive.frames")
+        frames = page.run("edpLive.frames")
         time.sleep(seconds)
         after, wall = asked(pipe), time.monotonic() - began
-        frames = page.value("edpLive.frames") - frames
-        lags = np.array(page.value("edpLive.lags"))
-        dropped = page.value("edpLive.dropped")
+        frames = page.run("edpLive.frames") - frames
+        lags = np.array(page.run("edpLive.lags"))
+        dropped = page.run("edpLive.dropped")
         readers.close()
     pipe.send("stop")
     process.join(30)
@@ -294,9 +322,22 @@ def main() -> None:
     """See the module's text."""
     made = parser(__doc__ or "")
     made.add_argument("--seconds", type=float, default=60.0, help="of the eight viewers")
+    made.add_argument(
+        "--models", nargs=3, metavar=("LOG", "RUN", "MONITOR"), help="only a log with a network and a monitor beside it"
+    )
     arguments = made.parse_args()
     quick = arguments.quick
-    look = watched(10.0 if quick else arguments.seconds)
+    seconds = 10.0 if quick else arguments.seconds
+    if arguments.models:
+        look = watched(seconds, tuple(arguments.models))
+        table(["eight viewers, with models", "figure"], [[name, float(value)] for name, value in look.items()])
+        judged = [
+            verdict("lag with models, 95 % (against 100 ms)", look["lag_p95_ms"], 100.0, "<= 1", "ms", quick),
+            verdict("ticks with models (against those due)", look["came"], look["due"], ">= 0.99", "ticks", quick),
+        ]
+        finish("live_view_models", judged, arguments.seed, {"viewers": look})
+        return
+    look = watched(seconds)
     table(["eight viewers", "figure"], [[name, float(value)] for name, value in look.items()])
     long = day(DAY // 24 if quick else DAY, print)
     table(["a day", "figure"], [[name, float(value)] for name, value in long.items()])

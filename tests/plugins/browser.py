@@ -12,7 +12,10 @@ import os
 import select
 import shutil
 import subprocess
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +24,8 @@ import pytest
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run", "--mute-audio",
     "--disable-background-networking", "--disable-component-update", "--disable-extensions", "--hide-scrollbars",
-    "--host-resolver-rules=MAP * ~NOTFOUND",
+    # No name is looked up: pages are files, or of a server of this machine.
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )  # fmt: skip
 PHONE, DESK = (390, 844), (1280, 900)
 """Width and height in pixels of the page's own."""
@@ -64,12 +68,17 @@ class Browser:
 
     def open(self, page: Path | str, size: tuple[int, int] = DESK, phone: bool = False) -> None:
         """Load a file or an address in a window of a size; returns once its scripts have run and it is drawn."""
-        width, height = size
-        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self.size(*size, phone)
         self.events.clear()
         self.ask("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         self._until("Page.loadEventFired")
         self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+
+    def size(self, width: int, height: int, phone: bool = False, dark: bool = False) -> None:
+        """Change the window, and whether the system is dark."""
+        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.ask("Emulation.setEmulatedMedia", features=[scheme])
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page; a promise is waited for."""
@@ -207,12 +216,27 @@ def serious_findings(browser: Browser) -> list[str]:
     ]
 
 
+def chromium() -> str | None:
+    """The path of a Chromium; None where there is none."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@contextmanager
+def opened(executable: str) -> Iterator[Browser]:
+    """A headless Chromium with a profile of its own."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        one = Browser(executable, Path(profile))
+        try:
+            yield one
+        finally:
+            one.close()
+
+
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory):
+def browser():
     """A headless Chromium; the test skips where there is none."""
-    executable = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    executable = chromium()
     if executable is None:
         pytest.skip("no Chromium; `make system-packages` installs it")
-    opened = Browser(executable, tmp_path_factory.mktemp("profile"))
-    yield opened
-    opened.close()
+    with opened(executable) as one:
+        yield one

@@ -35,6 +35,7 @@ _EXTRAS: Mapping[str, tuple[str, str]] = {
     "fmu": ("ziglang", "edp export --to fmu, edp parity of FMUs"),
     "casadi": ("casadi", "edp export --to casadi"),
     "live": ("foxglove", "edp live --record"),
+    "rerun": ("rerun", "edp live --rerun"),
     "control": ("gymnasium", "edp control, edp tune, the simulator as an environment"),
     "rl": ("stable_baselines3", "controllers learned by reinforcement"),
     "cluster": ("ray", "edp search --cluster"),

@@ -37,6 +37,9 @@ def live(
     bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     save: Annotated[Path | None, typer.Option("--save", help="Page (.html) to write at the end.")] = None,
     record: Annotated[Path | None, typer.Option("--record", help="Write the session as MCAP (.mcap).")] = None,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Show the session in Rerun besides; needs the extra [rerun].")
+    ] = False,
     until_end: Annotated[bool, typer.Option("--until-end", help="End with the source, for scripts.")] = False,
     machine: Annotated[str | None, typer.Option(help="Machine or machine file (.toml) of the side view.")] = None,
     rate: Annotated[float | None, typer.Option(min=0.01, help="Rate (Hz) where no model says it.")] = None,
@@ -66,7 +69,7 @@ def live(
     )
     order = LiveOrder(
         source=name, options=options, run=run, monitor=monitor, speed=speed, free_s=free_s, host=bind, port=port,
-        save=save, record=record, until_end=until_end,
+        save=save, record=record, rerun=rerun, until_end=until_end,
     )  # fmt: skip
 
     def ready(server: LiveServer) -> None:
@@ -80,7 +83,11 @@ def live(
         if kind != "note":
             err.print(f"{kind}: {text}")
 
-    result = run_live(order, ready, event)
+    def mirrored(address: str) -> None:
+        (err if as_json else out).print(f"Rerun: {address}")
+        err.print("Rerun has no token: every user of this machine can read there; its page calls its makers' servers")
+
+    result = run_live(order, ready, event, on_mirror=mirrored)
     facts = {
         "ticks": result.ticks,
         "alarms": result.alarms,

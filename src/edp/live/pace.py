@@ -58,6 +58,18 @@ class Pace:
                 self._changed.wait(left)
             return False
 
+    def is_due(self, tick: int) -> bool:
+        """Whether a tick would not have to wait: the source is behind, or runs as fast as it can."""
+        with self._changed:
+            if self.stopped or self.paused:
+                return False
+            if tick < self._ahead or math.isinf(self.speed):
+                return True
+            if self._base is None:
+                return False
+            first, began = self._base
+            return began + (tick - first) / (self.rate_hz * self.speed) <= self._clock()
+
     def pause(self, paused: bool) -> None:
         """Let ticks wait, or go on."""
         with self._changed:

@@ -86,10 +86,11 @@ class LiveSession:
             self.ticks += 1
             self.stamp = time.time()
 
-    def event(self, kind: str, text: str, group: str = "") -> None:
-        """Log an event at the present tick."""
+    def event(self, kind: str, text: str, group: str = "", tick: int | None = None) -> None:
+        """Log an event, at the present tick where no other is given."""
         with self._lock:
-            self._events.append(LiveEvent(self._counted, self.ticks, kind, text[:MOST_TEXT], group[:MOST_TEXT]))
+            at = self.ticks if tick is None else tick
+            self._events.append(LiveEvent(self._counted, at, kind, text[:MOST_TEXT], group[:MOST_TEXT]))
             self._counted += 1
 
     def break_off(self) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from edp.errors import ConfigError, DataError
 from edp.networks.input_range import HOLD_TICKS, input_limits
 from edp.networks.predictor import Predictor
+from edp.networks.streaming import State
 
 Rows = NDArray[np.float32]
 Inputs = Sequence[float] | NDArray[np.floating] | Tensor
@@ -102,6 +103,8 @@ class Stream:
         self._low, self._high = (limit.astype(np.float32) for limit in input_limits(predictor))
         task, self._coverages = predictor.task, tuple(predictor.output.coverages)
         self._shape = (len(task.horizons), len(task.targets))
+        self._state: State
+        self._age: int
         self.reset()
 
     def reset(self) -> None:
@@ -124,14 +127,43 @@ class Stream:
             DataError: another number of inputs, or something else than numbers.
         """
         row = self._row(inputs)
-        # A value beyond float32 becomes infinite, and is rejected as such; a comparison with NaN is false.
-        with np.errstate(over="ignore"):
-            single = row.astype(np.float32)
-        if bool(((single >= self._low) & (single <= self._high)).all()):
+        if self.accepts(row):
             self._last, self._holding = row, 0
             return self._tick(self._run(holding=False))
         self.rejected += 1
         return self._tick(self._hold())
+
+    def accepts(self, rows: NDArray[np.floating]) -> bool:
+        """Whether none of the inputs in SI units would be rejected; shape (input,) or (ticks, input)."""
+        # A value beyond float32 becomes infinite, and is rejected as such; a comparison with NaN is false.
+        with np.errstate(over="ignore"):
+            single = rows.astype(np.float32)
+        inside: NDArray[np.bool_] = (single >= self._low) & (single <= self._high)
+        return bool(inside.all())
+
+    def steps(self, inputs: NDArray[np.floating]) -> list[StreamTick]:
+        """Feed ticks that follow each other, ``(ticks, input)``: what `step` gives for each, but for rounding.
+
+        Where all are accepted it is one call of the network, which costs little more than one tick.
+
+        Raises:
+            DataError: see `step`.
+        """
+        rows = [self._row(row) for row in inputs]
+        if len(rows) < 2 or not self.accepts(np.array(rows)):
+            return [self.step(row) for row in rows]
+        before = self._state
+        numbers = self._computed(np.array(rows))
+        if not np.isfinite(numbers).all():
+            self._state = before
+            return [self.step(row) for row in rows]
+        ticks = []
+        for row, self._numbers in zip(rows, numbers, strict=True):
+            self.ticks += 1
+            self._last, self._holding = row, 0
+            self._age = min(self._age + 1, self.predictor.window)
+            ticks.append(self._tick(StreamStatus.OK if self.warm else StreamStatus.WARMING))
+        return ticks
 
     def missed(self, ticks: int = 1) -> StreamTick:
         """Tell that ticks went by without a step; the result is that of the last of them.
@@ -182,7 +214,7 @@ class Stream:
         """One tick of the network from the last accepted inputs."""
         self.ticks += 1
         # Non-finite results would stay in the recurrent state for ever; clearing it is the only way back.
-        numbers = self._computed()
+        numbers = self._computed(self._last[None])[0]
         if not np.isfinite(numbers).all():
             self.restarts += 1
             self._forget()
@@ -193,14 +225,14 @@ class Stream:
             return StreamStatus.HELD
         return StreamStatus.OK if self.warm else StreamStatus.WARMING
 
-    def _computed(self) -> Rows:
-        """Predictions, then lower and upper bounds, ``(1 + 2 * coverage, horizon, target)``, SI units."""
-        x = torch.from_numpy(self._last).to(dtype=self._like.dtype, device=self._like.device).reshape(1, 1, -1)
+    def _computed(self, rows: NDArray[np.floating]) -> Rows:
+        """Predictions, then lower and upper bounds, ``(ticks, 1 + 2 * coverage, horizon, target)``, SI units."""
+        x = torch.from_numpy(rows).to(dtype=self._like.dtype, device=self._like.device).unsqueeze(0)
         with torch.inference_mode(), _threads(self._threads):
             center, bounds, self._state = self.predictor.predict_with_intervals(x, self._state)
-            parts = [center[0, 0].unsqueeze(0)]
-            parts += [] if bounds is None else [bounds[0, 0, :, side] for side in (0, 1)]
-            numbers: Rows = torch.cat(parts).float().cpu().numpy()
+            parts = [center[0].unsqueeze(1)]
+            parts += [] if bounds is None else [bounds[0, :, :, side] for side in (0, 1)]
+            numbers: Rows = torch.cat(parts, dim=1).float().cpu().numpy()
         return numbers
 
     def _hold(self) -> StreamStatus:

@@ -6,9 +6,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import live_browser
 import numpy as np
 import pytest
+from browser import DESK, Browser
 
 from edp.live import Forecast, LiveLayout, LiveSession, LiveTrace, Pace, write_session_page
 from edp.live.server import LiveServer
@@ -16,10 +16,7 @@ from edp.report.animation.page import geometry_of
 from edp.signals import Channel, Kind
 from edp.sim import load_machine
 
-pytestmark = [
-    pytest.mark.processes,
-    pytest.mark.skipif(live_browser.CHROMIUM is None, reason="needs chromium (make system-packages)"),
-]
+pytestmark = pytest.mark.processes
 HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
 
 
@@ -42,12 +39,6 @@ def stream(session: LiveSession, ticks: int) -> None:
         session.append(np.array(row, np.float32))
 
 
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[live_browser.Browser]:
-    with live_browser.browser() as one:
-        yield one
-
-
 @pytest.fixture
 def served() -> Iterator[LiveServer]:
     server = LiveServer(session_of(), Pace(100.0))
@@ -65,70 +56,69 @@ def served() -> Iterator[LiveServer]:
     thread.join(20)
 
 
-def harmless(page: live_browser.Page, address: str) -> None:
+def harmless(page: Browser, address: str) -> None:
     """Nothing ran, nothing failed, nothing was fetched from elsewhere."""
-    assert page.value("document.title").endswith("live view")
-    assert page.value("document.querySelectorAll('img').length") == 0
-    assert page.messages == []
-    assert [one for one in page.requests if not one.startswith(address)] == []
+    assert page.run("document.title").endswith("live view")
+    assert page.run("document.querySelectorAll('img').length") == 0
+    assert page.complaints() == []
+    assert [one for one in page.requests() if not one.startswith(address)] == []
 
 
-def test_a_session_is_shown_as_it_comes_and_names_are_text(chromium, served):
+def test_a_session_is_shown_as_it_comes_and_names_are_text(browser, served):
     session = served.session
     stream(session, 200)
     session.event("alarm", HOSTILE, "g")
     session.event("alarm", HOSTILE, "g")
-    page = chromium.page()
-    page.size(1280, 900)
+    page = browser
     page.open(served.address)
     page.wait("window.edpLive && edpLive.frames > 0 && document.querySelectorAll('#events li').length")
     stream(session, 300)
     page.wait("edpLive.ticks >= 300 && document.getElementById('clock').textContent.startsWith('5.0 s')")
-    assert page.value("document.getElementById('title').textContent") == HOSTILE
-    assert HOSTILE in page.value("document.getElementById('charts').textContent")
-    assert page.value("document.querySelectorAll('#charts figure').length") == 3
+    assert page.run("document.getElementById('title').textContent") == HOSTILE
+    assert HOSTILE in page.run("document.getElementById('charts').textContent")
+    assert page.run("document.querySelectorAll('#charts figure').length") == 3
     # Alarms that say the same are one row, with their number.
-    assert page.value("document.querySelectorAll('#events li.alarm').length") == 1
-    assert "(2 times" in page.value("document.querySelector('#events li.alarm').textContent")
-    assert page.value("document.getElementById('front').width") > 100
-    assert page.value("document.documentElement.scrollWidth <= innerWidth")
+    assert page.run("document.querySelectorAll('#events li.alarm').length") == 1
+    assert "(2 times" in page.run("document.querySelector('#events li.alarm').textContent")
+    assert page.run("document.getElementById('front').width") > 100
+    assert page.run("document.documentElement.scrollWidth <= innerWidth")
     harmless(page, served.address)
-    page.size(390, 844)
-    assert page.wait("document.documentElement.scrollWidth <= innerWidth")
-    page.size(1280, 900, dark=True)
-    assert page.value("getComputedStyle(document.body).backgroundColor") == "rgb(20, 25, 30)"
+    page.size(390, 844, phone=True)
+    page.wait("document.documentElement.scrollWidth <= innerWidth")
+    page.size(*DESK, dark=True)
+    assert page.run("getComputedStyle(document.body).backgroundColor") == "rgb(20, 25, 30)"
     stream(session, 10)
     # The line of what is measured is light on dark now.
     page.wait("document.querySelector('figcaption i[data-colour=measured]').style.borderColor === 'rgb(232, 236, 240)'")
 
 
-def test_viewers_pause_look_back_and_run_ahead(chromium, served):
+def test_viewers_pause_look_back_and_run_ahead(browser, served):
     stream(served.session, 400)
-    page = chromium.page()
+    page = browser
     page.open(served.address)
     page.wait("window.edpLive && edpLive.frames > 0 && edpLive.state")
-    page.value("document.getElementById('play').click()")
+    page.run("document.getElementById('play').click()")
     page.wait("document.getElementById('state').textContent.startsWith('source paused')")
     assert served.pace.paused
-    page.value("document.getElementById('play').click()")
+    page.run("document.getElementById('play').click()")
     page.wait("document.getElementById('play').textContent === 'Pause'")
     seek = (
         "(() => {{ const s = document.getElementById('scrub'); s.value = {}; s.dispatchEvent(new Event('input')); }})()"
     )
-    page.value(seek.format(100))
+    page.run(seek.format(100))
     page.wait("document.getElementById('clock').textContent.startsWith('1.0 s')")
     stream(served.session, 50)
     time.sleep(0.3)
-    assert page.value("document.getElementById('clock').textContent").startswith("1.0 s")
-    page.value(seek.format(3000))
+    assert page.run("document.getElementById('clock').textContent").startswith("1.0 s")
+    page.run(seek.format(3000))
     page.wait("document.getElementById('clock').textContent.startsWith('4.5 s')")
     assert served.pace._ahead == 3000
     harmless(page, served.address)
 
 
-def test_a_server_that_ends_and_rows_that_stop_are_said(chromium, served):
+def test_a_server_that_ends_and_rows_that_stop_are_said(browser, served):
     stream(served.session, 100)
-    page = chromium.page()
+    page = browser
     page.open(served.address)
     page.wait("window.edpLive && edpLive.frames > 0")
     stream(served.session, 10)
@@ -137,7 +127,7 @@ def test_a_server_that_ends_and_rows_that_stop_are_said(chromium, served):
     page.wait("document.getElementById('state').textContent.startsWith('the log has ended')")
 
 
-def test_a_saved_session_replays_without_a_server(chromium, tmp_path: Path):
+def test_a_saved_session_replays_without_a_server(browser, tmp_path: Path):
     session = session_of()
     stream(session, 450)
     session.break_off()
@@ -145,19 +135,18 @@ def test_a_saved_session_replays_without_a_server(chromium, tmp_path: Path):
     session.event("alarm", HOSTILE)
     session.end("done")
     file = write_session_page(session, tmp_path / "session.html")
-    page = chromium.page()
-    page.size(1280, 1400)
-    page.open(file.as_uri())
+    page = browser
+    page.open(file, (1280, 1400))
     page.wait("window.edpLive && edpLive.frames > 3")
     page.wait("parseFloat(document.getElementById('clock').textContent) > 0.3")
-    assert page.value("document.getElementById('events').textContent").count(HOSTILE) == 1
-    page.value("document.getElementById('speed').value = '50'")
+    assert page.run("document.getElementById('events').textContent").count(HOSTILE) == 1
+    page.run("document.getElementById('speed').value = '50'")
     page.wait("document.getElementById('play').textContent === 'Play'")
     page.wait("document.getElementById('clock').textContent.startsWith('5.0 s')")
     scrub = "const s = document.getElementById('scrub')"
     residual = "[...document.querySelectorAll('figcaption span span')].pop().textContent"
     for tick, shown in ((449, True), (451, False), (459, False), (461, True)):
-        page.value(f"(() => {{ {scrub}; s.value = {tick}; s.dispatchEvent(new Event('input')); }})()")
+        page.run(f"(() => {{ {scrub}; s.value = {tick}; s.dispatchEvent(new Event('input')); }})()")
         page.wait(f"document.getElementById('clock').textContent.startsWith('{tick / 100:.1f} s')")
         # Nothing foretold of the session before is held against the one that began anew.
         page.wait(f"({residual} !== '–') === {str(shown).lower()}")

@@ -15,6 +15,7 @@ from small_monitors import fitted_monitor
 from edp.errors import ConfigError, DataError
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
+from edp.networks.stream import Stream
 from edp.networks.twin import TWINS
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
@@ -29,6 +30,7 @@ from edp.training.twin_bundle import TwinBundle
 from edp.workflows.live import SOURCES, LiveOrder, LiveRun, SourceOptions
 from edp.workflows.live.free_run import LiveTwin
 from edp.workflows.live.look_ahead import LiveNetwork, spread
+from edp.workflows.live.run_live import AT_ONCE
 from edp.workflows.live.sources.base import LiveSource, Needs
 from edp.workflows.live.sources.log import LogSource
 from edp.workflows.live.sources.sim import SimSource, view_of_truth
@@ -93,13 +95,43 @@ def test_missing_values_are_held_and_told_once_and_gaps_restart(tiny, network):
     bad[1] = np.nan
     for row in (*good[:20], bad, bad, *good[20:30]):
         live.take(row)
+    live.show()
     texts = [event.text for event in live.session.events()]
+    # Rows are taken many at once here; each event stands at its own tick all the same.
+    assert [event.tick for event in live.session.events() if event.group in ("held", "reads")] == [20, 22]
     assert sum("holds the last ones" in text for text in texts) == 1
     assert sum("all values again" in text for text in texts) == 1
     live.take(good[30], missed=10_000)
     live.take(good[31], trusted=False)
+    live.show()
     column = live.session.layout.forecasts[0].column
     assert np.isnan(live.session.read(live.session.ticks - 1, 1)[1][0, column])
+
+
+def test_rows_that_are_due_together_give_the_numbers_of_rows_one_by_one(tiny, network, monkeypatch):
+    recording, asked = recording_of(tiny), []
+    steps = Stream.steps
+    monkeypatch.setattr(Stream, "steps", lambda self, rows: asked.append(len(rows)) or steps(self, rows))
+    together = played(run_of(LogSource(recording), run=network[1]))
+    assert max(asked) == AT_ONCE
+    monkeypatch.setattr(sys.modules[LiveRun.__module__], "AT_ONCE", 1)
+    alone = played(run_of(LogSource(recording), run=network[1]))
+    np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)
+
+
+def test_a_source_that_keeps_up_is_shown_row_by_row(tiny):
+    live = LiveRun(LiveOrder("test", SourceOptions(""), speed=1.0), source=LogSource(recording_of(tiny)))
+    clock = [0.0]
+    live.pace._clock = lambda: clock[0]
+    for tick, row in enumerate(tiny.test[0].inputs[:5]):
+        live.take(row)
+        assert live.session.ticks == tick + 1
+        clock[0] += 0.01
+    clock[0] += 0.05  # the models were slow: six rows are due
+    for tick, row in enumerate(tiny.test[0].inputs[5:11]):
+        live.take(row)
+        assert live.session.ticks == (5 if tick < 5 else 11)
+    live.close()
 
 
 def test_of_many_horizons_the_first_and_the_last_are_shown():

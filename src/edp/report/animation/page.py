@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,27 @@ OUTSIDE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
+class ForecastLine:
+    """A prediction along a recording, each value at the tick for which it was made; arrays have shape (ticks,).
+
+    Attributes:
+        name: of what is predicted, in words.
+        unit: of all values.
+        predicted: NaN where there is none.
+        measured: what then happened.
+        lower: bounds of the interval; None without one, `upper` likewise.
+        upper: see `lower`.
+    """
+
+    name: str
+    unit: str
+    predicted: Array
+    measured: Array
+    lower: Array | None = None
+    upper: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """What is shown, at `FRAMES_PER_S`; every array has shape (frame, columns).
 
@@ -45,6 +67,7 @@ class Scene:
         ground: heights above the boom foot, m; no columns without soil.
         ground_x: where they are, m before the boom foot.
         readings: further values by name, with their unit.
+        forecasts: lines of predictions, at the frames.
     """
 
     name: str
@@ -56,10 +79,15 @@ class Scene:
     ground: Array
     ground_x: Array
     readings: dict[str, Array]
+    forecasts: tuple[ForecastLine, ...] = ()
 
 
 def scene_of(
-    recording: Recording, machine: str | None = None, start_s: float = 0.0, seconds: float | None = None
+    recording: Recording,
+    machine: str | None = None,
+    start_s: float = 0.0,
+    seconds: float | None = None,
+    forecasts: Sequence[ForecastLine] = (),
 ) -> Scene:
     """What a page or film of a recording shows.
 
@@ -68,6 +96,7 @@ def scene_of(
         machine: name or file of the machine; default: the one the recording was simulated with.
         start_s: first second shown.
         seconds: how many; default: to the end, at most `LONGEST_S`.
+        forecasts: along the recording, to be drawn beside what then happened.
 
     Raises:
         DataError: neither angles nor strokes, or strokes that this machine does not have.
@@ -114,6 +143,16 @@ def scene_of(
         ground=shown.take(*ground) if soil else np.zeros((len(rows), 0)),
         ground_x=np.asarray(index * SPACING_M, dtype=np.float64),
         readings=readings,
+        forecasts=tuple(_at_rows(line, rows) for line in forecasts),
+    )
+
+
+def _at_rows(line: ForecastLine, rows: NDArray[np.int_]) -> ForecastLine:
+    def of(values: Array | None) -> Array | None:
+        return None if values is None else values[rows]
+
+    return replace(
+        line, predicted=line.predicted[rows], measured=line.measured[rows], lower=of(line.lower), upper=of(line.upper)
     )
 
 
@@ -237,7 +276,25 @@ def _plain(scene: Scene) -> dict[str, Any]:
         "ground_every": 5,
         "ground_x": np.round(scene.ground_x, 3).tolist(),
         "readings": {name: np.round(values, 1).tolist() for name, values in scene.readings.items()},
+        "forecasts": [
+            {
+                "name": line.name,
+                "unit": line.unit,
+                **{part: _gappy(getattr(line, part)) for part in ("predicted", "measured", "lower", "upper")},
+            }
+            for line in scene.forecasts
+        ],
     }
+
+
+def _gappy(values: Array | None) -> list[float | None] | None:
+    """Values with as many digits as a picture shows, and None where there is none."""
+    if values is None:
+        return None
+    finite = np.abs(values[np.isfinite(values)])
+    # A thousandth of the largest value is finer than a pixel.
+    places = 3 - math.floor(math.log10(finite.max())) if finite.size and finite.max() > 0.0 else 0
+    return [round(float(v), places) if math.isfinite(v) else None for v in values]
 
 
 def geometry_of(machine: Machine) -> dict[str, Any]:

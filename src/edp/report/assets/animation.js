@@ -9,7 +9,7 @@
 
   const at = (columns, frame) => {
     const k = Math.min(Math.floor(frame), frames - 2), w = frame - k;
-    return columns.map((column) => column[k] * (1 - w) + column[k + 1] * w);
+    return columns.map((column) => (column[k] === null || column[k + 1] === null ? NaN : column[k] * (1 - w) + column[k + 1] * w));
   };
   const tips = Array.from({ length: frames }, (_, k) => side.pose(scene.angles.map((x) => x[k])).tip);
   const soil = scene.ground.length > 0 && scene.ground[0].length > 0;
@@ -30,7 +30,7 @@
   const WINDOW = 12;
   const charts = [];
   const holder = document.getElementById("charts");
-  function chart(title, unit, rows) {
+  function chart(title, unit, rows, exact = false) {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
     const canvas = document.createElement("canvas");
     const head = document.createElement("b");
@@ -47,13 +47,15 @@
     figure.append(caption, canvas);
     holder.append(figure);
     let low = Infinity, high = -Infinity;
-    rows.forEach((row) => row.data.forEach((v) => { low = Math.min(low, v); high = Math.max(high, v); }));
+    const reach = (v) => { if (v !== null) { low = Math.min(low, v); high = Math.max(high, v); } };
+    rows.forEach((row) => [row.data, ...(row.band || [])].forEach((column) => column.forEach(reach)));
+    if (low > high) { low = 0; high = 1; }
     const room = 0.06 * (high - low || 1);
     canvas.addEventListener("click", (event) => {
       const [first, last] = span(position), plot = canvas.clientWidth - 46;
       seek(first + ((event.offsetX - 40) / plot) * (last - first));
     });
-    charts.push({ canvas, rows, values, low: low - room, high: high + room });
+    charts.push({ canvas, rows, values, exact, low: low - room, high: high + room });
   }
   const span = (frame) => {
     const width = Math.min(WINDOW * rate, frames - 1);
@@ -86,16 +88,36 @@
       if (x > left + 8 && x < right - 8) c.fillText(`${Math.round((s + scene.start) * 10) / 10} s`, x, height - 4);
     }
     c.save(); c.beginPath(); c.rect(left, 0, right - left, bottom + 1); c.clip();
+    const begin = Math.max(0, Math.floor(first)), end = Math.min(frames - 1, Math.ceil(last));
     it.rows.forEach((row) => {
+      if (row.band) {
+        const [lower, upper] = row.band;
+        c.fillStyle = row.colour; c.globalAlpha = 0.16;
+        for (let k = begin; k < end; k++) {
+          if ([lower[k], upper[k], lower[k + 1], upper[k + 1]].includes(null)) continue;
+          c.beginPath(); c.moveTo(px(k), py(lower[k])); c.lineTo(px(k + 1), py(lower[k + 1]));
+          c.lineTo(px(k + 1), py(upper[k + 1])); c.lineTo(px(k), py(upper[k])); c.fill();
+        }
+        c.globalAlpha = 1;
+      }
       c.strokeStyle = row.colour; c.lineWidth = row.dashed ? 1.4 : 1.8; c.setLineDash(row.dashed ? [4, 3] : []);
       c.beginPath();
-      for (let k = Math.max(0, Math.floor(first)); k <= Math.min(frames - 1, Math.ceil(last)); k++) c.lineTo(px(k), py(row.data[k]));
+      let drawing = false;
+      for (let k = begin; k <= end; k++) {
+        if (row.data[k] === null) { drawing = false; continue; }
+        if (drawing) c.lineTo(px(k), py(row.data[k])); else c.moveTo(px(k), py(row.data[k]));
+        drawing = true;
+      }
       c.stroke();
     });
     c.setLineDash([]); c.restore();
     c.strokeStyle = "#b3261e"; c.lineWidth = 1;
     c.beginPath(); c.moveTo(px(frame), top); c.lineTo(px(frame), bottom); c.stroke();
-    it.rows.forEach((row, i) => { it.values[i].textContent = at([row.data], frame)[0].toFixed(0); });
+    const places = Math.max(0, Math.min(6, 2 - Math.floor(Math.log10(it.high - it.low))));
+    it.rows.forEach((row, i) => {
+      const value = at([row.data], frame)[0];
+      it.values[i].textContent = Number.isNaN(value) ? "none" : value.toFixed(it.exact ? places : 0).replace(/^-(0(?:\.0+)?)$/, "$1");
+    });
   }
 
   let position = 0, playing = true, before = null;
@@ -107,6 +129,10 @@
     term.textContent = name; box.append(term, value); readings.append(box);
     return [name, value];
   });
+  scene.forecasts.forEach((line) => chart(line.name, line.unit, [
+    { name: "measured", data: line.measured, colour: "#3c4650" },
+    { name: "predicted", data: line.predicted, colour: "#0b57d0", dashed: true, band: line.lower && [line.lower, line.upper] },
+  ], true));
   chart("Cylinder velocity", "mm/s", scene.velocity.map((data, i) => ({ name: names[i], data, colour: colours[i] })));
   for (let i = 0; i < scene.pressure.length / 2; i++) {
     chart(`${names[i]} pressure`, "bar", [

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.live.layout import Forecast, label
-from edp.networks.stream import Stream, StreamStatus
+from edp.networks.stream import Stream, StreamStatus, StreamTick
 from edp.signals import KINDS, Channel
 from edp.training.bundle import Bundle
 from edp.workflows.live.parts import LivePart, Note, Row, columns_of
@@ -49,6 +49,19 @@ class LiveNetwork(LivePart):
             self._stream.missed(missed)
         tick = self._stream.step(row[self._columns])
         self._tell(tick.status)
+        return self._shown(tick)
+
+    def at_once(self, rows: Row) -> Row | None:
+        """See `LivePart`; what is rejected or held is told tick by tick."""
+        inputs = rows[:, self._columns]
+        if self._held or not self._stream.accepts(inputs):
+            return None
+        ticks = self._stream.steps(inputs)
+        self._tell(ticks[-1].status)
+        return np.array([self._shown(tick) for tick in ticks])
+
+    def _shown(self, tick: StreamTick) -> Row:
+        """Predictions by horizon and target, then lower and upper bounds."""
         if not tick.valid:
             return np.full(self.width, np.nan, np.float32)
         parts = [tick.prediction]

@@ -38,6 +38,16 @@ class LivePart(ABC):
             missed: ticks that went by without a row before it.
         """
 
+    def at_once(self, rows: Row) -> Row | None:
+        """What `step` would give for rows that follow each other, shape (ticks, width), by one call of a model.
+
+        None where it would not be the same, or is not known: the rows are then taken one by one.
+
+        Args:
+            rows: of the source's channels, shape (ticks, channels).
+        """
+        return None
+
     @abstractmethod
     def reset(self) -> None:
         """Forget all rows."""
@@ -91,11 +101,16 @@ class LiveFront(LivePart):
 
     def step(self, row: Row, missed: int) -> Row:
         """See `LivePart`."""
-        values = row[self._columns]
+        angles: Row = self.at_once(row[None])[0]
+        return angles
+
+    def at_once(self, rows: Row) -> Row:
+        """See `LivePart`."""
+        values: Row = rows[:, self._columns]
         if self._tables is None:
             return values
-        bent = [np.interp(value, *table) for value, table in zip(values, self._tables, strict=True)]
-        return np.array(bent, np.float32)
+        bent = [np.interp(value, *table) for value, table in zip(values.T, self._tables, strict=True)]
+        return np.array(bent, np.float32).T
 
     def reset(self) -> None:
         """See `LivePart`."""

@@ -7,7 +7,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +19,17 @@ from edp.live.saved import write_session_page
 from edp.live.server import LOOPBACK, LiveServer
 from edp.live.session import HISTORY_BYTES, LiveSession
 from edp.monitor.monitor_file import load_monitor
-from edp.signals import Channel, Kind
-from edp.training.bundle import Bundle, load_bundle
-from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
 from edp.workflows.live.free_run import FREE_S, LiveTwin
 from edp.workflows.live.look_ahead import LiveNetwork
+from edp.workflows.live.mirror import RerunMirror
+from edp.workflows.live.models import LiveModels, check_rate, levers_of, models_of, needs_of
 from edp.workflows.live.parts import LiveFront, LivePart, Row
 from edp.workflows.live.record import McapRecorder
-from edp.workflows.live.sources import SOURCES, LiveSource, Needs, SourceOptions, SourceStopped
+from edp.workflows.live.sources import SOURCES, LiveSource, SourceOptions, SourceStopped
 from edp.workflows.live.watch import LiveMonitor
 
-MOST_LEVERS = 12
-LEVER = "Lever_"
+AT_ONCE = 25
+"""Rows that models are asked for at once where the source is behind: they cost a network little more than one."""
 STOP_S = 5.0
 """To wait for the thread of a source, which may be within a tick."""
 
@@ -50,6 +49,7 @@ class LiveOrder:
         port: see `host`.
         save: page to write at the end.
         record: MCAP file to write.
+        rerun: whether to show the session in Rerun besides.
         until_end: whether to end with the source; a session stays open for viewers otherwise.
         history_bytes: of rows that can be looked back at.
     """
@@ -64,6 +64,7 @@ class LiveOrder:
     port: int = 0
     save: Path | None = None
     record: Path | None = None
+    rerun: bool = False
     until_end: bool = False
     history_bytes: int = HISTORY_BYTES
 
@@ -119,8 +120,10 @@ class LiveRun:
         self.failure: EdpError | None = None
         self._waiting: list[tuple[str, str, str]] = []
         self._recorder: McapRecorder | None = None
-        models = _models(order)
-        self.source = source or SOURCES[order.source].of(order.options, _needs(models, order))
+        self._due: list[Row] = []
+        self._trusted, self._ahead = True, 0
+        models = models_of(order.run)
+        self.source = source or SOURCES[order.source].of(order.options, needs_of(models, order.monitor))
         try:
             self._parts, layout = self._assembled(models)
             self.pace = Pace(self.source.rate_hz, order.speed)
@@ -139,21 +142,50 @@ class LiveRun:
         """See `edp.workflows.live.sources.Sink`; the others below likewise."""
         return self.pace.stopped
 
-    def take(self, row: Row, missed: int = 0, trusted: bool = True) -> None:
-        """A row of the source: wait until it is due, ask the models, keep it."""
-        if self.pace.stopped or (self.source.steered and not self.pace.wait(self.session.ticks)):
+    def take(self, row: Row, missed: int = 0, trusted: bool = True, more: bool = False) -> None:
+        """A row of the source: wait until it is due; ask the models and keep it, with those that are due with it."""
+        if self.pace.stopped:
             raise SourceStopped
-        columns = [row]
-        for part in self._parts:
-            asked = trusted or isinstance(part, LiveFront)
-            columns.append(part.step(row, missed) if asked else np.full(part.width, np.nan, np.float32))
-        full = np.concatenate(columns).astype(np.float32, copy=False)
-        self.session.append(full)
-        if self._recorder is not None:
-            self._recorder.row(self.session.ticks - 1, full)
+        following = self.session.ticks + len(self._due) + 1
+        if self.source.steered:
+            if not self.pace.wait(following - 1):
+                raise SourceStopped
+            more = self.pace.is_due(following)
+        if missed or trusted != self._trusted:
+            self.show()
+            self._trusted = trusted
+        self._due.append(row)
+        if missed or not more or len(self._due) >= AT_ONCE:
+            self.show(missed)
+
+    def show(self, missed: int = 0) -> None:
+        """Ask the models for the rows that are due, and keep them; `missed` ticks went by before the first one."""
+        if not self._due:
+            return
+        rows, self._due = np.array(self._due), []
+        columns = [rows, *(self._computed(part, rows, missed) for part in self._parts)]
+        self._ahead = 0
+        for full in np.concatenate(columns, axis=1).astype(np.float32, copy=False):
+            self.session.append(full)
+            if self._recorder is not None:
+                self._recorder.row(self.session.ticks - 1, full)
+
+    def _computed(self, part: LivePart, rows: Row, missed: int) -> Row:
+        """Columns of a part for rows, shape (ticks, width), by one call of its model where that gives the same."""
+        if not self._trusted and not isinstance(part, LiveFront):
+            return np.full((len(rows), part.width), np.nan, np.float32)
+        self._ahead = 0
+        at_once = None if missed or len(rows) == 1 else part.at_once(rows)
+        if at_once is not None:
+            return at_once
+        answers = np.empty((len(rows), part.width), np.float32)
+        for self._ahead, row in enumerate(rows):
+            answers[self._ahead] = part.step(row, missed if self._ahead == 0 else 0)
+        return answers
 
     def begin_anew(self) -> None:
         """What follows does not continue what came."""
+        self.show()
         for part in self._parts:
             part.reset()
         self.session.break_off()
@@ -163,24 +195,27 @@ class LiveRun:
         if not hasattr(self, "session"):
             self._waiting.append((kind, text, group))
             return
-        shown_text = sentence(text)
-        self.session.event(kind, shown_text, group)
+        shown_text, at = sentence(text), self.session.ticks + self._ahead
+        self.session.event(kind, shown_text, group, at)
         if kind == "alarm":
             self.alarms += 1
         if self._recorder is not None:
-            self._recorder.event(self.session.ticks, kind, shown_text)
+            self._recorder.event(at, kind, shown_text)
         self._on_event(kind, shown_text)
 
     def play(self) -> None:
         """Give all rows of the source; returns when there are no more, or the session is over."""
         try:
             self.source.run(self)
+            self.show()
             self.note("note", self.source.ending)
             self.session.end(self.source.ending)
         except SourceStopped:
+            self.show()
             self.session.end("the session was ended")
         except EdpError as error:
             self.failure = error
+            self.show()
             self.note("warning", f"the source has stopped: {error}")
             self.session.end(f"the source has stopped: {error}")
 
@@ -200,14 +235,14 @@ class LiveRun:
             result.saved = write_session_page(self.session, self.order.save)
         return result
 
-    def _assembled(self, models: _Models) -> tuple[list[LivePart], LiveLayout]:
+    def _assembled(self, models: LiveModels) -> tuple[list[LivePart], LiveLayout]:
         """The parts of a row behind the source's own, and the columns of all."""
         source, order = self.source, self.order
         parts: list[LivePart] = []
         forecasts: list[Forecast] = []
         statistics: dict[str, int] = {}
         width = len(source.channels)
-        _check_rate(source, models)
+        check_rate(source, models)
 
         def add(part: LivePart) -> int:
             nonlocal width
@@ -243,7 +278,7 @@ class LiveRun:
             forecasts=forecasts,
             geometry=geometry,
             angles=list(angles),
-            levers=_levers(source.channels, models.twin),
+            levers=levers_of(source.channels, models.twin),
             statistics=statistics,
             steered=source.steered,
             ticks=source.ticks,
@@ -255,6 +290,7 @@ def run_live(
     on_ready: Callable[[LiveServer], None] | None = None,
     on_event: Callable[[str, str], None] | None = None,
     source: LiveSource | None = None,
+    on_mirror: Callable[[str], None] | None = None,
 ) -> LiveResult:
     """Serve a session until Ctrl-C, a request to end, or with `LiveOrder.until_end` the end of the source.
 
@@ -263,11 +299,13 @@ def run_live(
         on_ready: called once the page can be opened.
         on_event: called with kind and text of each event.
         source: of the rows, in place of the order's.
+        on_mirror: called with the address of Rerun's page, where that is asked for.
 
     Raises:
         EdpError: source, models, port or files cannot be used.
     """
     live = LiveRun(order, on_event, source)
+    mirror = _mirrored(live, on_mirror)
     playing = threading.Thread(target=live.play, name="edp-live-source", daemon=True)
     try:
         asyncio.run(_served(live, playing, on_ready))
@@ -275,10 +313,25 @@ def run_live(
         live.pace.stop()
         if playing.ident is not None:
             playing.join(STOP_S)
+        if mirror is not None:
+            mirror.close()
         result = live.close()
     if live.failure is not None:
         raise live.failure
     return result
+
+
+def _mirrored(live: LiveRun, on_mirror: Callable[[str], None] | None) -> RerunMirror | None:
+    if not live.order.rerun:
+        return None
+    try:
+        mirror = RerunMirror(live.session)
+    except BaseException:
+        live.close()
+        raise
+    if on_mirror is not None:
+        on_mirror(mirror.address)
+    return mirror
 
 
 async def _served(live: LiveRun, playing: threading.Thread, on_ready: Callable[[LiveServer], None] | None) -> None:
@@ -318,58 +371,3 @@ def _interrupts(stop: asyncio.Event) -> Iterator[None]:
     finally:
         for number in signals:
             loop.remove_signal_handler(number)
-
-
-@dataclass(frozen=True)
-class _Models:
-    """What a run folder holds."""
-
-    bundle: Bundle | None = None
-    twin: TwinBundle | None = None
-    channels: tuple[Channel, ...] = field(default=())
-    rate_hz: float | None = None
-
-
-def _models(order: LiveOrder) -> _Models:
-    if order.run is None:
-        return _Models()
-    if holds_twin(order.run):
-        twin = load_twin(order.run)
-        channels = twin.twin.channels
-        return _Models(twin=twin, channels=(*channels.commands, *channels.answers), rate_hz=channels.rate_hz)
-    bundle = load_bundle(order.run)
-    targets = [
-        Channel(name, kind, text)
-        for name, kind, text in zip(bundle.task.targets, bundle.target_kinds, bundle.descriptions, strict=True)
-        if name not in bundle.task.inputs
-    ]
-    return _Models(bundle=bundle, channels=(*bundle.inputs, *targets), rate_hz=bundle.task.rate_hz)
-
-
-def _needs(models: _Models, order: LiveOrder) -> Needs:
-    channels = list(models.channels)
-    rate = models.rate_hz
-    if order.monitor is not None:
-        monitor = load_monitor(order.monitor)
-        channels += [channel for channel in monitor.channels if channel not in channels]
-        rate = rate or monitor.rate_hz
-    return Needs(channels, rate, None if models.twin is None else models.twin.twin.channels)
-
-
-def _check_rate(source: LiveSource, models: _Models) -> None:
-    rate = models.rate_hz
-    # A thousandth: loggers state the same rate with different digits.
-    if rate is not None and abs(source.rate_hz - rate) > 1e-3 * rate:
-        raise ConfigError(
-            f"{source.text} has {source.rate_hz:g} Hz, the run {rate:g} Hz; set rate_hz in the signal map, or choose "
-            "a run of this rate"
-        )
-
-
-def _levers(channels: tuple[Channel, ...], twin: TwinBundle | None) -> list[int]:
-    """Columns of what is commanded: levers, else the twin's commands, else pilot pressures but for conflux ones."""
-    commanded = {c.name for c in twin.twin.channels.commands} if twin is not None else set()
-    pilots = [c.name for c in channels if c.kind is Kind.PILOT_PRESSURE and not c.name.endswith("Conf")]
-    levers = [c.name for c in channels if c.name.startswith(LEVER)]
-    chosen = levers or [c.name for c in channels if c.name in commanded] or pilots
-    return [n for n, channel in enumerate(channels) if channel.name in chosen][:MOST_LEVERS]

@@ -15,8 +15,9 @@ from edp.recording import Recording
 from edp.signals import Channel
 from edp.workflows.live.parts import LivePart, Note, Row
 
-CHUNK = 10
-"""Ticks that a monitor takes at once: its networks cost as much for ten as for one, and a block is longer."""
+MOST_TICKS = 100
+"""That a monitor takes at once. Nothing is judged before the end of a block, and its networks cost as much for all
+ticks of one as for a single tick; of longer blocks a part is enough."""
 
 
 class _Chunks(MonitorStream):
@@ -81,11 +82,12 @@ class LiveMonitor(LivePart):
         note("note", f"monitor: {monitor.limit.sentence()}", "")
 
     def step(self, row: Row, missed: int) -> Row:
-        """See `LivePart`: statistics over the limit, up to `CHUNK` ticks old."""
-        if missed > self._stream.monitor.chain.summaries.block:
+        """See `LivePart`: statistics over the limit, of the last block."""
+        block = self._stream.monitor.chain.summaries.block
+        if missed > block:
             self.reset()
         self._rows.append(np.append(row, np.float32(np.nan))[self._columns])
-        if len(self._rows) >= CHUNK:
+        if (self._stream.state.ticks + len(self._rows)) % block == 0 or len(self._rows) >= MOST_TICKS:
             for alarm in self._stream.chunk(np.array(self._rows)):
                 self._note("alarm", alarm.sentence, group_of(alarm))
             self._rows.clear()

@@ -33,17 +33,22 @@ class Sink(Protocol):
         """Whether the session is over."""
         ...
 
-    def take(self, row: Row, missed: int = 0, trusted: bool = True) -> None:
+    def take(self, row: Row, missed: int = 0, trusted: bool = True, more: bool = False) -> None:
         """A row, shape (channels,), SI units, NaN where missing; returns when the next one is due.
 
         Args:
             row: of the source's channels.
             missed: ticks that went by without a row before this one.
             trusted: whether rows come at the models' rate; they predict nothing where they do not.
+            more: whether a further row waits already, of a source that cannot be steered; both are then shown at once.
 
         Raises:
             SourceStopped: the session is over.
         """
+        ...
+
+    def show(self) -> None:
+        """Show what was taken: the row that was to follow does not come."""
         ...
 
     def begin_anew(self) -> None:

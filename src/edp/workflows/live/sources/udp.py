@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import select
 import socket
 import statistics
 import time
@@ -137,6 +138,7 @@ class UdpSource(LiveSource):
         while not sink.stopped:
             message = self._received(sink)
             if message is None:
+                sink.show()
                 if not silent and time.monotonic() - heard > SILENT_S:
                     silent = True
                     sink.note(
@@ -154,11 +156,18 @@ class UdpSource(LiveSource):
             if clock.trusted != trusted:
                 trusted = clock.trusted
                 self._tell_rate(sink, clock)
-            sink.take(self._row(message), missed, trusted)
+            sink.take(self._row(message), missed, trusted, self._waits())
 
     def close(self) -> None:
         """See `LiveSource`."""
         self._socket.close()
+
+    def _waits(self) -> bool:
+        """Whether a further datagram is there already: the models have been slower than the sender."""
+        try:
+            return bool(select.select([self._socket], [], [], 0.0)[0])
+        except (OSError, ValueError):  # closed meanwhile
+            return False
 
     def _received(self, sink: Sink) -> Mapping[str, float] | None:
         try:

@@ -1,0 +1,3 @@
+"""What the tests of the live view share."""
+
+from browser import browser as browser
