@@ -10,6 +10,7 @@ import typer
 from edp.cli.console import JsonFlag, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 
 if TYPE_CHECKING:
     from edp.report.transfer.facts import Transfer
@@ -29,6 +30,9 @@ def finetune(
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Fine-tune a network of one machine with logs of another, and judge it beside baselines on the same ticks.
@@ -52,7 +56,13 @@ def finetune(
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "finetune", "method")
         callbacks = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
-        result = make(bundle, source, order, folder, callbacks)
+        workforce = workforce_of(workers, cluster, open_cluster)
+        if workforce.alone:
+            result = make(bundle, source, order, folder, callbacks)
+        else:
+            from edp.workflows.fleet.training import finetune_with
+
+            result = finetune_with(workforce, bundle, source, order, folder, callbacks)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 

@@ -17,12 +17,12 @@ from types import SimpleNamespace
 
 import pytest
 
-import edp.workflows.search.cluster
+import edp.workflows.executors.cluster
 from edp.errors import ConfigError
 from edp.storage.ledger import Ledger, TrainingStatus, read_state
-from edp.workflows.search.cluster import RayPool
-from edp.workflows.search.executor import START, complete
-from edp.workflows.search.local import LocalPool
+from edp.workflows.executors.base import START, complete
+from edp.workflows.executors.cluster import RayPool
+from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 
@@ -196,16 +196,16 @@ class OneNode:
         self.results.pop(reference, None)
 
     def shutdown(self):
-        for pool in edp.workflows.search.cluster._pool.values():
+        for pool in edp.workflows.executors.cluster._pool.values():
             pool.close()
-        edp.workflows.search.cluster._pool.clear()
+        edp.workflows.executors.cluster._pool.clear()
 
 
 @pytest.fixture
 def node(monkeypatch):
     one = OneNode()
-    monkeypatch.setattr(edp.workflows.search.cluster, "_ray", lambda: one)
-    monkeypatch.setattr(edp.workflows.search.cluster, "_reach", lambda ray, address: None)
+    monkeypatch.setattr(edp.workflows.executors.cluster, "_ray", lambda: one)
+    monkeypatch.setattr(edp.workflows.executors.cluster, "_reach", lambda ray, address: None)
     monkeypatch.setattr(RayPool, "_check_nodes", lambda self: None)
     return one
 
