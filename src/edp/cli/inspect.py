@@ -54,7 +54,7 @@ def inspect(
     from edp.logs.source import DataSource
 
     source, asked = DataSource.of(data, signal_map), page is not None or bool(split or inputs)
-    names, known = tuple(filter(None, inputs.split(","))), None
+    names, inspection = tuple(filter(None, inputs.split(","))), None
     workforce = workforce_of(workers, cluster, open_cluster)
     with progress(as_json) as shown:
         on_log = LogDisplay(shown, Steps(as_json)).on_log
@@ -64,8 +64,8 @@ def inspect(
             from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 
             order = CoverageOrder(names, split) if covered or asked else None
-            known = inspect_with(workforce, source, order, on_log)
-            quality = known.quality
+            inspection = inspect_with(workforce, source, order, on_log)
+            quality = inspection.quality
     errors = quality.errors
     coverage_facts, why = None, "" if covered or asked else "not asked for"
     # Recordings with errors have no coverage: training would refuse them.
@@ -74,7 +74,7 @@ def inspect(
         if asked:
             raise DataError(f"'{data}': {why}")
     elif not errors and (covered or asked):
-        coverage_facts, why = _coverage(source, split, names, asked, known)
+        coverage_facts, why = _coverage(source, split, names, asked, inspection)
     if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
 
@@ -113,13 +113,13 @@ def inspect(
 
 
 def _coverage(
-    source: DataSource, split: str, inputs: tuple[str, ...], asked: bool, known: Inspection | None
+    source: DataSource, split: str, inputs: tuple[str, ...], asked: bool, inspection: Inspection | None
 ) -> tuple[Coverage | None, str]:
     """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
     from edp.workflows.train_evaluate import coverage
 
-    if known is not None and (known.coverage is not None or not asked):
-        return known.coverage, known.why
+    if inspection is not None and (inspection.coverage is not None or not asked):
+        return inspection.coverage, inspection.why
 
     try:
         return coverage(source, inputs, split), ""

@@ -166,18 +166,7 @@ def score_models(
     spec: JudgeSpec,
     left_out: Sequence[str] = (),
 ) -> Evaluation:
-    """Score predictions on ``data.test``, all on the same ticks.
-
-    Args:
-        models: predictions by name, the network's under ``network``.
-        predictor: the network.
-        data: prepared series.
-        spec: history, ticks.
-        left_out: baselines that were asked for and not run.
-
-    Raises:
-        DataError: no tick of the test series can be scored.
-    """
+    """Score predictions by name, the network's under ``network``, on ``data.test``; raises as `judge`."""
     # A whole window from reset: before that the network's memory is not filled, and baselines lack history.
     skip = predictor.spec.window if spec.skip is None else spec.skip
     if data.task.features.starting:  # While the start is read there is nothing to predict.

@@ -107,13 +107,13 @@ def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: dict[str, ty
 
 def classes_in(kind: type) -> dict[str, type]:
     """A dataclass and all that the types of its fields name, by name."""
-    found: dict[str, type] = {}
+    classes: dict[str, type] = {}
     waiting: list[Any] = [kind]
     while waiting:
         one = waiting.pop()
-        if isinstance(one, type) and is_dataclass(one) and one.__name__ not in found:
-            found[one.__name__] = one
+        if isinstance(one, type) and is_dataclass(one) and one.__name__ not in classes:
+            classes[one.__name__] = one
             waiting += list(typing.get_type_hints(one).values())
         elif isinstance(one, types.UnionType) or typing.get_origin(one) is not None:
             waiting += list(typing.get_args(one))
-    return found
+    return classes

@@ -84,11 +84,11 @@ def inspect_with(
             on_log(Path(unit.label), done, len(units))
 
     results = run_units(units, workforce, on_done=note)
-    found, why = None, ""
+    covered, why = None, ""
     if covers is not None:
         first, results = results[0], results[1:]
         why = str(first.values["why"])
-        found = None if first.content is None else unpacked(first.content, Coverage)
+        covered = None if first.content is None else unpacked(first.content, Coverage)
     looked = [unpacked(result.content or b"", LookedAt) for result in results[:looks]]
     reports = [report for one in looked for report in one.reports]
     sketches = [entry for one in looked for entry in one.sketches]
@@ -97,7 +97,7 @@ def inspect_with(
         names = unique_names([report.name for report in reports], [log.path for log in source.logs()])
         reports = [replace(report, name=name) for report, name in zip(reports, names, strict=True)]
         sketches = [None if s is None else replace(s, name=name) for s, name in zip(sketches, names, strict=True)]
-    return Inspection(compare(reports, [entry for entry in sketches if entry is not None]), found, why)
+    return Inspection(compare(reports, [entry for entry in sketches if entry is not None]), covered, why)
 
 
 def _units_of_logs(source: DataSource) -> list[WorkUnit]:
@@ -160,9 +160,9 @@ def _coverage_unit(source: DataSource, covers: CoverageOrder) -> WorkUnit:
 def cover_all(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, Any]:
     """What all recordings cover together, or why that cannot be told."""
     try:
-        found = coverage(
+        covered = coverage(
             DataSource.from_plain(where["source"]), tuple(identity.config["inputs"]), identity.config["split"]
         )
     except EdpError as error:
         return {"why": str(error)}
-    return WithState({"why": ""}, packed(found))
+    return WithState({"why": ""}, packed(covered))
