@@ -21,6 +21,7 @@ from edp.cli import (
     evaluate,
     export,
     finetune,
+    fleet,
     footprint,
     identify,
     init,
@@ -72,6 +73,7 @@ app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)
 app.command("pretrain")(pretrain.pretrain)
 app.command("finetune")(finetune.finetune)
+app.add_typer(fleet.app, name="fleet")
 app.command("adapt")(adapt.adapt)
 app.command("replay")(adapt.replay)
 app.add_typer(monitor.app, name="monitor")

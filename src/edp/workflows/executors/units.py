@@ -20,7 +20,7 @@ from typing import Any
 from edp.errors import EdpError, LostError, StorageError
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, code_version, read_state
 from edp.storage.runs import environment
-from edp.workflows.executors.base import Executor, Job, Workforce, complete
+from edp.workflows.executors.base import START, Executor, Job, Workforce, complete
 
 TRIED_AGAIN = tuple(status for status in TrainingStatus if status is not TrainingStatus.DONE)
 """A full disk or a log that was mended since: only what is done stays done when the command is given again."""
@@ -51,6 +51,8 @@ class WorkUnit:
 
     def job(self, threads: int) -> Job:
         """The unit for an executor."""
+        if START in self.where:
+            raise ValueError(f"'{START}' of `where` is the state that a training goes on from; name it otherwise")
         identity = TrainingIdentity(
             self.function, self.arguments, {}, 0, 0, code_version(whole=True), self.data, _environment(threads)
         )

@@ -45,7 +45,7 @@ def pretrain_with(
     where = {
         "source": source.to_plain(),
         "out": str(Path(out).resolve()),
-        "start": None if order.start is None else str(Path(order.start).resolve()),
+        "begun_from": None if order.start is None else str(Path(order.start).resolve()),
     }
     unit = WorkUnit(f"{__name__}:pretrain_there", f"pretraining in '{out}'", arguments, keys_of(source), where)
     values = dict(run_units([unit], workforce)[0].values)
@@ -59,7 +59,7 @@ def pretrain_there(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict
     """Train one network over many machines, or go on with it."""
     config = identity.config
     experiment = build(Experiment, config["experiment"], "of the unit")
-    order = Pretrain(method=config["method"], meta=MetaSpec(**config["meta"]), start=where["start"])
+    order = Pretrain(method=config["method"], meta=MetaSpec(**config["meta"]), start=where["begun_from"])
     try:
         return pretrain(DataSource.from_plain(where["source"]), experiment, order, where["out"])
     except Diverged as end:

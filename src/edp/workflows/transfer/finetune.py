@@ -119,7 +119,7 @@ def finetune(
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
     names, notes = _able(begun, order)
-    data, repair_notes = _target(begun, logs, experiment, order)
+    data, repair_notes = target_data(begun, logs, experiment, order)
     notes += repair_notes
     for note in notes:
         callbacks.on_note(note)
@@ -175,7 +175,7 @@ def train_method(source: str | Path, logs: DataSource, order: FinetuneRequest, o
     """
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
-    data, _ = _target(begun, logs, experiment, order)
+    data, _ = target_data(begun, logs, experiment, order)
     folder = _folder_of(name, order, Path(out))
     METHODS[name]().make(TransferCase(begun, logs, data, experiment, order.spec, folder, lambda training, event: None))
 
@@ -197,10 +197,14 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
     return [name for name in order.names if name not in lacking], notes
 
 
-def _target(
+def target_data(
     source: SourceModel, logs: DataSource, experiment: Experiment, order: FinetuneRequest
 ) -> tuple[Prepared, list[str]]:
-    """The logs, divided and held against the source; and what could not be held."""
+    """The logs of a target, divided and held against the source; and what could not be held.
+
+    Raises:
+        EdpError: logs that do not go with the source.
+    """
     task, window = source.bundle.task, source.predictor.spec.window
     recordings = logs.read()
     refuse_frozen(recordings, source.frozen, "would be trained on")
