@@ -29,7 +29,7 @@ FILES = frozenset(
         *("test_workflow", "test_trials", "transfer/test_checks", "transfer/test_finetune", "transfer/test_centring"),
         *("test_sim_limit", "test_sim_recordings", "test_front_door", "test_auto", "test_logs_shared_data"),
         *("test_auto_odd_data", "twin/test_continue_twin", "fleet/test_commands", "fleet/test_cluster_commands"),
-        *("pretraining/test_pretraining_units", "transfer/test_finetune_units"),
+        *("pretraining/test_pretraining_units", "pretraining/test_fleet_models", "transfer/test_finetune_units"),
     )
 )
 """Of ``tests/unit``: whose tests read logs or start workers."""

@@ -31,6 +31,7 @@ from edp.cli import (
     parity,
     pretrain,
     quantise,
+    registry,
     report,
     runs,
     screen,
@@ -74,6 +75,7 @@ app.command("compress")(compress.compress)
 app.command("pretrain")(pretrain.pretrain)
 app.command("finetune")(finetune.finetune)
 app.add_typer(fleet.app, name="fleet")
+app.add_typer(registry.app, name="registry")
 app.command("adapt")(adapt.adapt)
 app.command("replay")(adapt.replay)
 app.add_typer(monitor.app, name="monitor")
