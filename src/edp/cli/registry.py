@@ -67,7 +67,7 @@ def list_entries(registry: RegistryArgument, as_json: JsonFlag = False) -> None:
 @app.command("show")
 def show_entry(
     registry: RegistryArgument,
-    wanted: Annotated[str, typer.Argument(metavar="ENTRY", help="Name, or beginning of the identifier.")],
+    asked: Annotated[str, typer.Argument(metavar="ENTRY", help="Name, or beginning of the identifier.")],
     as_json: JsonFlag = False,
 ) -> None:
     """Show one entry, hold its files to its identifier, and tell where it comes from.
@@ -76,7 +76,7 @@ def show_entry(
     """
     from edp.workflows.fleet.registry import FILES, check_entry, find_entry, lineage
 
-    entry = find_entry(registry, wanted)
+    entry = find_entry(registry, asked)
     check_entry(registry, entry)
     steps = lineage(registry, entry)
     files = (registry / FILES / entry.id).resolve()

@@ -169,8 +169,8 @@ def verdict(facts: FleetFacts) -> list[str]:
     lines = [f"{drifting} of {len(facts.rows)} machines drift: their error grew over the time of their logs."]
     watched = [row for row in facts.rows if row.changes is not None]
     if watched:
-        told = sum(bool(row.changes) for row in watched)
-        lines.append(f"The monitor told of changes on {told} of {len(watched)}.")
+        changed = sum(bool(row.changes) for row in watched)
+        lines.append(f"The monitor told of changes on {changed} of {len(watched)}.")
     else:
         lines.append("No monitor watched.")
     if facts.failed:

@@ -166,7 +166,7 @@ def _judged(bundle: Bundle, source: MachineSource, where: Mapping[str, Any]) -> 
     if where["delta"] is not None:
         network = with_delta(network, read_delta(where["delta"]))
     factor = np.array([KINDS[kind].report_factor for kind in bundle.target_kinds])
-    errors = [np.abs(error) * factor for place, error in stream_errors(network, series) if place == 0]
+    errors = [np.abs(error) * factor for horizon, error in stream_errors(network, series) if horizon == 0]
     if not errors:
         shortest = task.max_horizon + network.spec.window
         return {"failed": f"no recording is longer than window and horizon together, {shortest} samples"}

@@ -265,22 +265,22 @@ def read_entry(registry: str | Path, digest: str) -> RegistryEntry:
     return RegistryEntry(**{name: content[name] for name in names})
 
 
-def find_entry(registry: str | Path, wanted: str) -> RegistryEntry:
+def find_entry(registry: str | Path, asked: str) -> RegistryEntry:
     """An entry by its name, of several the latest, or by the beginning of its identifier.
 
     Raises:
         ConfigError: none, or an identifier that begins several.
     """
     entries, _ = list_registry(registry)
-    named = [entry for entry in entries if entry.name == wanted]
+    named = [entry for entry in entries if entry.name == asked]
     if named:
         return named[-1]
-    begun = [entry for entry in entries if len(wanted) >= 4 and entry.id.startswith(wanted)]
+    begun = [entry for entry in entries if len(asked) >= 4 and entry.id.startswith(asked)]
     if len(begun) == 1:
         return begun[0]
     if begun:
-        raise ConfigError(f"'{wanted}' begins {len(begun)} identifiers; give more of it")
-    raise ConfigError(f"'{registry}' has no entry '{wanted}'{closest(wanted, {entry.name for entry in entries})}")
+        raise ConfigError(f"'{asked}' begins {len(begun)} identifiers; give more of it")
+    raise ConfigError(f"'{registry}' has no entry '{asked}'{closest(asked, {entry.name for entry in entries})}")
 
 
 def lineage(registry: str | Path, entry: RegistryEntry) -> list[RegistryEntry | str]:
