@@ -28,7 +28,8 @@ FILES = frozenset(
         *("test_logs_octave", "test_logs_parquet", "test_logs_rosbag", "test_logs_time_and_quality", "test_logs_truth"),
         *("test_workflow", "test_trials", "transfer/test_checks", "transfer/test_finetune", "transfer/test_centring"),
         *("test_sim_limit", "test_sim_recordings", "test_front_door", "test_auto", "test_logs_shared_data"),
-        *("test_auto_odd_data", "twin/test_continue_twin"),
+        *("test_auto_odd_data", "twin/test_continue_twin", "fleet/test_commands", "fleet/test_cluster_commands"),
+        *("pretraining/test_pretraining_units", "pretraining/test_fleet_models", "transfer/test_finetune_units"),
     )
 )
 """Of ``tests/unit``: whose tests read logs or start workers."""

@@ -21,6 +21,7 @@ from edp.cli import (
     evaluate,
     export,
     finetune,
+    fleet,
     footprint,
     forecast,
     identify,
@@ -31,6 +32,7 @@ from edp.cli import (
     parity,
     pretrain,
     quantise,
+    registry,
     report,
     runs,
     screen,
@@ -74,6 +76,8 @@ app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)
 app.command("pretrain")(pretrain.pretrain)
 app.command("finetune")(finetune.finetune)
+app.add_typer(fleet.app, name="fleet")
+app.add_typer(registry.app, name="registry")
 app.command("adapt")(adapt.adapt)
 app.command("replay")(adapt.replay)
 app.add_typer(monitor.app, name="monitor")

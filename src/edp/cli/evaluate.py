@@ -10,11 +10,13 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
     from edp.logs.source import DataSource
+    from edp.workflows.executors import Workforce
 
 # Scripts can tell a network that should not be used without reading JSON.
 BEATEN = 6
@@ -39,6 +41,9 @@ def evaluate(
     predictor: Annotated[
         Path | None, typer.Option(help="Of a twin: run folder of a look-ahead predictor to compare with.")
     ] = None,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Score a trained model on held-out recordings beside baselines; a twin on free runs.
@@ -50,7 +55,12 @@ def evaluate(
     from edp.training.twin_bundle import holds_twin
 
     source = None if data is None else source_of(data, signal_map, repair)
+    workforce = workforce_of(workers, cluster, open_cluster)
+    if minutes is not None and not workforce.alone:
+        raise ConfigError("--minutes bounds what one process does; leave it out with --workers and --cluster")
     if holds_twin(run):
+        if not workforce.alone:
+            raise ConfigError(f"'{run}' holds a twin, which one process judges; leave --workers and --cluster out")
         if baselines is not None or channel_importance or minutes is not None:
             raise ConfigError(
                 f"'{run}' holds a twin, which has no --baselines, --minutes or --channel-importance; leave them out: "
@@ -66,7 +76,7 @@ def evaluate(
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
     from edp.storage.runs import read_provenance
 
-    folder, scores = run_evaluation(run, source, names, as_json, minutes)
+    folder, scores = run_evaluation(run, source, names, as_json, minutes, workforce)
     beaten = beaten_by(scores, minutes_of(run))
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
     choice = read_choice(run) if source is None else None
@@ -148,6 +158,7 @@ def run_evaluation(
     names: list[str] | None = None,
     quiet: bool = False,
     minutes: float | None = None,
+    workforce: Workforce | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Judge with a progress display; returns the folder of the scores and the scores."""
     from edp.storage import read_object
@@ -162,7 +173,12 @@ def run_evaluation(
             shown.update(bar, note=name)
             steps.say(f"evaluate: {name}, {duration(time.monotonic() - began)} so far")
 
-        folder = judge_run(run, source, names, on_step, minutes)
+        if workforce is None or workforce.alone:
+            folder = judge_run(run, source, names, on_step, minutes)
+        else:
+            from edp.workflows.fleet.judging import evaluate_with
+
+            folder = evaluate_with(workforce, run, source, names, on_step)
     return folder, read_object(folder / "scores.json")
 
 

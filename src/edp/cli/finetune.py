@@ -7,17 +7,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.errors import ConfigError
 
 if TYPE_CHECKING:
     from edp.report.transfer.facts import Transfer
+    from edp.workflows.executors import Workforce
+    from edp.workflows.fleet.personal import PersonalOrder
 
 
 def finetune(
     bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
-    logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, folder, data-set file, or store.")],
+    logs: Annotated[
+        Path | None, typer.Argument(help="Logs of the target: a log, folder, data-set file, or store.")
+    ] = None,
+    *,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     method: Annotated[str, typer.Option(help="Method whose network becomes the run.")] = "full",
     baselines: Annotated[
@@ -29,6 +36,15 @@ def finetune(
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    fleet: Annotated[
+        Path | None, typer.Option(help="In place of LOGS: a store of many machines, each of which gets a delta.")
+    ] = None,
+    delta_kb: Annotated[
+        int | None, typer.Option("--delta-kb", min=8, max=16384, help="With --fleet: size of a delta; default: 64.")
+    ] = None,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Fine-tune a network of one machine with logs of another, and judge it beside baselines on the same ticks.
@@ -40,6 +56,10 @@ def finetune(
     Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --baselines all`
 
     Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --set finetune.rounds=20 --set finetune.batch=16`
+
+    With --fleet a store of many machines is taken, and what comes out is a delta of kilobytes for each of them.
+
+    Example: `edp finetune runs/foundation --fleet stores/fleet --out fleet/own --workers 4`
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.report import read_transfer, write_transfer_page
@@ -47,12 +67,29 @@ def finetune(
     from edp.workflows.transfer import finetune as make
 
     spec, others = command_settings("finetune", FinetuneSpec, config, changes, TRAINING_TABLES)
+    workforce = workforce_of(workers, cluster, open_cluster)
+    if fleet is not None:
+        if logs is not None or signal_map is not None or repair:
+            raise ConfigError("LOGS, --map and --repair do not go with --fleet, whose store holds mapped logs already")
+        from edp.workflows.fleet.personal import PersonalOrder
+
+        size = {} if delta_kb is None else {"most_bytes": 1024 * delta_kb}
+        personal = PersonalOrder(method=method, spec=spec, changes=others, **size)
+        _finetune_fleet(bundle, fleet, folder, personal, workforce, as_json)
+        return
+    if logs is None or delta_kb is not None:
+        raise ConfigError("give LOGS of one machine, or --fleet with a store of many, to which --delta-kb belongs")
     order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "finetune", "method")
         callbacks = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
-        result = make(bundle, source, order, folder, callbacks)
+        if workforce.alone:
+            result = make(bundle, source, order, folder, callbacks)
+        else:
+            from edp.workflows.fleet.training import finetune_with
+
+            result = finetune_with(workforce, bundle, source, order, folder, callbacks)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 
@@ -62,6 +99,31 @@ def finetune(
         out.print(f"next: edp evaluate {folder}, or edp export {folder} --to c --out exported")
 
     emit(as_json, result | {"run": str(folder), "report": str(page)}, show)
+
+
+def _finetune_fleet(
+    bundle: Path, store: Path, folder: Path, order: PersonalOrder, workforce: Workforce, as_json: bool
+) -> None:
+    """Fine-tune for every machine of a store, with a progress display, and print what it came to."""
+    from edp.cli.fleet import MachineDisplay
+    from edp.workflows.fleet.personal import errors_by_machine, finetune_fleet
+
+    with progress(as_json) as shown:
+        on_machine = MachineDisplay(shown, Steps(as_json), "finetune").on_machine
+        content = finetune_fleet(workforce, bundle, store, order, folder, on_machine)
+
+    def show() -> None:
+        rows = [(name, *(f"{error:.4g}" for error in errors)) for name, *errors in errors_by_machine(content)]
+        unit = content["unit"]
+        heads = ["machine", f"before [{unit}]", f"full fine-tune [{unit}]", f"its delta [{unit}]"]
+        table(f"mean absolute error, k = {content['horizon']}, ends of the recordings", heads, rows)
+        for row in content["machines"]:
+            if "failed" in row:
+                out.print(f"'{row['machine']}' has no delta: {row['failed']}")
+        out.print(f"deltas in {folder}")
+        out.print(f"next: edp fleet report {bundle} {store} --deltas {folder} --out report")
+
+    emit(as_json, content, show)
 
 
 def _named(baselines: str, every: tuple[str, ...]) -> tuple[str, ...]:

@@ -10,11 +10,13 @@ import typer
 from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
 from edp.cli.quality import LogDisplay, show_between, show_lines, show_report, verdict_text
 from edp.cli.train import MapOption
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import DataError, EdpError
 
 if TYPE_CHECKING:
     from edp.data.coverage import Coverage
     from edp.logs.source import DataSource
+    from edp.workflows.fleet.inspecting import Inspection
 
 # Scripts can tell unusable data by the exit code.
 FAULTY = 3
@@ -37,6 +39,9 @@ def inspect(
     inputs: Annotated[
         str, typer.Option(help="Command channels, where names and kinds do not identify them: a,b.")
     ] = "",
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Report the quality of recordings: time, gaps, noise, steps, clipping, units, repeats; nothing is changed.
@@ -48,11 +53,20 @@ def inspect(
     """
     from edp.logs.source import DataSource
 
-    source = DataSource.of(data, signal_map)
+    source, asked = DataSource.of(data, signal_map), page is not None or bool(split or inputs)
+    names, inspection = tuple(filter(None, inputs.split(","))), None
+    workforce = workforce_of(workers, cluster, open_cluster)
     with progress(as_json) as shown:
-        quality = source.inspect(LogDisplay(shown, Steps(as_json)).on_log)
+        on_log = LogDisplay(shown, Steps(as_json)).on_log
+        if workforce.alone:
+            quality = source.inspect(on_log)
+        else:
+            from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
+
+            order = CoverageOrder(names, split) if covered or asked else None
+            inspection = inspect_with(workforce, source, order, on_log)
+            quality = inspection.quality
     errors = quality.errors
-    asked = page is not None or bool(split or inputs)
     coverage_facts, why = None, "" if covered or asked else "not asked for"
     # Recordings with errors have no coverage: training would refuse them.
     if quality.proposed and (covered or asked):
@@ -60,7 +74,7 @@ def inspect(
         if asked:
             raise DataError(f"'{data}': {why}")
     elif not errors and (covered or asked):
-        coverage_facts, why = _coverage(source, split, tuple(filter(None, inputs.split(","))), asked)
+        coverage_facts, why = _coverage(source, split, names, asked, inspection)
     if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
 
@@ -98,9 +112,14 @@ def inspect(
         raise typer.Exit(FAULTY)
 
 
-def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bool) -> tuple[Coverage | None, str]:
+def _coverage(
+    source: DataSource, split: str, inputs: tuple[str, ...], asked: bool, inspection: Inspection | None
+) -> tuple[Coverage | None, str]:
     """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
     from edp.workflows.train_evaluate import coverage
+
+    if inspection is not None and (inspection.coverage is not None or not asked):
+        return inspection.coverage, inspection.why
 
     try:
         return coverage(source, inputs, split), ""

@@ -10,6 +10,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
+from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 
 
 def pretrain(
@@ -26,6 +27,8 @@ def pretrain(
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Train one network over many machines, and judge it on unseen machines.
@@ -48,14 +51,15 @@ def pretrain(
     with progress(as_json) as shown:
         steps = Steps(as_json)
         display = TrainingDisplay(shown, steps)
-        result = make(
-            source_of(data, signal_map, repair),
-            experiment,
-            order,
-            folder,
-            display.on_event,
-            lambda text: steps.say(text, force=True),
-        )
+        source = source_of(data, signal_map, repair)
+        if cluster:
+            from edp.workflows.fleet.training import pretrain_with
+
+            steps.say(f"pretrain: on a node of the cluster at {cluster}", force=True)
+            result = pretrain_with(workforce_of(1, cluster, open_cluster), source, experiment, order, folder)
+        else:
+            on_step = lambda text: steps.say(text, force=True)  # noqa: E731
+            result = make(source, experiment, order, folder, display.on_event, on_step)
 
     def show() -> None:
         _tables(result)

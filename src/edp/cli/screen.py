@@ -13,14 +13,19 @@ import typer
 from edp.cli.console import JsonFlag, Steps, duration, emit, listing, out, progress, table
 from edp.cli.quality import LogDisplay, show_between, verdict_text
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
     from edp.config.experiment import FeatureSettings
+    from edp.logs import DataQuality
+    from edp.logs.source import DataSource
     from edp.settings.tree import Change
     from edp.training import TrainingProgress
+    from edp.workflows.executors import Workforce
     from edp.workflows.feature_selection.select import Selection, SelectionOrder
+    from edp.workflows.fleet.inspecting import OnLog
 
 # A terminal's page; everything is in the files.
 SHOWN = 40
@@ -55,6 +60,9 @@ def screen(
     own: Annotated[
         list[Path], typer.Option("--features", help="With --trials: further feature-set file; may be repeated.")
     ] = [],  # noqa: B006
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Screen recordings for the channels a model needs: a ranked, reasoned proposal with its evidence.
@@ -86,7 +94,7 @@ def screen(
             sets=_own_sets(own),
         )
     source = source_of(data, signal_map, repair)
-    selection = run_screening(source, folder, order, as_json)
+    selection = run_screening(source, folder, order, as_json, workforce_of(workers, cluster, open_cluster))
     command = next_command(data, signal_map, repair, selection)
 
     def show() -> None:
@@ -99,15 +107,24 @@ def screen(
     emit(as_json, facts_of(selection) | {"next": command}, show)
 
 
-def run_screening(source: Any, folder: Path, order: SelectionOrder, quiet: bool = False) -> Selection:
-    """Screen with a progress display."""
+def run_screening(
+    source: Any, folder: Path, order: SelectionOrder, quiet: bool = False, workforce: Workforce | None = None
+) -> Selection:
+    """Screen with a progress display; a workforce inspects the recordings."""
     from edp.workflows.feature_selection.select import Listeners, select_features
+
+    inspected = None
+    if workforce is not None and not workforce.alone:
+        from edp.workflows.fleet.inspecting import inspect_with
+
+        def inspected(source: DataSource, on_log: OnLog | None) -> DataQuality:
+            return inspect_with(workforce, source, None, on_log).quality
 
     with progress(quiet) as shown:
         display = ScreeningDisplay(shown, Steps(quiet))
         logs = LogDisplay(shown, Steps(quiet))
         listeners = Listeners(on_log=logs.on_log, on_progress=display.on_progress, on_trial=display.on_trial)
-        return select_features(source, folder, order, listeners)
+        return select_features(source, folder, order, listeners, inspected)
 
 
 class ScreeningDisplay:

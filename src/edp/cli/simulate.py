@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
+from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 
 if TYPE_CHECKING:
-    from edp.recording import Recording
-    from edp.sim.data_set import SimulationOrder
+    from edp.sim.data_set import Simulated, SimulationOrder
     from edp.sim.predictability import LimitSpec
+    from edp.workflows.executors import Workforce
 
 
 def simulate(
@@ -60,6 +61,8 @@ def simulate(
     limit: Annotated[
         bool, typer.Option("--limit", help="Also compute the limit of predictability: limit.json.")
     ] = False,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Simulate recordings of an excavator: M22 in free air, or what a scenario file describes.
@@ -98,7 +101,8 @@ def simulate(
     )
     # Settings of the limit are checked even where it is not asked for.
     spec = limit_settings(scenario, changes)
-    paths = run(folder, order, workers, as_json)
+    elsewhere = workforce_of(workers, cluster, open_cluster, usual=0) if cluster else None
+    paths = run(folder, order, workers, as_json, elsewhere)
     limit_facts = run_limit(folder, order, spec, workers, as_json) if limit else None
     what_simulated = f"{order.family} machines" if order.family else order.machine
     facts: dict[str, Any] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
@@ -117,15 +121,21 @@ def simulate(
     emit(as_json, facts, show)
 
 
-def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = False) -> list[Path]:
-    """Simulate with a progress display."""
+def run(
+    folder: Path,
+    order: SimulationOrder,
+    workers: int = 0,
+    quiet: bool = False,
+    workforce: Workforce | None = None,
+) -> list[Path]:
+    """Simulate with a progress display; a workforce stands for the workers of this machine."""
     from edp.sim.data_set import simulate_data_set
 
     began, steps, counts = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
     with progress(quiet) as shown:
         bar = shown.add_task("simulate", total=order.recordings, note="")
 
-        def on_done(recording: Recording, existed: bool) -> None:
+        def on_done(recording: Simulated, existed: bool) -> None:
             counts["kept" if existed else "new"] += 1
             counts["seconds"] += 0.0 if existed else recording.duration_s
             elapsed = time.monotonic() - began
@@ -136,6 +146,10 @@ def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = Fa
             shown.update(bar, advance=1, note=note)
             steps.say(f"simulate: {done:g} of {order.recordings} recordings, {note}, {duration(left)} left")
 
+        if workforce is not None:
+            from edp.workflows.fleet.simulating import simulate_with
+
+            return simulate_with(workforce, folder, order, on_done)
         return simulate_data_set(folder, order, workers, on_done)
 
 

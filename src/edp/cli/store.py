@@ -11,6 +11,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress, table
 from edp.cli.inspect import FAULTY
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 
 if TYPE_CHECKING:
     from edp.logs.store import StoreIndex, StoreProgress
@@ -37,6 +38,8 @@ def build(
     workers: Annotated[
         int, typer.Option(min=0, max=256, help="Processes that read side by side; 0: one for each core.")
     ] = 0,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Read logs into a store: SI units on a uniform grid, as every command would read them.
@@ -55,7 +58,12 @@ def build(
             shown.update(bar, total=reached.of, completed=reached.logs, note=f"{reached.logs} logs{refused}")
             steps.say(f"store: {reached.logs} of {reached.of} logs{refused}")
 
-        index = source.store(folder, workers or os.cpu_count() or 1, note)
+        if cluster:
+            from edp.workflows.fleet.storing import store_with
+
+            index = store_with(workforce_of(workers, cluster, open_cluster, usual=0), source, folder, note)
+        else:
+            index = source.store(folder, workers or os.cpu_count() or 1, note)
     _show(index, folder, as_json)
     if index.refused:
         err.print(f"{len(index.refused)} log(s) are not in the store; mend them and give the same command again")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -110,41 +110,83 @@ def judge(
     say = on_step or (lambda name: None)
     _check_memory(predictor, data, spec)
     say("network")
-    predictions = {"network": stream_predictions(predictor, data.test)}
-    names, times = {"network": label}, {"network": seconds}
-    on_validation: dict[str, Predictions] = {}
+    models = {"network": predict_network(predictor, data, label, seconds)}
     start, left_out = time.perf_counter(), []
-    for name in sorted(spec.baselines, key=lambda name: BASELINES[name].effort):
-        began = time.perf_counter()
-        if minutes is not None and began - start > 60 * minutes:
+    for name in by_effort(spec.baselines):
+        if minutes is not None and time.perf_counter() - start > 60 * minutes:
             left_out.append(name)
             continue
         say(name)
-        predict, baseline = baseline_predictions(BASELINES[name], data, spec)
-        predictions[name] = predict(data)
-        on_validation[name] = predict(replace(data, test=data.validation))
-        names[name], times[name] = baseline.label, time.perf_counter() - began
+        models[name] = predict_baseline(name, data, spec)
+    return score_models(models, predictor, data, spec, left_out)
+
+
+def by_effort(names: Sequence[str]) -> list[str]:
+    """Names of baselines, the cheapest first."""
+    return sorted(names, key=lambda name: BASELINES[name].effort)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPredictions:
+    """What a model predicts on the test part.
+
+    Attributes:
+        label: how tables call it.
+        seconds: of its training.
+        test: for each series of the test part ``(time, horizon, target)``, SI units.
+        validation: the same of the validation part, of baselines.
+        bounds: intervals of the test part, of networks that state some.
+    """
+
+    label: str
+    seconds: float
+    test: tuple[NDArray[np.float32], ...]
+    validation: tuple[NDArray[np.float32], ...] = ()
+    bounds: tuple[NDArray[np.float32], ...] = ()
+
+
+def predict_network(predictor: Predictor, data: Prepared, label: str, seconds: float) -> ModelPredictions:
+    """Run the network along the test part."""
+    bounds = stream_intervals(predictor, data.test) if predictor.spec.output.coverages else []
+    return ModelPredictions(label, seconds, tuple(stream_predictions(predictor, data.test)), bounds=tuple(bounds))
+
+
+def predict_baseline(name: str, data: Prepared, spec: JudgeSpec) -> ModelPredictions:
+    """Fit a baseline on the training part, and run it along test and validation part."""
+    began = time.perf_counter()
+    predict, baseline = baseline_predictions(BASELINES[name], data, spec)
+    test, validation = predict(data), predict(replace(data, test=data.validation))
+    return ModelPredictions(baseline.label, time.perf_counter() - began, tuple(test), tuple(validation))
+
+
+def score_models(
+    models: Mapping[str, ModelPredictions],
+    predictor: Predictor,
+    data: Prepared,
+    spec: JudgeSpec,
+    left_out: Sequence[str] = (),
+) -> Evaluation:
+    """Score predictions by name, the network's under ``network``, on ``data.test``; raises as `judge`."""
     # A whole window from reset: before that the network's memory is not filled, and baselines lack history.
     skip = predictor.spec.window if spec.skip is None else spec.skip
     if data.task.features.starting:  # While the start is read there is nothing to predict.
         skip = max(skip, data.task.features.starting_ticks)
     ruler = _Ruler(data, skip)
-    models = {
-        name: {"label": names[name], "seconds": times[name], **ruler.measure(predicted)}
-        for name, predicted in predictions.items()
+    entries = {
+        name: {"label": model.label, "seconds": model.seconds, **ruler.measure(list(model.test))}
+        for name, model in models.items()
     }
+    on_validation = {name: list(model.validation) for name, model in models.items() if name != "network"}
     for name, scores in _on_validation(on_validation, data, max(skip, spec.history)).items():
-        models[name]["validation"] = scores
-    coverages, bounds = predictor.spec.output.coverages, []
+        entries[name]["validation"] = scores
+    coverages, bounds = predictor.spec.output.coverages, list(models["network"].bounds)
     if coverages:
-        say("intervals")
-        bounds = stream_intervals(predictor, data.test)
-        models["network"]["intervals"] = ruler.intervals(bounds, coverages)
+        entries["network"]["intervals"] = ruler.intervals(bounds, coverages)
         shown = nearest_to_shown(coverages)
         bounds = [pair[:, shown] for pair in bounds]
-    left = {"left_out": left_out} if left_out else {}
-    scores = ruler.header() | {"models": models, "situation": situation_of(data)} | left
-    return Evaluation(scores, predictions, data.test, bounds)
+    left = {"left_out": list(left_out)} if left_out else {}
+    scores = ruler.header() | {"models": entries, "situation": situation_of(data)} | left
+    return Evaluation(scores, {name: list(model.test) for name, model in models.items()}, data.test, bounds)
 
 
 def _on_validation(predictions: dict[str, Predictions], data: Prepared, skip: int) -> dict[str, Any]:

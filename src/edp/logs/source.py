@@ -110,7 +110,7 @@ class DataSource:
             ConfigError: a map or repairs for a store, whose logs were read with their own.
         """
         if self.stored:
-            self._check_store_options()
+            self.check_store_options()
             return read_store(self.path)
         if self.path.suffix != ".toml":
             return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
@@ -154,7 +154,7 @@ class DataSource:
         return build_store(stored, folder, workers, on_progress)
 
     def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
-        self._check_store_options()
+        self.check_store_options()
         recordings = read_store(self.path)
         reports, sketches = [], []
         for i, recording in enumerate(recordings):
@@ -164,7 +164,8 @@ class DataSource:
             sketches.append(sketch(recording))
         return compare(reports, sketches)
 
-    def _check_store_options(self) -> None:
+    def check_store_options(self) -> None:
+        """Refuse a map or repairs for a store, whose logs were read with their own."""
         options = [name for name, value in (("--map", self.signal_map), ("--repair", self.repair)) if value is not None]
         if options:
             raise ConfigError(

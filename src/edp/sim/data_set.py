@@ -10,12 +10,11 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from edp import __version__
 from edp.errors import BusyError, ConfigError, EdpError, StorageError, closest
 from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
-from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim.plan import DataSetSpec, simulate_many
 from edp.sim.predictability import LimitJob, LimitSpec, find_limit, plan_limit
@@ -133,11 +132,30 @@ def suffix_of(form: str) -> str:
     return f".{form.lstrip('.')}"
 
 
+class Simulated(Protocol):
+    """What is told of a recording that is there: itself, or what it was simulated from."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def duration_s(self) -> float:
+        """Its length."""
+        ...
+
+
+Elsewhere = Callable[[Sequence[Scenario], Path, Callable[[Simulated], None]], None]
+"""Writes the logs of scenarios into a folder and tells of each that is there."""
+
+
 def simulate_data_set(
     out: str | Path,
     order: SimulationOrder | None = None,
     workers: int = 0,
-    on_done: Callable[[Recording, bool], None] | None = None,
+    on_done: Callable[[Simulated, bool], None] | None = None,
+    elsewhere: Elsewhere | None = None,
 ) -> list[Path]:
     """Simulate a data set into a folder, a log each; logs already there from the same order are kept.
 
@@ -146,6 +164,7 @@ def simulate_data_set(
         order: what to simulate; an hour of machine M22 by default.
         workers: processes; 0 for one a core.
         on_done: called with each recording and whether it was there already.
+        elsewhere: writes the logs that are missing, in place of processes of this machine.
 
     Raises:
         BusyError: another process simulates into the folder.
@@ -166,16 +185,27 @@ def simulate_data_set(
         if not bound:
             write_json(folder / MANIFEST, identity)
         absent = {scenario.name for scenario in missing}
-        for scenario, path in zip(plan, paths, strict=True):
+        for scenario in plan:
             if on_done is not None and scenario.name not in absent:
-                on_done(read_recording(path), True)
+                # Read, so that a damaged one is told; a coordinator of others' work stays light.
+                on_done(
+                    scenario if elsewhere is not None else read_recording(folder / f"{scenario.name}{suffix}"), True
+                )
+
+        def wrote(simulated: Simulated) -> None:
+            check()
+            if on_done is not None:
+                on_done(simulated, False)
+
+        if elsewhere is not None:
+            elsewhere(missing, folder, wrote)
+            return paths
         count = workers or os.cpu_count() or 1
         for recording in simulate_many(missing, min(count, max(1, len(missing)))):
             # Before each log: a lock that was taken over means that another process writes here.
             check()
             write_recording(recording, folder / f"{recording.name}{suffix}", files)
-            if on_done is not None:
-                on_done(recording, False)
+            wrote(recording)
     return paths
 
 

@@ -23,7 +23,7 @@ from edp.evaluation.channel_importance import ChannelImportances, ChannelImporta
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import Evaluation, JudgeSpec, judge, score_predictions
+from edp.evaluation.judge import Evaluation, JudgeSpec, ModelPredictions, judge, score_models, score_predictions
 from edp.evaluation.scores_file import earlier_scores
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
@@ -243,6 +243,10 @@ def _provenance(
     }
 
 
+PredictedBy = Callable[[JudgeSpec, str], Mapping[str, ModelPredictions]]
+"""Gives the predictions of all models for how to judge and the digest of what is judged."""
+
+
 @one_blas_thread()
 def evaluate(
     run: str | Path,
@@ -250,6 +254,7 @@ def evaluate(
     baselines: Sequence[str] | None = None,
     on_step: Callable[[str], None] | None = None,
     minutes: float | None = None,
+    predicted: PredictedBy | None = None,
 ) -> Path:
     """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
 
@@ -261,6 +266,7 @@ def evaluate(
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
         minutes: after which no further baseline is begun; a later call judges it.
+        predicted: gives the predictions of all models in place of this process; `minutes` is then not looked at.
 
     Returns:
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
@@ -281,7 +287,10 @@ def evaluate(
     scores = earlier_scores(target, key)
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
-        evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
+        if predicted is None:
+            evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
+        else:
+            evaluation = score_models(predicted(chosen, " ".join(judged)), bundle.predictor, data, chosen)
         # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
         write_bytes(target / "predictions.safetensors", save(evaluation.kept(SHOWN_RECORDINGS, SHOWN_TICKS)))

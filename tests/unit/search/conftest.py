@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from edp.storage.ledger import TrainingIdentity
-from edp.workflows.search.executor import Job
+from edp.workflows.executors.base import Job
 
 
 @pytest.fixture

@@ -1,34 +1,24 @@
 """A real Ray cluster of three nodes on this machine: the same study, the same result, with a node killed meanwhile."""
 
-import contextlib
 import dataclasses
 import os
 import pickle
-import secrets
-import shutil
-import signal
-import socket
-import subprocess
 import sys
-import tempfile
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from ray_nodes import needs_ray, three_nodes
 
-import edp.workflows.search.cluster
+import edp.workflows.executors.cluster
 from edp.errors import ConfigError
 from edp.storage.ledger import Ledger, TrainingStatus, read_state
-from edp.workflows.search.cluster import RayPool
-from edp.workflows.search.executor import START, complete
-from edp.workflows.search.local import LocalPool
+from edp.workflows.executors.base import START, complete
+from edp.workflows.executors.cluster import RayPool
+from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 
-TOKEN = secrets.token_hex(16)
-RAY = Path(sys.executable).with_name("ray")
-needs_ray = pytest.mark.skipif(not RAY.exists(), reason="the extra 'cluster' (Ray) is not installed")
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
     'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',
@@ -39,68 +29,10 @@ CHANGES = (
 )
 
 
-class Nodes:
-    """Nodes of a cluster, a process group each."""
-
-    def __init__(self, folder):
-        self.folder = folder
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
-        self.address = f"127.0.0.1:{self.port}"
-        self.groups = []
-
-    def start(self, *options):
-        command = [
-            RAY,
-            "start",
-            *options,
-            "--node-ip-address=127.0.0.1",
-            "--num-cpus=1",
-            "--object-store-memory=80000000",
-            "--block",
-        ]
-        with (self.folder / f"node{len(self.groups)}.log").open("wb") as log:
-            node = subprocess.Popen(
-                [*command, "--disable-usage-stats"], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-            )
-        self.groups.append(node)
-
-    def kill(self, number):
-        """kill -9 of a whole node, as when its plug is pulled."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.groups[number].pid, signal.SIGKILL)
-        self.groups[number].wait()
-
-
 @pytest.fixture
 def cluster(monkeypatch):
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # before Ray is imported, which reads them once
-    monkeypatch.setenv("RAY_AUTH_TOKEN", TOKEN)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)]))
-    import ray
-
-    folder = Path(tempfile.mkdtemp(prefix="edp-ray-"))  # not the test's own: paths of sockets must be short
-    nodes = Nodes(folder)
-    try:
-        nodes.start("--head", f"--port={nodes.port}", "--include-dashboard=false", f"--temp-dir={folder / 'head'}")
-        until = time.monotonic() + 300
-        while time.monotonic() < until:
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", nodes.port), 1):
-                break
-            time.sleep(0.2)
-        ray.init(address=nodes.address, log_to_driver=False)
-        for size in (2, 3):  # one after the other: two that start at once may take the same ports
-            nodes.start(f"--address={nodes.address}")
-            while ray.cluster_resources().get("CPU", 0) < size and time.monotonic() < until:
-                time.sleep(0.5)
-        ray.shutdown()
+    with three_nodes(monkeypatch, Path(__file__).parent) as nodes:
         yield nodes
-    finally:
-        ray.shutdown()
-        for number in reversed(range(len(nodes.groups))):
-            nodes.kill(number)
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @needs_ray
@@ -196,16 +128,16 @@ class OneNode:
         self.results.pop(reference, None)
 
     def shutdown(self):
-        for pool in edp.workflows.search.cluster._pool.values():
+        for pool in edp.workflows.executors.cluster._pool.values():
             pool.close()
-        edp.workflows.search.cluster._pool.clear()
+        edp.workflows.executors.cluster._pool.clear()
 
 
 @pytest.fixture
 def node(monkeypatch):
     one = OneNode()
-    monkeypatch.setattr(edp.workflows.search.cluster, "_ray", lambda: one)
-    monkeypatch.setattr(edp.workflows.search.cluster, "_reach", lambda ray, address: None)
+    monkeypatch.setattr(edp.workflows.executors.cluster, "_ray", lambda: one)
+    monkeypatch.setattr(edp.workflows.executors.cluster, "_reach", lambda ray, address: None)
     monkeypatch.setattr(RayPool, "_check_nodes", lambda self: None)
     return one
 

@@ -4,9 +4,9 @@ import pytest
 
 from edp.config.experiment import load_experiment
 from edp.storage.ledger import Ledger, TrainingStatus
+from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.dispatch import Dispatcher
-from edp.workflows.search.local import LocalPool
 from edp.workflows.search.run_phases import run_phases
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.trainings import settings_of

@@ -28,13 +28,13 @@ from edp.workflows.compression import (
     search,
 )
 from edp.workflows.compression.quantise import quantise
+from edp.workflows.executors.perform import perform
 from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_settings
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 from edp.workflows.search.smaller import Recipe, before, make_smaller
 from edp.workflows.search.study_log import look_at
 from edp.workflows.search.trainings import experiment_of
-from edp.workflows.search.worker import perform
 from edp.workflows.train_evaluate import evaluate, prepare_data, train, trained_run
 from edp.workflows.transfer.finetune import FinetuneRequest, finetune
 from edp.workflows.transfer.spec import FinetuneSpec

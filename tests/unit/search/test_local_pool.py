@@ -9,9 +9,9 @@ import pytest
 
 from edp.errors import ConfigError, StorageError
 from edp.storage.ledger import Ledger, TrainingStatus, claim, leave_arrival
-from edp.workflows.search import worker
-from edp.workflows.search.executor import complete
-from edp.workflows.search.local import LocalPool
+from edp.workflows.executors import perform as performing
+from edp.workflows.executors.base import complete
+from edp.workflows.executors.processes import LocalPool
 
 
 @pytest.fixture(scope="module")
@@ -194,15 +194,15 @@ def test_a_pool_is_used_from_one_thread(pool, job_of):
 
 def test_a_training_that_someone_else_does_is_not_done_twice(pool, job_of, log, tmp_path, monkeypatch):
     job = job_of(0)
-    monkeypatch.setattr(worker, "CLAIM_WAIT_S", 0.2)
+    monkeypatch.setattr(performing, "CLAIM_WAIT_S", 0.2)
     with claim(tmp_path, job.key):
-        record = worker.perform(job.identity, job.where, str(tmp_path), lambda: None)
+        record = performing.perform(job.identity, job.where, str(tmp_path), lambda: None)
     assert record.status is TrainingStatus.LOST
     assert f"claimed by process {os.getpid()}" in record.message
     assert log("start") == 0
-    first = worker.perform(job.identity, job.where, str(tmp_path), lambda: None)
+    first = performing.perform(job.identity, job.where, str(tmp_path), lambda: None)
     assert first.status is TrainingStatus.DONE
-    assert worker.perform(job.identity, job.where, str(tmp_path), lambda: None) == first
+    assert performing.perform(job.identity, job.where, str(tmp_path), lambda: None) == first
     assert log("start") == 1
 
 
@@ -238,7 +238,7 @@ def test_a_pool_of_nothing(wrong):
 
 
 def test_memory_caps_are_refused_where_they_cannot_be_held(pool, job_of, monkeypatch):
-    monkeypatch.setattr("edp.workflows.search.local.sys.platform", "darwin")
+    monkeypatch.setattr("edp.workflows.executors.processes.sys.platform", "darwin")
     with pytest.raises(ConfigError, match="needs Linux"):
         pool.submit(job_of(0, memory_mb=1))
 

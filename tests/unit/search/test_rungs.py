@@ -23,15 +23,15 @@ from edp.storage.ledger import (
     read_state,
 )
 from edp.storage.study_file import read_study
+from edp.workflows.executors.perform import perform
+from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.export import export_study
 from edp.workflows.search.jobs import job_of as job_of_order
-from edp.workflows.search.local import LocalPool
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 from edp.workflows.search.study_log import look_at
 from edp.workflows.search.trainings import TrainingRequest, settings_of
-from edp.workflows.search.worker import perform
 
 TINY = (
     'task={targets=["speed"], horizons=[1]}',
@@ -313,7 +313,7 @@ def test_a_search_whose_states_cannot_be_written_is_stopped(six_sessions, plan, 
     def full(folder, key, state):
         raise StorageError("cannot write 'states': No space left on device; free space")
 
-    monkeypatch.setattr("edp.workflows.search.worker.leave_state", full)
+    monkeypatch.setattr("edp.workflows.executors.perform.leave_state", full)
     with pytest.raises(LostError, match="No space left"):
         run_search(six_sessions, plan, tmp_path, CREW, "calibration")
     monkeypatch.undo()

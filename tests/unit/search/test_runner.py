@@ -11,11 +11,11 @@ from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
 from edp.storage.ledger import Ledger, TrainingStatus
 from edp.storage.study_file import read_study
-from edp.workflows.search.executor import ended
+from edp.workflows.executors.base import ended
+from edp.workflows.executors.perform import perform
 from edp.workflows.search.plan import SearchPlan, load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 from edp.workflows.search.study_log import look_at
-from edp.workflows.search.worker import perform
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',

@@ -10,6 +10,7 @@ from edp.report import write_study_page
 from edp.storage.ledger import Ledger
 from edp.storage.study_file import read_study
 from edp.training.parts import fit_part
+from edp.workflows.executors.perform import perform
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
@@ -21,7 +22,6 @@ from edp.workflows.search.trainings import (
     train_order,
     train_part,
 )
-from edp.workflows.search.worker import perform
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',

@@ -82,13 +82,17 @@ def digest_of(value: Any) -> str:
 
 
 @cache
-def code_version() -> str:
-    """Version of the package and blake2b of its source and tables, without what decides no result."""
+def code_version(whole: bool = False) -> str:
+    """Version of the package and blake2b of its source and tables, without what decides no result.
+
+    Args:
+        whole: with all of it: a unit of work may call any part.
+    """
     state = hashlib.blake2b(digest_size=16)
     root = Path(__file__).parents[2]
     for file in sorted([*root.rglob("*.py"), *root.rglob("*.toml")]):
         relative_path = file.relative_to(root).as_posix()
-        if not _below(relative_path, UNREAD) or _below(relative_path, READ):
+        if whole or not _below(relative_path, UNREAD) or _below(relative_path, READ):
             # Zero bytes between name and content: a line moved from file to file changes the hash.
             state.update(f"{relative_path}\0".encode() + file.read_bytes() + b"\0")
     return f"{__version__}+{state.hexdigest()}"

@@ -97,7 +97,11 @@ class Selection:
 
 
 def select_features(
-    source: DataSource, out: str | Path, order: SelectionOrder | None = None, listeners: Listeners | None = None
+    source: DataSource,
+    out: str | Path,
+    order: SelectionOrder | None = None,
+    listeners: Listeners | None = None,
+    inspected: Callable[[DataSource, Callable[[Path, int, int], None] | None], DataQuality] | None = None,
 ) -> Selection:
     """Screen a data set and write what it proposes.
 
@@ -106,6 +110,7 @@ def select_features(
         out: folder of all that is written.
         order: what is asked.
         listeners: who hears of the progress.
+        inspected: inspects the recordings in place of this process.
 
     Raises:
         EdpError: the recordings cannot be read as they are, or no conclusion can be drawn from them.
@@ -114,7 +119,7 @@ def select_features(
     folder = check_writable(out)
     # Without a map all channels are read under the names of the files: a screening may judge each of them.
     mapped = source if source.signal_map is not None or _lists_maps(source) else _taken_whole(source)
-    quality = mapped.inspect(listeners.on_log)
+    quality = (inspected or DataSource.inspect)(mapped, listeners.on_log)
     recordings, notes = _read(mapped, quality)
     spec, more = _candidates(recordings[0], order)
     screening = screen(recordings, spec, listeners.on_progress)

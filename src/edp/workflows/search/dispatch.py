@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from edp.storage.ledger import FINAL, Ledger, Record
+from edp.workflows.executors.base import START, Executor, Job, complete
 from edp.workflows.search.context import Outcome
-from edp.workflows.search.executor import START, Executor, Job, complete
 from edp.workflows.search.jobs import job_of
 from edp.workflows.search.smaller import before
 from edp.workflows.search.trainings import TrainingRequest

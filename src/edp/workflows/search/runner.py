@@ -23,10 +23,9 @@ from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record
 from edp.storage.portable import cores
+from edp.workflows.executors import Executor, LocalPool, RayPool
 from edp.workflows.search.context import Decision, SearchContext, set_apart
 from edp.workflows.search.dispatch import Dispatcher
-from edp.workflows.search.executor import Executor
-from edp.workflows.search.local import LocalPool
 from edp.workflows.search.networks import JudgedNetwork, frozen_split, network_name, write_networks
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import SearchPlan, plain_spec
@@ -81,8 +80,6 @@ class Resources:
     def gather(self) -> Executor:
         """What does the trainings."""
         if self.cluster:
-            from edp.workflows.search.cluster import RayPool  # Ray takes seconds to import, and few have it
-
             return RayPool(self.cluster, self.threads, open_cluster=self.open_cluster)
         return LocalPool(self.workers or max(1, cores() // self.threads), self.threads)
 

@@ -119,7 +119,7 @@ def finetune(
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
     names, notes = _able(begun, order)
-    data, repair_notes = _target(begun, logs, experiment, order)
+    data, repair_notes = target_data(begun, logs, experiment, order)
     notes += repair_notes
     for note in notes:
         callbacks.on_note(note)
@@ -127,8 +127,9 @@ def finetune(
     results: dict[str, Made] = {}
     for number, name in enumerate(names):
         callbacks.on_method(name, number, len(names))
-        method_folder = folder if name == order.method else folder / "baselines" / name
-        case = TransferCase(begun, logs, data, experiment, order.spec, method_folder, callbacks.on_training)
+        case = TransferCase(
+            begun, logs, data, experiment, order.spec, _folder_of(name, order, folder), callbacks.on_training
+        )
         try:
             results[name] = METHODS[name]().make(case)
         except Diverged as end:
@@ -142,6 +143,41 @@ def finetune(
     write_bytes(make_folder(folder) / SHOWN, save(shown))
     write_json(folder / RESULT, result)
     return result
+
+
+def _folder_of(name: str, order: FinetuneRequest, out: Path) -> Path:
+    """The run folder of a method."""
+    return out if name == order.method else out / "baselines" / name
+
+
+def trained_methods(source: str | Path, order: FinetuneRequest) -> list[str]:
+    """The methods of an order that leave a run, and for which the source has what they need.
+
+    Raises:
+        EdpError: as `finetune`, of source and order.
+    """
+    return [name for name in _able(read_source(source), order)[0] if METHODS[name].trains]
+
+
+def train_method(source: str | Path, logs: DataSource, order: FinetuneRequest, out: str | Path, name: str) -> None:
+    """Train one method into its run folder, where `finetune` finds it done.
+
+    Args:
+        source: run folder or bundle.
+        logs: recordings of the target.
+        order: methods and settings.
+        out: run folder of the whole.
+        name: of the method.
+
+    Raises:
+        EdpError: as `finetune`.
+        Diverged: its training diverged; `finetune` then says so of a baseline, and goes on.
+    """
+    begun = read_source(source)
+    experiment = target_experiment(begun, order.changes)
+    data, _ = target_data(begun, logs, experiment, order)
+    folder = _folder_of(name, order, Path(out))
+    METHODS[name]().make(TransferCase(begun, logs, data, experiment, order.spec, folder, lambda training, event: None))
 
 
 def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[str]]:
@@ -161,10 +197,14 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
     return [name for name in order.names if name not in lacking], notes
 
 
-def _target(
+def target_data(
     source: SourceModel, logs: DataSource, experiment: Experiment, order: FinetuneRequest
 ) -> tuple[Prepared, list[str]]:
-    """The logs, divided and held against the source; and what could not be held."""
+    """The logs of a target, divided and held against the source; and what could not be held.
+
+    Raises:
+        EdpError: logs that do not go with the source.
+    """
     task, window = source.bundle.task, source.predictor.spec.window
     recordings = logs.read()
     refuse_frozen(recordings, source.frozen, "would be trained on")

@@ -23,8 +23,17 @@ from typing import IO, Any
 
 from edp.errors import ConfigError
 from edp.storage.ledger import Record, TrainingStatus
-from edp.workflows.search.executor import RETRIES, ClosedAtExit, Job, ended, refuse_twice
-from edp.workflows.search.worker import BEGUN
+from edp.workflows.executors.base import (
+    EXECUTORS,
+    RETRIES,
+    ClosedAtExit,
+    Executor,
+    Job,
+    Workforce,
+    ended,
+    refuse_twice,
+)
+from edp.workflows.executors.perform import BEGUN
 
 TICK_S = 0.1
 """Interval of checks of the memory of a training; without a cap the pool sleeps until something happens."""
@@ -56,7 +65,7 @@ class _Worker:
         pinned = {name: str(threads) for name in THREADS}
         places = os.pathsep.join(folder for folder in sys.path if folder)
         # `-P`: the working directory must not shadow modules of the library.
-        command = [sys.executable, "-P", "-m", "edp.workflows.search.worker", str(theirs.fileno()), str(os.getpid())]
+        command = [sys.executable, "-P", "-m", "edp.workflows.executors.worker", str(theirs.fileno()), str(os.getpid())]
         try:
             self.process = subprocess.Popen(
                 command,
@@ -108,7 +117,7 @@ class _Worker:
 
 
 class LocalPool(ClosedAtExit):
-    """Runs jobs in processes of this machine; see `edp.workflows.search.executor.Executor`.
+    """Runs jobs in processes of this machine; see `edp.workflows.executors.base.Executor`.
 
     Use it from one thread that lives as long as the pool: on Linux a worker dies with the thread that started it.
 
@@ -124,7 +133,7 @@ class LocalPool(ClosedAtExit):
                 f"a pool of {workers} workers with {threads} threads each cannot do anything; give 1 or more"
             )
         if sys.platform == "win32":  # where no socket can be handed to a process that is started
-            raise ConfigError("edp search starts processes in a way that Windows lacks; run it in WSL, or on a cluster")
+            raise ConfigError("worker processes are started in a way that Windows lacks; run in WSL, or on a cluster")
         self.workers, self.threads, self.retries = workers, threads, retries
         # The parent-death signal is tied to the thread that starts the worker.
         self._thread = threading.get_ident()
@@ -275,3 +284,9 @@ class LocalPool(ClosedAtExit):
         """End a busy worker; another one takes its place when there is something to do."""
         del self._busy[worker.now().job.key]
         worker.end()
+
+
+@EXECUTORS.register("processes")
+def in_processes(workforce: Workforce) -> Executor:
+    """Processes of this machine."""
+    return LocalPool(workforce.count, workforce.threads)

@@ -1,4 +1,4 @@
-"""Trainings on a Ray cluster: the only door to Ray. On every node a training runs through the pool of one machine.
+"""Jobs on a Ray cluster: the only door to Ray. On every node a job runs through the pool of one machine.
 
 Only the coordinator writes the ledger; a node needs this version of EDP and the recordings under the same path.
 """
@@ -19,8 +19,18 @@ from edp.errors import ConfigError, LostError
 from edp.storage import write_bytes
 from edp.storage.ledger import Record, TrainingStatus, code_version, left_state
 from edp.storage.runs import environment
-from edp.workflows.search.executor import RETRIES, START, ClosedAtExit, Job, ended, refuse_twice
-from edp.workflows.search.local import LocalPool
+from edp.workflows.executors.base import (
+    EXECUTORS,
+    RETRIES,
+    START,
+    ClosedAtExit,
+    Executor,
+    Job,
+    Workforce,
+    ended,
+    refuse_twice,
+)
+from edp.workflows.executors.processes import LocalPool
 
 NAMESPACE = "edp"
 # An hour: nodes may be busy with a training before they answer.
@@ -32,7 +42,7 @@ _pool: dict[int, LocalPool] = {}
 
 
 class RayPool(ClosedAtExit):
-    """Runs jobs on the nodes of a Ray cluster; see `edp.workflows.search.executor.Executor`.
+    """Runs jobs on the nodes of a Ray cluster; see `edp.workflows.executors.base.Executor`.
 
     Caps on time and memory, and retries of a training whose process is killed, are those of `LocalPool`, which runs on
     the node; a training whose node or Ray worker is lost starts again elsewhere.
@@ -169,6 +179,12 @@ class RayPool(ClosedAtExit):
             raise ConfigError("no node of the cluster answers; start one, then give the same command again")
 
 
+@EXECUTORS.register("ray")
+def on_a_cluster(workforce: Workforce) -> Executor:
+    """The nodes of a Ray cluster."""
+    return RayPool(workforce.cluster, workforce.threads, open_cluster=workforce.open_cluster)
+
+
 @dataclass(frozen=True)
 class _StateFile:
     """A file of the state that a training goes on from."""
@@ -211,7 +227,8 @@ def _perform_there(job: Job, threads: int, start: _StateFile | None) -> tuple[by
 
 
 def _state_there(threads: int) -> dict[str, str]:
-    return {"code": code_version(), **environment(threads)}
+    # All of the code: a unit of work may call any part of it.
+    return {"code": code_version(whole=True), **environment(threads)}
 
 
 def _ray() -> Any:

@@ -1,26 +1,17 @@
-"""The process that does trainings for a pool: ``python -m edp.workflows.search.worker`` with a socket; nothing for
-people.
-
-It lives as long as its parent and not longer, and answers each job with one record.
-"""
+"""A job from its claim to its record: whatever happens in it comes back as a record."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import os
 import platform
-import queue
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from multiprocessing.connection import Connection
 from typing import Any
 
 from edp.errors import BusyError, ConfigError, EdpError, NotFiniteError, StorageError
-from edp.sandbox.processes import die_with_parent
 from edp.storage.ledger import (
     Record,
     TrainingIdentity,
@@ -37,6 +28,7 @@ CLAIM_WAIT_S = 10.0
 """For how long a worker waits for the claim of another one, such as that of a pool that was killed a moment ago."""
 SHOWN_TRACE = 4000
 BEGUN = b"begun"
+"""What a worker sends before the function of a job is called."""
 
 
 def perform(
@@ -46,7 +38,7 @@ def perform(
 
     Args:
         identity: what to train.
-        where: see `edp.workflows.search.executor.Job`.
+        where: see `edp.workflows.executors.base.Job`.
         folder: of the ledger, to claim the training and leave its state and its record.
         begun: called before the function of the training.
     """
@@ -148,27 +140,3 @@ def _out_of_memory(error: BaseException) -> bool:
     # By name: PyTorch's class is not there without torch.
     named = any("OutOfMemoryError" in kind.__name__ for kind in type(error).__mro__)
     return named or isinstance(error, MemoryError) or "can't allocate memory" in str(error)
-
-
-def serve(connection: Connection) -> None:
-    """Do jobs until the other side closes."""
-    jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
-
-    def listen() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                jobs.put(connection.recv())
-        os._exit(1)  # in the middle of a training, too: nobody waits for it
-
-    threading.Thread(target=listen, daemon=True).start()
-    while True:
-        identity, where, folder = jobs.get()
-        record = perform(identity, where, folder, lambda: connection.send_bytes(BEGUN))
-        connection.send_bytes(record.to_bytes())
-
-
-if __name__ == "__main__":
-    # Children of the training must not inherit the socket, or the pool would wait for them.
-    os.set_inheritable(int(sys.argv[1]), False)
-    die_with_parent(int(sys.argv[2]))
-    serve(Connection(int(sys.argv[1])))

@@ -1,4 +1,7 @@
-"""What runs trainings: jobs in, typed ends out. The local pool and the cluster answer to the same three calls."""
+"""What runs jobs: jobs in, typed ends out. This process, a pool and a cluster answer to the same three calls.
+
+An executor is one file and one registration in `EXECUTORS`; a `Workforce` says which one is asked for.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self
 
 from edp.errors import ConfigError
+from edp.registry import Registry
+from edp.settings.bounds import MOST_THREADS, check_bounds, integer
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus
+from edp.storage.portable import cores
 
 START = "start"
 # Two restarts tell bad luck from a fault of the training itself.
@@ -85,8 +91,62 @@ class Executor(Protocol):
         ...
 
 
+@dataclass(frozen=True, kw_only=True)
+class Workforce:
+    """Who does the work of a command.
+
+    Attributes:
+        workers: processes of this machine, 1 for this process alone, 0 for one to each core over `threads`.
+        threads: of each job; another number may give other bits.
+        cluster: address of a Ray cluster that does the work instead; empty for this machine.
+        open_cluster: take a cluster without a token at an address that other computers may reach.
+
+    Raises:
+        ConfigError: a number out of range, or workers of this machine and a cluster.
+    """
+
+    workers: int = 1
+    threads: int = 1
+    cluster: str = ""
+    open_cluster: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds("workers", self, workers=integer(0, MOST_THREADS), threads=integer(1, MOST_THREADS))
+        if self.cluster and self.workers > 1:
+            raise ConfigError(
+                f"workers = {self.workers} and the cluster '{self.cluster}' came; a cluster has its own number of "
+                "workers, as many as its cores hold: give one of the two"
+            )
+
+    @property
+    def count(self) -> int:
+        """Processes of this machine."""
+        return self.workers or max(1, cores() // self.threads)
+
+    @property
+    def kind(self) -> str:
+        """Name of the executor."""
+        return "ray" if self.cluster else "processes" if self.count > 1 else "local"
+
+    @property
+    def alone(self) -> bool:
+        """Whether this process does everything."""
+        return self.kind == "local"
+
+    def open(self) -> Executor:
+        """The executor; to be closed, best by a ``with`` block.
+
+        Raises:
+            ConfigError: it cannot be had, such as a cluster that does not answer, is open, or has other versions.
+        """
+        return EXECUTORS[self.kind](self)
+
+
+EXECUTORS: Registry[Callable[[Workforce], Executor]] = Registry("executor")
+
+
 class ClosedAtExit:
-    """What both pools do at the end of a ``with`` block: they stop everything."""
+    """What all executors do at the end of a ``with`` block: they stop everything."""
 
     def close(self) -> None:
         """Stop everything."""

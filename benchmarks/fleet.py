@@ -1,0 +1,424 @@
+"""What do more workers bring a fleet's commands, what does the coordinator take, and what does a delta lose?
+
+* Two workers against one, for simulate, store, inspect, the inspection of screen, and evaluate. On a computer that
+  others use wall time says little, so processor time is compared: that of one process for everything, against the
+  coordinator's with two workers and that of the busier worker, with the readers of logs that each has. Starting a
+  worker (imports) is measured with next to nothing to do and taken off.
+* The coordinator's processor time a unit over 1,000 units, as a share of a core while two workers do units of the mean
+  length of the first part.
+* A delta of 64 kB of each of some machines that the network never saw, from five minutes of logs, against their full
+  fine-tuning, on the ends of the logs.
+* The error of one network, parameters and updates fixed, by the minutes of logs that train it, on machines never seen.
+* The time of a fleet of 10,000 h on 100 cores: the scheduler simulated with the measured times of units, checked with
+  two workers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import os
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import finish, kept, parser, table, verdict
+from edp.config.experiment import Experiment, load_experiment
+from edp.logs.source import DataSource
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.training import load_bundle
+from edp.workflows.executors import Workforce
+from edp.workflows.executors.units import WorkUnit, run_units
+from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
+from edp.workflows.fleet.judge_fleet import FleetQuestion, report_fleet
+from edp.workflows.fleet.judging import evaluate_with
+from edp.workflows.fleet.personal import PersonalOrder, errors_by_machine, finetune_fleet
+from edp.workflows.fleet.simulating import simulate_with
+from edp.workflows.fleet.storing import store_with
+from edp.workflows.train_evaluate import train
+from edp.workflows.transfer import FinetuneSpec
+
+SPEEDUP, SHARE, NEAR = 1.8, 0.03, 1.05
+UNITS = 1_000
+PARTS = ("before", "full", "delta")
+WORKER = b"edp.workflows.executors.worker"
+TICK_S = 0.1
+CLOCK = os.sysconf("SC_CLK_TCK")
+HOURS, CORES = 10_000.0, 100
+NETWORK = (
+    'model.backbone={kind="hybrid",channels=[64],kernel=4,units=64}',
+    "task.horizons=[10]",
+    "model.window=50",
+)
+
+
+def spent_s(process: int) -> float:
+    """Processor time of a process so far, in s; 0 once it is gone."""
+    with contextlib.suppress(OSError, IndexError):
+        fields = Path(f"/proc/{process}/stat").read_bytes().rpartition(b")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / CLOCK
+    return 0.0
+
+
+def children(process: int) -> list[int]:
+    """Processes that a process started, in any thread."""
+    found = []
+    with contextlib.suppress(OSError):
+        for thread in Path(f"/proc/{process}/task").iterdir():
+            found += [int(word) for word in (thread / "children").read_text().split()]
+    return found
+
+
+def tree_s(process: int) -> dict[int, float]:
+    """Processor time of a process and of all below it, by process."""
+    spent = {process: spent_s(process)}
+    for child in children(process):
+        spent |= tree_s(child)
+    return spent
+
+
+def is_worker(process: int) -> bool:
+    with contextlib.suppress(OSError):
+        return WORKER in Path(f"/proc/{process}/cmdline").read_bytes()
+    return False
+
+
+@dataclass
+class Meter:
+    """Processor time of this process with its readers, and of each worker with its own, looked at now and then."""
+
+    begun: dict[int, float] = field(default_factory=lambda: tree_s(os.getpid()))
+    seen: dict[int, dict[int, float]] = field(default_factory=dict)
+    done: threading.Event = field(default_factory=threading.Event)
+
+    def look(self) -> None:
+        own = os.getpid()
+        for child in children(own):
+            # A worker looks like this process until it runs its own program.
+            if is_worker(child):
+                self.seen.setdefault(own, {}).pop(child, None)
+            place = self.seen.setdefault(child if is_worker(child) else own, {})
+            for process, spent in tree_s(child).items():
+                place[process] = max(place.get(process, 0.0), spent)
+        self.seen.setdefault(own, {})[own] = spent_s(own)
+
+    def watch(self) -> None:
+        while not self.done.wait(TICK_S):
+            self.look()
+
+    def here(self) -> float:
+        """Of this process and what is no worker, since the meter began."""
+        return sum(spent - self.begun.get(p, 0.0) for p, spent in self.seen.get(os.getpid(), {}).items())
+
+    def busiest(self) -> float:
+        """Of the worker that took most."""
+        workers = [sum(spent.values()) for process, spent in self.seen.items() if process != os.getpid()]
+        return max(workers, default=0.0)
+
+
+@contextlib.contextmanager
+def metered() -> Iterator[Meter]:
+    meter = Meter()
+    looking = threading.Thread(target=meter.watch, daemon=True)
+    looking.start()
+    yield meter
+    meter.look()
+    meter.done.set()
+    looking.join()
+
+
+def rest(identity: Any, where: Any) -> dict[str, Any]:
+    """A unit that takes no processor time: what is left is the coordinator's."""
+    time.sleep(0.02)
+    return {"number": identity.config["number"]}
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much the short and the full form do."""
+
+    minutes: float
+    recordings: int
+    machines: int
+    fleet_minutes: float
+    updates: int
+    curve: tuple[float, ...]
+
+
+SIZES = {
+    True: Size(1.0, 4, 3, 3.0, 20, ()),
+    False: Size(30.0, 10, 24, 48.0, 900, (10.0, 40.0, 160.0)),
+}
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Where the benchmark stands."""
+
+    work: Path
+    seed: int
+    quick: bool
+
+    @property
+    def size(self) -> Size:
+        return SIZES[self.quick]
+
+    def order(self, minutes: float, recordings: int) -> SimulationOrder:
+        return SimulationOrder(minutes=minutes, recordings=recordings, seed=self.seed)
+
+    def logs(self, name: str, order: SimulationOrder) -> Path:
+        """Logs, simulated where they are not there yet."""
+        simulate_data_set(self.work / name, order, workers=1)
+        return self.work / name
+
+    def experiment(self, *changes: str) -> Experiment:
+        return load_experiment(None, "quick", [*NETWORK, f"training.seed={self.seed}", *changes])
+
+    def run(self) -> Path:
+        """A network that commands judge."""
+        logs = self.logs("many", self.order(self.size.minutes, self.size.recordings))
+        updates = 10 if self.quick else 100
+        experiment = self.experiment("training.epochs=1", f"training.updates={updates}")
+        train(DataSource.of(logs), experiment, self.work / "run")
+        return self.work / "run"
+
+
+Command = Callable[[Workforce, Path, str], object]
+
+
+def commands(bench: Bench) -> dict[str, Command]:
+    """Each command on the data of a name: ``many`` for the measure, ``few`` for what starting takes."""
+    size = bench.size
+    orders = {"many": bench.order(size.minutes, size.recordings), "few": bench.order(0.2, 2)}
+    run = Path() if bench.quick else bench.run()
+    for name, order in orders.items():
+        bench.logs(name, order)
+
+    def source(name: str) -> DataSource:
+        return DataSource.of(bench.work / name)
+
+    if bench.quick:  # starting processes takes longest: two commands stand for all
+        return {
+            "simulate": lambda workforce, out, name: simulate_with(workforce, out / "logs", orders[name]),
+            "store": lambda workforce, out, name: store_with(workforce, source(name), out / "store"),
+        }
+
+    def evaluate(workforce: Workforce, out: Path, name: str) -> object:
+        shutil.copytree(run, out / "run")
+        return evaluate_with(workforce, out / "run", source(name))
+
+    return {
+        "simulate": lambda workforce, out, name: simulate_with(workforce, out / "logs", orders[name]),
+        "store": lambda workforce, out, name: store_with(workforce, source(name), out / "store"),
+        "inspect": lambda workforce, out, name: inspect_with(workforce, source(name), CoverageOrder()),
+        "screen (inspection)": lambda workforce, out, name: inspect_with(workforce, source(name)),
+        "evaluate": evaluate,
+    }
+
+
+def processor_s(command: Command, workers: int, name: str) -> tuple[float, float]:
+    """Processor time of this process, and of the busier worker."""
+    with tempfile.TemporaryDirectory() as out, metered() as meter:
+        command(Workforce(workers=workers), Path(out), name)
+    return meter.here(), meter.busiest()
+
+
+def two_against_one(bench: Bench) -> list[dict[str, Any]]:
+    rows = []
+    for name, command in commands(bench).items():
+        processor_s(command, 1, "few")  # what this process loads once
+        started_here, started_there = processor_s(command, 2, "few")
+        alone, _ = processor_s(command, 1, "many")
+        here, there = processor_s(command, 2, "many")
+        two = max(0.0, here - started_here) + max(0.0, there - started_there)
+        rows.append({
+            "command": name, "one process, s": alone, "two: coordinator, s": here, "two: busier worker, s": there,
+            "of which starting, s": started_there, "times": alone / max(two, 1e-9),
+        })  # fmt: skip
+        print(rows[-1], flush=True)
+    return rows
+
+
+def coordinating(workers: int) -> dict[str, float]:
+    """The coordinator's processor time a unit over many that take none."""
+    units = [WorkUnit("fleet:rest", f"unit {n}", {"number": n}) for n in range(UNITS)]
+    began, wall = time.process_time(), time.perf_counter()
+    run_units(units, Workforce(workers=workers))
+    spent = time.process_time() - began
+    return {
+        "units": UNITS,
+        "processor_s": spent,
+        "ms_a_unit": 1e3 * spent / UNITS,
+        "wall_s": time.perf_counter() - wall,
+    }
+
+
+def fleet_orders(bench: Bench) -> dict[str, SimulationOrder]:
+    """Machines that train, machines never seen with six minutes each, and growing data sets for the curve."""
+    size = bench.size
+    soil: dict[str, Any] = {"materials": {"air": 1.0, "sandy_loam": 1.0}, "scatter": 2.0}
+    own = 2 if bench.quick else 4
+    train_set = SimulationOrder(
+        minutes=size.fleet_minutes, recordings=2 * size.machines, family=size.machines, seed=bench.seed + 1, **soil
+    )
+    unseen = SimulationOrder(
+        minutes=6.0 * own if not bench.quick else 4.0, recordings=2 * own, family=own, seed=bench.seed + 2, **soil
+    )
+    curve = {
+        f"curve_{minutes:g}": SimulationOrder(
+            minutes=minutes, recordings=max(4, round(minutes / 1.5)), family=max(4, round(minutes / 3.0)),
+            seed=bench.seed + 3, **soil,
+        )
+        for minutes in size.curve
+    }  # fmt: skip
+    return {"fleet": train_set, "unseen": unseen, **curve}
+
+
+def trained(bench: Bench, name: str, order: SimulationOrder) -> Path:
+    """One network over the machines of a data set; parameters and updates are the same for all."""
+    epochs = 2 if bench.quick else 6
+    lengths = (f"training.epochs={epochs}", f"training.updates={max(1, bench.size.updates // epochs)}")
+    experiment = bench.experiment('split.kind="machines"', *lengths)
+    out = bench.work / "runs" / name
+    train(DataSource.of(bench.logs(name, order)), experiment, out)
+    return out
+
+
+def deltas(bench: Bench) -> dict[str, Any]:
+    """Errors of base, full fine-tuning and delta on machines never seen, in mm/s."""
+    orders = fleet_orders(bench)
+    base = trained(bench, "fleet", orders["fleet"])
+    store = bench.work / "unseen_store"
+    DataSource.of(bench.logs("unseen", orders["unseen"])).store(store, 1)
+    found: dict[str, Any] = {"parameters": sum(p.numel() for p in load_bundle(base).predictor.parameters())}
+    spec = FinetuneSpec(rounds=3 if bench.quick else 10)
+    for label, method, kilobytes in (("full", "full", 64), ("low_rank", "low_rank", 64)):
+        if bench.quick and label != "full":
+            continue
+        order = PersonalOrder(method=method, spec=spec, most_bytes=1024 * kilobytes)
+        content = finetune_fleet(Workforce(), base, store, order, bench.work / f"own_{method}_{kilobytes}")
+        rows = errors_by_machine(content)
+        found[label] = {
+            "machines": [list(row) for row in rows],
+            "bytes": max(row.get("bytes", 0) for row in content["machines"]),
+            "trained_min": float(np.mean([row["trained_min"] for row in content["machines"] if "mae" in row])),
+            **{
+                part: float(np.mean([row[1 + n] for row in rows])) for n, part in enumerate(("before", "full", "delta"))
+            },
+        }
+        print(label, found[label], flush=True)
+    return found
+
+
+def curve(bench: Bench) -> dict[str, float]:
+    """Error on machines never seen by minutes of training logs, in mm/s, and the exponent of a power law."""
+    orders, errors = fleet_orders(bench), {}
+    for minutes in bench.size.curve:
+        name = f"curve_{minutes:g}"
+        run = trained(bench, name, orders[name])
+        question = FleetQuestion(network=run, store=bench.work / "unseen_store")
+        facts = report_fleet(Workforce(), question, bench.work / f"report_{name}")
+        errors[f"{minutes:g}"] = float(np.mean([row.mae for row in facts.rows]))
+        print(f"{minutes:g} min: {errors[f'{minutes:g}']:.4g} mm/s on machines never seen", flush=True)
+    slope = np.polyfit(np.log([float(m) for m in errors]), np.log(list(errors.values())), 1)[0]
+    return {**errors, "exponent": float(slope)}
+
+
+def makespan(seconds: Sequence[float], workers: int) -> float:
+    """When the last of some units ends that are handed out in order to whoever is free first."""
+    free = [0.0] * workers
+    heapq.heapify(free)
+    for one in seconds:
+        heapq.heappush(free, heapq.heappop(free) + one)
+    return max(free)
+
+
+def unit_seconds(bench: Bench) -> list[float]:
+    """Processor seconds of the units of a simulation, one by one in this process."""
+    seconds: list[float] = []
+    with tempfile.TemporaryDirectory() as out:
+        last = [time.process_time()]
+
+        def note(simulated: Any, there: bool) -> None:
+            seconds.append(time.process_time() - last[0])
+            last[0] = time.process_time()
+
+        order = bench.order(bench.size.minutes, bench.size.recordings)
+        simulate_with(Workforce(), Path(out) / "logs", order, note)
+    return seconds
+
+
+def cost(bench: Bench, rows: Sequence[dict[str, Any]], coordinator_ms: float) -> dict[str, float]:
+    """A fleet of 10,000 h on 100 cores, from measured units; and two workers as foretold and as measured."""
+    seconds = unit_seconds(bench)
+    hours = bench.size.minutes / 60.0
+    simulated = next(row for row in rows if row["command"] == "simulate")
+    measured = simulated["two: busier worker, s"] - simulated["of which starting, s"]
+    draw = np.random.default_rng(bench.seed)
+    many = round(HOURS / hours * len(seconds))
+    large = list(draw.choice(seconds, many))
+    # One coordinator: units cannot end faster than it can hear of them.
+    heard = many * coordinator_ms / 1e3
+    each = {row["command"]: row["one process, s"] / hours for row in rows}
+    told = [name for name in ("simulate", "store", "inspect") if name in each]
+    return {
+        "unit_mean_s": float(np.mean(seconds)),
+        "two_foretold_s": makespan(seconds, 2),
+        "two_measured_s": measured,
+        "units": float(many),
+        "hours_of_100_cores": makespan(large, CORES) / 3600.0,
+        "efficiency": sum(large) / CORES / makespan(large, CORES),
+        "coordinator_h": heard / 3600.0,
+        "processor_h": sum(each[name] for name in told) * HOURS / 3600.0,
+    }
+
+
+def measure(bench: Bench) -> dict[str, Any]:
+    def part(name: str, found: Callable[[], Any]) -> Any:
+        return kept(bench.work / f"{name}.json", lambda: {"found": found()})["found"]
+
+    found: dict[str, Any] = {"deltas": part("deltas", lambda: deltas(bench))}
+    found["coordinator"] = coordinator = part("coordinator", lambda: coordinating(2))
+    found["commands"] = rows = part("two_against_one", lambda: two_against_one(bench))
+    if bench.size.curve:
+        found["curve"] = part("curve", lambda: curve(bench))
+    return found | {"cost": part("cost", lambda: cost(bench, rows, coordinator["ms_a_unit"]))}
+
+
+def main() -> None:
+    made = parser(__doc__ or "")
+    made.add_argument("--work", type=Path, default=None, help="folder of data, runs and parts, kept between runs")
+    arguments = made.parse_args()
+    quick = arguments.quick
+    with contextlib.ExitStack() as stack:
+        work = arguments.work or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        found = measure(Bench(work, arguments.seed, quick))
+    table(list(found["commands"][0]), [list(row.values()) for row in found["commands"]])
+    cost_of, coordinator = found["cost"], found["coordinator"]
+    share = coordinator["ms_a_unit"] / 1e3 * 2 / cost_of["unit_mean_s"]
+    print(f"coordinator: {coordinator['ms_a_unit']:.2f} ms a unit")
+    print(f"10,000 h on 100 cores: {cost_of}")
+    tuned = found["deltas"]["full"]
+    verdicts = [
+        verdict(f"{row['command']}: two workers against one", row["times"], 1.0, f">= {SPEEDUP}", "times", quick)
+        for row in found["commands"]
+    ]
+    verdicts += [
+        verdict("coordinator's share of a core, of 3 %", share, SHARE, "<= 1", "core", quick),
+        verdict("error of a delta over full fine-tuning", tuned["delta"], tuned["full"], f"<= {NEAR}", "mm/s", quick),
+        verdict("bytes of a delta, of 64 kB", tuned["bytes"], 65536, "<= 1", "B", quick),
+        verdict("two workers, measured over foretold", cost_of["two_measured_s"], cost_of["two_foretold_s"],
+                "<= 1.2", "s", quick),
+    ]  # fmt: skip
+    finish("fleet", verdicts, arguments.seed, found)
+
+
+if __name__ == "__main__":
+    main()

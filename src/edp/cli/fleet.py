@@ -1,0 +1,95 @@
+"""``edp fleet``: many machines under one network: their report, and the network of one of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+
+app = typer.Typer(
+    name="fleet",
+    help="Many machines under one network: which are worst and why, and the network of one of them.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+)
+
+
+@app.command("report")
+def report(
+    network: Annotated[Path, typer.Argument(help="Run folder or bundle of the fleet's network.")],
+    store: Annotated[Path, typer.Argument(help="Store of recordings that say their machine.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the page and fleet_report.json.")],
+    deltas: Annotated[
+        Path | None, typer.Option(help="Folder of edp finetune --fleet: each machine runs under its own delta.")
+    ] = None,
+    monitor: Annotated[Path | None, typer.Option(help="Monitor that watches every machine, too.")] = None,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Report a fleet: machines by error, drift and alarms, and what stands out of the ten worst.
+
+    Example: `edp fleet report runs/foundation stores/fleet --out fleet --deltas fleet/own --workers 4`
+    """
+    from edp.report.fleet.facts import headline, machine_sheet, worst_sheet
+    from edp.workflows.fleet.judge_fleet import PAGE, FleetQuestion, report_fleet
+
+    question = FleetQuestion(network=network, store=store, deltas=deltas, monitor=monitor)
+    with progress(as_json) as shown:
+        on_machine = MachineDisplay(shown, Steps(as_json), "judge").on_machine
+        facts = report_fleet(workforce_of(workers, cluster, open_cluster), question, folder, on_machine)
+    page = (folder / PAGE).resolve()
+
+    def show() -> None:
+        for sheet in (worst_sheet(facts), machine_sheet(facts)) if facts.rows else ():
+            table(sheet.caption, sheet.heads(), sheet.texts())
+            out.print()
+        for name, why in facts.failed:
+            out.print(f"'{name}' could not be judged: {why}")
+        out.print(headline(facts))
+        out.print(f"page: {page}")
+
+    emit(as_json, {"page": str(page), "headline": headline(facts), **facts.content}, show)
+
+
+@app.command("network")
+def network(
+    deltas: Annotated[Path, typer.Argument(help="Folder of edp finetune --fleet.")],
+    machine: Annotated[str, typer.Argument(help="Name of the machine.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the bundle.")],
+    base: Annotated[
+        Path | None, typer.Option(help="Run folder or bundle of the fleet's network; default: where it lay.")
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write the network of one machine, the fleet's with its delta added, as a bundle to export.
+
+    Example: `edp fleet network fleet/own "C14 no. 3" --out c14_3`, then `edp export c14_3 --to c --out exported`
+    """
+    from edp.workflows.fleet.personal import network_of
+
+    written = network_of(deltas, machine, folder, base)
+
+    def show() -> None:
+        out.print(f"network of '{machine}' in {written}")
+        out.print(f"next: edp export {written} --to c --out exported")
+
+    emit(as_json, {"bundle": str(written), "machine": machine}, show)
+
+
+class MachineDisplay:
+    """Shows which machine is done."""
+
+    def __init__(self, shown: Any, steps: Steps, what: str) -> None:
+        self.shown, self.steps, self.what = shown, steps, what
+        self.bar = shown.add_task(what, total=None, note="")
+
+    def on_machine(self, name: str, done: int, count: int) -> None:
+        """Show one machine."""
+        self.shown.update(self.bar, total=count, completed=done, note=name)
+        self.steps.say(f"{self.what}: {name}, {done} of {count}")

@@ -1,0 +1,229 @@
+"""A fleet as a reader sees it: machines by error, drift and alarms, and for the worst ones what stands out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.report.common.wording import number, percent
+
+WORST = 10
+SURE_T = 4.0
+"""Welch's t from which a drift is told: by chance one machine in 30,000, where blocks are independent."""
+DRIFTS = 1.15
+"""Ratio of the error of both halves from which a drift is worth a word."""
+FAR = 4.0
+"""Robust deviations from the fleet's median from which an input is told as unusual."""
+LARGER = 1.3
+"""Times the fleet's median from which an error or a speed is told as large."""
+NORMAL = 1.4826
+"""Of the median absolute deviation to a standard deviation."""
+
+
+@dataclass(frozen=True)
+class FleetRow:
+    """A machine.
+
+    Attributes:
+        name: of it.
+        minutes: of its recordings.
+        mae: mean absolute error over outputs and ticks, report units.
+        skill: share of the error of persistence that the network takes away.
+        drift: error of the second half over that of the first; None where the recordings are too short to tell.
+        drifts: whether that is more than chance.
+        changes: that a monitor told of; None without one.
+        own: whether the network is its own.
+        why: what stands out, the most telling first.
+    """
+
+    name: str
+    minutes: float
+    mae: float
+    skill: float
+    drift: float | None
+    drifts: bool
+    changes: int | None
+    own: bool
+    why: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FleetFacts:
+    """A fleet.
+
+    Attributes:
+        title: of the page.
+        unit: of errors.
+        ahead_ms: time that is looked ahead.
+        rows: machines, the worst first.
+        failed: machines that could not be judged, and why.
+        content: what ``fleet_report.json`` has.
+    """
+
+    title: str
+    unit: str
+    ahead_ms: float
+    rows: tuple[FleetRow, ...]
+    failed: tuple[tuple[str, str], ...]
+    content: Mapping[str, Any]
+
+    @property
+    def median(self) -> float:
+        """Of the machines' errors; not a number where none was judged."""
+        return float(np.median([row.mae for row in self.rows])) if self.rows else float("nan")
+
+
+def fleet_facts(content: Mapping[str, Any], title: str) -> FleetFacts:
+    """Facts of what ``fleet_report.json`` has."""
+    units = {target["unit"] for target in content["targets"]}
+    judged = [row for row in content["machines"] if "mae" in row]
+    failed = tuple((row["machine"], row["failed"]) for row in content["machines"] if "failed" in row)
+    usual = _Usual(judged, content["targets"])
+    rows = sorted((usual.row(row) for row in judged), key=lambda row: -row.mae)
+    ahead = 1e3 * content["horizon"] / content["rate_hz"]
+    unit = units.pop() if len(units) == 1 else "mixed units"
+    return FleetFacts(title, unit, ahead, tuple(rows), failed, content)
+
+
+class _Usual:
+    """What is usual in the fleet, and how a machine departs from it."""
+
+    def __init__(self, judged: Sequence[Mapping[str, Any]], targets: Sequence[Mapping[str, str]]) -> None:
+        self.targets = [target["name"] for target in targets]
+        self.by_target = np.median([row["by_target"] for row in judged], axis=0) if judged else np.zeros(0)
+        self.still = float(np.median([row["persistence"] for row in judged])) if judged else 0.0
+        self.inputs: dict[tuple[str, str], tuple[float, float]] = {}
+        for name in judged[0]["inputs"] if judged else ():
+            for figure in ("mean", "std"):
+                values = np.array([row["inputs"][name][figure] for row in judged])
+                middle = float(np.median(values))
+                self.inputs[name, figure] = (middle, NORMAL * float(np.median(np.abs(values - middle))))
+
+    def row(self, row: Mapping[str, Any]) -> FleetRow:
+        drift, alarms = row["drift"], row["alarms"]
+        drifts = drift is not None and drift["t"] > SURE_T and drift["ratio"] > DRIFTS
+        return FleetRow(
+            name=row["machine"],
+            minutes=row["minutes"],
+            mae=row["mae"],
+            skill=1.0 - row["mae"] / row["persistence"] if row["persistence"] else 0.0,
+            drift=None if drift is None else drift["ratio"],
+            drifts=drifts,
+            changes=None if alarms is None else alarms.get("changes"),
+            own=row["own"],
+            why=tuple(self._why(row, drifts)),
+        )
+
+    def _why(self, row: Mapping[str, Any], drifts: bool) -> list[str]:
+        reasons = [*self._outputs(row), *self._speed(row)]
+        if drifts:
+            grown = percent(row["drift"]["ratio"] - 1.0)
+            reasons.append(f"the error grew by {grown} from the first half of its time to the second")
+        alarms = row["alarms"]
+        if alarms and alarms.get("changes"):
+            reasons.append(f"the monitor told of {alarms['changes']} change(s), first: {alarms['first'][0]}")
+        return [*reasons, *self._unusual(row)]
+
+    def _outputs(self, row: Mapping[str, Any]) -> list[str]:
+        """The output whose error departs most from the fleet's."""
+        ratios = np.asarray(row["by_target"]) / np.maximum(self.by_target, 1e-30)
+        worst = int(np.argmax(ratios))
+        if ratios[worst] < LARGER:
+            return []
+        return [f"the error of {self.targets[worst]} is {ratios[worst]:.1f} times the fleet's median"]
+
+    def _speed(self, row: Mapping[str, Any]) -> list[str]:
+        """Whether its outputs simply change faster."""
+        ratio = row["persistence"] / self.still if self.still else 1.0
+        return [f"its outputs change {ratio:.1f} times as fast as the fleet's"] if ratio > LARGER else []
+
+    def _unusual(self, row: Mapping[str, Any]) -> list[str]:
+        """The input that departs most from the fleet's, in robust deviations."""
+        words = {"mean": "lies", "std": "varies"}
+        far = []
+        for (name, figure), (middle, spread) in self.inputs.items():
+            away = abs(row["inputs"][name][figure] - middle) / spread if spread > 0 else 0.0
+            far.append((away, name, figure))
+        away, name, figure = max(far, default=(0.0, "", "mean"))
+        return [f"input {name} {words[figure]} {away:.0f} deviations off the fleet"] if away > FAR else []
+
+
+def headline(facts: FleetFacts) -> str:
+    """The fleet in a sentence."""
+    if not facts.rows:
+        return f"None of {len(facts.failed)} machines could be judged."
+    worst = facts.rows[0]
+    return (
+        f"{len(facts.rows)} machines, median error {number(facts.median)} {facts.unit} {facts.ahead_ms:g} ms ahead; "
+        f"the worst is {worst.name} with {number(worst.mae)} {facts.unit}."
+    )
+
+
+def verdict(facts: FleetFacts) -> list[str]:
+    """What a reader must know behind the headline."""
+    drifting = sum(row.drifts for row in facts.rows)
+    lines = [f"{drifting} of {len(facts.rows)} machines drift: their error grew over the time of their logs."]
+    watched = [row for row in facts.rows if row.changes is not None]
+    if watched:
+        changed = sum(bool(row.changes) for row in watched)
+        lines.append(f"The monitor told of changes on {changed} of {len(watched)}.")
+    else:
+        lines.append("No monitor watched.")
+    if facts.failed:
+        lines.append(f"{len(facts.failed)} machine(s) could not be judged; they stand at the end.")
+    own = sum(row.own for row in facts.rows)
+    if own:
+        lines.append(f"{own} ran under their own delta.")
+    return lines
+
+
+def tiles(facts: FleetFacts) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, what it is."""
+    errors = [row.mae for row in facts.rows]
+    hours = sum(row.minutes for row in facts.rows) / 60.0
+    high = float(np.quantile(errors, 0.9)) if errors else float("nan")
+    return [
+        (str(len(facts.rows)), "", "machines"),
+        (number(hours), "h", "of recordings"),
+        (number(facts.median), facts.unit, "error of the median machine"),
+        (number(high), facts.unit, "error that one machine in ten exceeds"),
+        (str(sum(row.drifts for row in facts.rows)), "", "machines drift"),
+    ]
+
+
+def worst_sheet(facts: FleetFacts) -> Sheet:
+    """The worst machines, and why."""
+    rows: list[tuple[Value, ...]] = [
+        (row.name, row.mae, "; ".join(row.why) or "nothing stands out: the network is less exact here")
+        for row in facts.rows[:WORST]
+    ]
+    columns = (Column("Machine"), Column("Error", facts.unit, figures(row[1] for row in rows)), Column("Why"))
+    return Sheet("worst", f"The {len(rows)} machines with the largest error", columns, tuple(rows))
+
+
+def machine_sheet(facts: FleetFacts) -> Sheet:
+    """Every machine."""
+    rows: list[tuple[Value, ...]] = [
+        (row.name, row.minutes, row.mae, percent(row.skill), row.drift, "yes" if row.drifts else "", row.changes)
+        for row in facts.rows
+    ]
+    columns = (
+        Column("Machine"),
+        Column("Logs", "min", figures((row[1] for row in rows), decimals=1)),
+        Column("Error", facts.unit, figures(row[2] for row in rows)),
+        Column("Better than persistence"),
+        Column("Error, 2nd over 1st half", "", figures((row[4] for row in rows), decimals=2)),
+        Column("Drifts"),
+        Column("Changes told"),
+    )
+    marked = frozenset(n for n, row in enumerate(facts.rows) if row.drifts or row.changes)
+    return Sheet("machines", "All machines, the largest error first", columns, tuple(rows), marked)
+
+
+def failed_sheet(facts: FleetFacts) -> Sheet:
+    """Machines that could not be judged."""
+    return Sheet("failed", "Machines that could not be judged", (Column("Machine"), Column("Why")), facts.failed)

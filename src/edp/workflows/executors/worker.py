@@ -1,0 +1,42 @@
+"""The process that does jobs for a pool: ``python -m edp.workflows.executors.worker`` with a socket; not for
+people.
+
+It lives as long as its parent and not longer, and answers each job with one record.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import sys
+import threading
+from multiprocessing.connection import Connection
+from typing import Any
+
+from edp.sandbox.processes import die_with_parent
+from edp.workflows.executors.perform import BEGUN, perform
+
+
+def serve(connection: Connection) -> None:
+    """Do jobs until the other side closes."""
+    jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def listen() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                jobs.put(connection.recv())
+        os._exit(1)  # in the middle of a training, too: nobody waits for it
+
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        identity, where, folder = jobs.get()
+        record = perform(identity, where, folder, lambda: connection.send_bytes(BEGUN))
+        connection.send_bytes(record.to_bytes())
+
+
+if __name__ == "__main__":
+    # Children of the training must not inherit the socket, or the pool would wait for them.
+    os.set_inheritable(int(sys.argv[1]), False)
+    die_with_parent(int(sys.argv[2]))
+    serve(Connection(int(sys.argv[1])))

@@ -1,0 +1,168 @@
+"""`edp inspect` and the inspection of `edp screen` by a pool or a cluster: a unit a log, and one for the coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from edp.data.coverage import Coverage
+from edp.errors import EdpError
+from edp.logs import DataQuality, QualityReport, Sketch, compare, inspect, look_into, sketch, unique_names
+from edp.logs.source import DataSource
+from edp.logs.store import read_index, read_store
+from edp.recording import Recording
+from edp.settings.tree import build, plain_tree
+from edp.signals import SignalMap
+from edp.storage.ledger import TrainingIdentity, WithState
+from edp.workflows.executors import Workforce
+from edp.workflows.executors.packing import packed, unpacked
+from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
+from edp.workflows.fleet.storing import keys_of, stored_logs
+from edp.workflows.train_evaluate import coverage
+
+STORED_UNITS = 64
+"""Units that the recordings of a store are divided into, about: opening a store takes longer the more it holds."""
+OnLog = Callable[[Path, int, int], None]
+
+
+@dataclass(frozen=True)
+class CoverageOrder:
+    """Which coverage is asked for; see `edp.workflows.train_evaluate.coverage`."""
+
+    inputs: tuple[str, ...] = ()
+    split: str = ""
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What a unit found in the recordings that it looked at."""
+
+    reports: tuple[QualityReport, ...]
+    sketches: tuple[Sketch | None, ...]
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found in a source.
+
+    Attributes:
+        quality: of its recordings.
+        coverage: what they cover; None where that was not asked for, or cannot be told.
+        why: why it cannot.
+    """
+
+    quality: DataQuality
+    coverage: Coverage | None = None
+    why: str = ""
+
+
+def inspect_with(
+    workforce: Workforce, source: DataSource, covers: CoverageOrder | None = None, on_log: OnLog | None = None
+) -> Inspection:
+    """As `DataSource.inspect`, and `edp.workflows.train_evaluate.coverage`, by a workforce.
+
+    Args:
+        workforce: who looks; nodes see the logs under the same paths.
+        source: where the recordings are.
+        covers: the coverage that is wanted, too.
+        on_log: called with a path, how many units are done and how many there are.
+
+    Raises:
+        UnitError: a file that cannot be read at all.
+    """
+    units = _units_of_store(source) if source.stored else _units_of_logs(source)
+    looks = len(units)
+    if covers is not None:
+        # First: it takes longest.
+        units.insert(0, _coverage_unit(source, covers))
+
+    def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
+        if on_log is not None:
+            on_log(Path(unit.label), done, len(units))
+
+    results = run_units(units, workforce, on_done=note)
+    covered, why = None, ""
+    if covers is not None:
+        first, results = results[0], results[1:]
+        why = str(first.values["why"])
+        covered = None if first.content is None else unpacked(first.content, Coverage)
+    looked = [unpacked(result.content or b"", LookedAt) for result in results[:looks]]
+    reports = [report for one in looked for report in one.reports]
+    sketches = [entry for one in looked for entry in one.sketches]
+    if not source.stored:
+        # As `DataSource.inspect` does: a finding on two recordings must tell which is which.
+        names = unique_names([report.name for report in reports], [log.path for log in source.logs()])
+        reports = [replace(report, name=name) for report, name in zip(reports, names, strict=True)]
+        sketches = [None if s is None else replace(s, name=name) for s, name in zip(sketches, names, strict=True)]
+    return Inspection(compare(reports, [entry for entry in sketches if entry is not None]), covered, why)
+
+
+def _units_of_logs(source: DataSource) -> list[WorkUnit]:
+    units = []
+    for log, stored in zip(source.logs(), stored_logs(source), strict=True):
+        arguments = {
+            "map": None if log.signal_map is None else plain_tree(log.signal_map),
+            "name": log.name,
+            "rows": None if log.rows is None else list(log.rows),
+        }
+        where = {"path": str(log.path.resolve()), "shown": str(log.path)}
+        units.append(WorkUnit(f"{__name__}:look_at_log", str(log.path), arguments, stored.key, where))
+    return units
+
+
+def look_at_log(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Look into one log."""
+    table, rows = identity.config["map"], identity.config["rows"]
+    signal_map = None if table is None else build(SignalMap, table, f"map of '{where['shown']}'")
+    # The path as it was given stands in messages; where it leads nowhere on this node, the resolved one is read.
+    shown = Path(where["shown"])
+    path = shown if shown.exists() else Path(where["path"])
+    span = None if rows is None else (rows[0], rows[1])
+    report, drawn = look_into(path, signal_map, identity.config["name"], span)
+    return WithState({"verdict": report.verdict}, packed(LookedAt((report,), (drawn,))))
+
+
+def _units_of_store(source: DataSource) -> list[WorkUnit]:
+    source.check_store_options()
+    entries = read_index(source.path).recordings
+    each = max(1, -(-len(entries) // STORED_UNITS))
+    units = []
+    for first in range(0, len(entries), each):
+        part = entries[first : first + each]
+        arguments = {"first": first, "digests": [entry.digest for entry in part]}
+        where = {"store": str(source.path.resolve())}
+        units.append(WorkUnit(f"{__name__}:look_at_stored", str(source.path / part[0].name), arguments, where=where))
+    return units
+
+
+def look_at_stored(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Look at some recordings of a store."""
+    digests = identity.config["digests"]
+    recordings = _opened(where["store"], tuple(digests))[identity.config["first"] :][: len(digests)]
+    looked = LookedAt(tuple(map(inspect, recordings)), tuple(map(sketch, recordings)))
+    return WithState({"recordings": len(recordings)}, packed(looked))
+
+
+@lru_cache(maxsize=1)
+def _opened(store: str, digests: tuple[str, ...]) -> list[Recording]:
+    return read_store(store)
+
+
+def _coverage_unit(source: DataSource, covers: CoverageOrder) -> WorkUnit:
+    arguments = {"inputs": list(covers.inputs), "split": covers.split}
+    where = {"source": source.to_plain()}
+    return WorkUnit(f"{__name__}:cover_all", "coverage", arguments, keys_of(source), where)
+
+
+def cover_all(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, Any]:
+    """What all recordings cover together, or why that cannot be told."""
+    try:
+        covered = coverage(
+            DataSource.from_plain(where["source"]), tuple(identity.config["inputs"]), identity.config["split"]
+        )
+    except EdpError as error:
+        return {"why": str(error)}
+    return WithState({"why": ""}, packed(covered))

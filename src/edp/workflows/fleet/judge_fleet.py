@@ -1,0 +1,229 @@
+"""`edp fleet report`: every machine of a store under one network, or under its own delta; a unit a machine."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp import __version__
+from edp.errors import EdpError
+from edp.logs.source import DataSource
+from edp.networks.predictor import describe
+from edp.networks.running import stream_errors
+from edp.recording import Recording
+from edp.report.fleet.facts import FleetFacts, fleet_facts
+from edp.report.fleet.page import write_fleet_page
+from edp.signals import KINDS
+from edp.storage import check_writable, read_bytes, write_json
+from edp.storage.ledger import TrainingIdentity
+from edp.training import Bundle, load_bundle
+from edp.training.blas import one_blas_thread
+from edp.training.bundle import weights_digest
+from edp.training.delta import MOST_BYTES, read_delta, with_delta
+from edp.workflows.executors import Workforce
+from edp.workflows.executors.units import UnitResult, WorkUnit, forget_units, run_units
+from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
+from edp.workflows.fleet.personal import UNITS, read_fleet
+from edp.workflows.monitor import run_monitor
+
+RESULT, PAGE = "fleet_report.json", "report.html"
+SCHEMA = 1
+BLOCK_S = 10.0
+"""Blocks of which drift is told: longer than a network remembers what it misjudged."""
+LEAST_BLOCKS = 8
+"""In each half, for a spread to be known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetQuestion:
+    """What a fleet is judged by.
+
+    Attributes:
+        network: run folder or bundle.
+        store: recordings that say their machine.
+        deltas: folder of `edp finetune --fleet`, whose deltas are added for the machines that have one.
+        monitor: folder of a monitor that watches every machine.
+    """
+
+    network: Path
+    store: Path
+    deltas: Path | None = None
+    monitor: Path | None = None
+
+
+def report_fleet(
+    workforce: Workforce,
+    question: FleetQuestion,
+    out: str | Path,
+    on_machine: Callable[[str, int, int], None] | None = None,
+) -> FleetFacts:
+    """Judge every machine, and write ``fleet_report.json`` and a page.
+
+    Args:
+        workforce: who judges; nodes see all folders under the same paths.
+        question: network, store, deltas, monitor.
+        out: folder of the report.
+        on_machine: called with the name of a machine that is done, how many are, and how many there are.
+
+    Raises:
+        EdpError: a network, store or monitor that cannot be used, or a folder that cannot be written.
+    """
+    bundle = load_bundle(question.network)
+    machines = machines_of(question.store)
+    folder = check_writable(out)
+    deltas = {} if question.deltas is None else _deltas(question.deltas)
+    digest = weights_digest(bundle.predictor)
+    units = [_unit(machine, digest, question, deltas.get(machine.name)) for machine in machines]
+
+    def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
+        if on_machine is not None:
+            on_machine(str(unit.arguments["machine"]), done, len(units))
+
+    results = run_units(units, workforce, folder / UNITS, note)
+    pairs = zip(machines, results, strict=True)
+    rows = [{"machine": machine.name, "minutes": machine.minutes, **result.values} for machine, result in pairs]
+    task = bundle.task
+    content = {
+        "schema": SCHEMA,
+        "edp": __version__,
+        "network": {"path": str(question.network), "weights": digest, "label": describe(bundle.predictor.spec)},
+        "store": str(question.store),
+        "deltas": None if question.deltas is None else str(question.deltas),
+        "monitor": None if question.monitor is None else str(question.monitor),
+        "horizon": task.horizons[0],
+        "rate_hz": task.rate_hz,
+        "targets": [
+            {"name": name, "unit": KINDS[kind].report_unit}
+            for name, kind in zip(task.targets, bundle.target_kinds, strict=True)
+        ],
+        "machines": rows,
+    }
+    write_json(folder / RESULT, content)
+    facts = fleet_facts(content, Path(question.store).resolve().name)
+    write_fleet_page(facts, folder / PAGE)
+    forget_units(folder / UNITS)
+    return facts
+
+
+def _deltas(folder: Path) -> dict[str, Path]:
+    """Files of deltas by machine."""
+    rows = read_fleet(folder)["machines"]
+    return {row["machine"]: folder / row["delta"] for row in rows if "delta" in row}
+
+
+def _unit(machine: StoredMachine, digest: str, question: FleetQuestion, delta: Path | None) -> WorkUnit:
+    monitor = question.monitor
+    arguments = {
+        "machine": machine.name,
+        "weights": digest,
+        "delta": None if delta is None else _hash(read_bytes(delta, MOST_BYTES)),
+        "monitor": None if monitor is None else _state_of(monitor),
+    }
+    where = {
+        "network": str(question.network.resolve()),
+        "store": str(question.store.resolve()),
+        "delta": None if delta is None else str(delta.resolve()),
+        "monitor": None if monitor is None else str(monitor.resolve()),
+    }
+    label = f"machine '{machine.name}'"
+    return WorkUnit(f"{__name__}:judge_machine", label, arguments, " ".join(machine.digests), where)
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
+
+
+def _state_of(folder: Path) -> str:
+    """Names, sizes and times of the files of a folder, as one hash."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    facts = [(str(file.relative_to(folder)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    return _hash(repr(facts).encode())
+
+
+@one_blas_thread()
+def judge_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any]:
+    """Errors, drift, inputs and alarms of one machine."""
+    bundle = _bundle(where["network"], identity.config["weights"])
+    source = MachineSource(Path(where["store"]), machine=identity.config["machine"])
+    try:
+        return _judged(bundle, source, where)
+    except EdpError as error:
+        # A machine with other channels than the network's must not end the fleet's report.
+        return {"failed": str(error)}
+
+
+def _judged(bundle: Bundle, source: MachineSource, where: Mapping[str, Any]) -> dict[str, Any]:
+    recordings = source.read()
+    task, network = bundle.task, bundle.predictor
+    series = [task.series(recording) for recording in recordings]
+    if where["delta"] is not None:
+        network = with_delta(network, read_delta(where["delta"]))
+    factor = np.array([KINDS[kind].report_factor for kind in bundle.target_kinds])
+    errors = [np.abs(error) * factor for horizon, error in stream_errors(network, series) if horizon == 0]
+    if not errors:
+        shortest = task.max_horizon + network.spec.window
+        return {"failed": f"no recording is longer than window and horizon together, {shortest} samples"}
+    start, k = network.spec.window, task.horizons[0]
+    still = [np.abs(part.targets[start + k :] - part.targets[start : part.samples - k]) * factor for part in series]
+    pooled = np.concatenate(errors)
+    return {
+        "mae": float(pooled.mean()),
+        "by_target": [float(value) for value in pooled.mean(axis=0)],
+        "persistence": float(np.concatenate([part for part in still if len(part)]).mean()),
+        "recordings": [{"name": part.name, "mae": float(one.mean())} for part, one in zip(series, errors)],
+        "drift": drift_of(np.concatenate([error.mean(axis=1) for error in errors]), task.rate_hz),
+        "inputs": _inputs(recordings, [channel.name for channel in bundle.inputs]),
+        "own": where["delta"] is not None,
+        "alarms": None if where["monitor"] is None else _alarms(Path(where["monitor"]), source),
+    }
+
+
+def drift_of(error: NDArray[np.floating], rate_hz: float) -> dict[str, float] | None:
+    """How the error of the second half of the time stands to that of the first, by blocks.
+
+    Args:
+        error: absolute error a tick, in the order of time.
+        rate_hz: ticks a second.
+
+    Returns:
+        ``ratio`` of both means and Welch's ``t`` between the blocks of both; None where there are too few blocks.
+    """
+    size = round(BLOCK_S * rate_hz)
+    blocks = error[: len(error) // size * size].reshape(-1, size).mean(axis=1)
+    half = len(blocks) // 2
+    if half < LEAST_BLOCKS:
+        return None
+    first, second = blocks[:half], blocks[half:]
+    spread = float(np.sqrt(first.var(ddof=1) / len(first) + second.var(ddof=1) / len(second)))
+    difference = float(second.mean() - first.mean())
+    return {"ratio": float(second.mean() / max(first.mean(), 1e-30)), "t": difference / spread if spread else 0.0}
+
+
+def _inputs(recordings: list[Recording], names: list[str]) -> dict[str, dict[str, float]]:
+    """Mean and deviation of each input, SI units."""
+    values = np.concatenate([recording.select(names) for recording in recordings]).astype(np.float64)
+    means, spreads = values.mean(axis=0), values.std(axis=0)
+    return {name: {"mean": float(m), "std": float(s)} for name, m, s in zip(names, means, spreads, strict=True)}
+
+
+def _alarms(monitor: Path, source: DataSource) -> dict[str, Any]:
+    """How many changes a monitor told of, and the first of them; or why it could not watch."""
+    try:
+        watched = run_monitor(monitor, source)
+    except EdpError as error:
+        return {"failed": str(error)}
+    changes = watched.changes
+    first = [same[0].sentence for same in changes[:3]]
+    return {"changes": len(changes), "alarms": len(watched.alarms), "hours": watched.hours, "first": first}
+
+
+@lru_cache(maxsize=1)
+def _bundle(path: str, digest: str) -> Bundle:
+    return load_bundle(path)

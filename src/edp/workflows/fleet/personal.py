@@ -1,0 +1,252 @@
+"""`edp finetune --fleet`: one network, and for each machine of a store a delta of kilobytes; a unit a machine."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.config.experiment import Change
+from edp.data.prepared import Prepared
+from edp.errors import ConfigError, EdpError, closest
+from edp.evaluation.judge import score_predictions
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
+from edp.signals import KINDS
+from edp.storage import check_writable, make_folder, object_with, read_object, write_bytes, write_json
+from edp.storage.ledger import TrainingIdentity, WithState
+from edp.training.bundle import load_bundle, save_bundle, weights_digest
+from edp.training.delta import DELTA_BYTES, SUFFIX, delta_from_bytes, delta_of, read_delta, with_delta
+from edp.workflows.executors import Workforce
+from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
+from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
+from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec
+from edp.workflows.transfer.case import TransferCase
+from edp.workflows.transfer.finetune import target_data
+from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
+
+FLEET, DELTAS, UNITS = "fleet.json", "deltas", "units"
+SCHEMA = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class PersonalOrder:
+    """How each machine gets its network.
+
+    Attributes:
+        method: of the fine-tuning; one that trains and needs no recordings of the source.
+        spec: its settings.
+        changes: settings of the trainings that differ from those of the source.
+        most_bytes: of a delta.
+
+    Raises:
+        ConfigError: a method that does not do here, or no room for a delta.
+    """
+
+    method: str = "full"
+    spec: FinetuneSpec = field(default_factory=FinetuneSpec)
+    changes: tuple[Change, ...] = ()
+    most_bytes: int = DELTA_BYTES
+
+    def __post_init__(self) -> None:
+        method = METHODS[self.method]
+        if not method.trains or method.needs_source:
+            able = ", ".join(name for name, one in METHODS.items() if one.trains and not one.needs_source)
+            raise ConfigError(f"method '{self.method}' cannot make the networks of a fleet; one of {able} can")
+        if not 2**13 <= self.most_bytes <= 2**24:
+            raise ConfigError(f"a delta of {self.most_bytes} bytes; give 8192 to 16777216")
+
+
+def finetune_fleet(
+    workforce: Workforce,
+    source: str | Path,
+    store: str | Path,
+    order: PersonalOrder,
+    out: str | Path,
+    on_machine: Callable[[str, int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Fine-tune a network for each machine of a store, and keep what changed.
+
+    Each recording is divided by time: its beginning trains, a part validates, its end tests. A machine that is done is
+    not done again when the command is given again, with more machines in the store, too.
+
+    Args:
+        workforce: who trains; nodes see source and store under the same paths.
+        source: run folder or bundle of the fleet's network.
+        store: recordings that say their machine.
+        order: method, settings, bytes.
+        out: folder for ``fleet.json`` and ``deltas``.
+        on_machine: called with the name of a machine that is done, how many are, and how many there are.
+
+    Returns:
+        The content of ``fleet.json``. A machine whose logs do not go with the network is in it with the reason.
+
+    Raises:
+        EdpError: a source or store that cannot be used.
+    """
+    base = read_source(source, recordings=False)
+    digest = weights_digest(base.predictor)
+    machines = machines_of(store)
+    folder = check_writable(out)
+    units = [_unit(machine, digest, source, store, order) for machine in machines]
+
+    def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
+        if on_machine is not None:
+            on_machine(str(unit.arguments["machine"]), done, len(units))
+
+    results = run_units(units, workforce, folder / UNITS, note)
+    rows = []
+    for machine, result in zip(machines, results, strict=True):
+        row = {"machine": machine.name, "minutes": round(machine.minutes, 3), **result.values}
+        if result.content is not None:
+            row["delta"] = f"{DELTAS}/{file_of(machine.name)}"
+            write_bytes(make_folder(folder / DELTAS) / file_of(machine.name), result.content)
+        rows.append(row)
+    content = {
+        "schema": SCHEMA,
+        "edp": __version__,
+        "base": digest,
+        "source": str(Path(source).resolve()),
+        "store": str(Path(store).resolve()),
+        "method": order.method,
+        "most_bytes": order.most_bytes,
+        "unit": _unit_of(base),
+        "horizon": base.bundle.task.horizons[0],
+        "rate_hz": base.bundle.task.rate_hz,
+        "machines": rows,
+    }
+    write_json(folder / FLEET, content)
+    return content
+
+
+def network_of(folder: str | Path, machine: str, out: str | Path, base: str | Path | None = None) -> Path:
+    """Write the network of a machine, the fleet's with its delta, as a bundle.
+
+    Args:
+        folder: of `finetune_fleet`.
+        machine: its name.
+        out: folder of the bundle.
+        base: run folder or bundle of the fleet's network; None where ``fleet.json`` says that it lies.
+
+    Returns:
+        The folder of the bundle.
+
+    Raises:
+        ConfigError: no such machine, or one without a delta.
+        BundleError: the delta is one of another network, or damaged.
+    """
+    content = read_fleet(folder)
+    rows = {row["machine"]: row for row in content["machines"]}
+    if machine not in rows:
+        raise ConfigError(f"'{folder}' has no machine '{machine}'{closest(machine, rows)}")
+    row = rows[machine]
+    if "failed" in row:
+        raise ConfigError(f"machine '{machine}' has no network of its own: {row['failed']}")
+    bundle = load_bundle(base or content["source"])
+    delta = read_delta(Path(folder, DELTAS, file_of(machine)))
+    own = with_delta(bundle.predictor, delta)
+    provenance = {
+        **bundle.provenance,
+        "strategy": {"method": "delta", "source": {"weights": delta.base}, **delta.facts},
+    }
+    return save_bundle(replace(bundle, predictor=own, provenance=provenance, scores={}), out)
+
+
+def file_of(machine: str) -> str:
+    """Name of the file of a machine's delta: names of machines come from logs, and may be anything."""
+    return hashlib.blake2b(machine.encode(), digest_size=12).hexdigest() + SUFFIX
+
+
+def read_fleet(folder: str | Path) -> dict[str, Any]:
+    """The content of ``fleet.json``.
+
+    Raises:
+        StorageError: it is missing or damaged.
+        ConfigError: of another schema.
+    """
+    file = Path(folder, FLEET)
+    content = object_with(read_object(file), ("schema", "base", "source", "machines"), f"'{file}'")
+    if content["schema"] != SCHEMA:
+        raise ConfigError(f"'{file}' has schema {content['schema']}; this version of EDP reads {SCHEMA}: update it")
+    for row in content["machines"]:
+        object_with(row, ("machine",), f"'{file}'")
+    return content
+
+
+def _unit_of(base: SourceModel) -> str:
+    units = {KINDS[kind].report_unit for kind in base.bundle.target_kinds}
+    return units.pop() if len(units) == 1 else "mixed units"
+
+
+def _unit(machine: StoredMachine, digest: str, source: str | Path, store: str | Path, order: PersonalOrder) -> WorkUnit:
+    changes = [change if isinstance(change, str) else dict(change) for change in order.changes]
+    arguments = {
+        "machine": machine.name,
+        "base": digest,
+        "method": order.method,
+        "spec": asdict(order.spec),
+        "changes": changes,
+        "most_bytes": order.most_bytes,
+    }
+    where = {"source": str(Path(source).resolve()), "store": str(Path(store).resolve())}
+    label = f"machine '{machine.name}'"
+    return WorkUnit(f"{__name__}:tune_machine", label, arguments, " ".join(machine.digests), where)
+
+
+def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, Any]:
+    """Fine-tune for one machine; the run itself is not kept, its change is."""
+    config = identity.config
+    base = _source(where["source"], config["base"])
+    logs = MachineSource(Path(where["store"]), machine=config["machine"])
+    request = FinetuneRequest(
+        spec=FinetuneSpec(**config["spec"]), method=config["method"], changes=tuple(config["changes"])
+    )
+    try:
+        experiment = target_experiment(base, request.changes)
+        data, _ = target_data(base, logs, experiment, request)
+        with tempfile.TemporaryDirectory(prefix="edp-machine-") as folder:
+            case = TransferCase(base, logs, data, experiment, request.spec, Path(folder), lambda name, event: None)
+            network = METHODS[request.method]().make(case).network
+    except EdpError as error:
+        # A machine without usable logs must not end the fleet's run; other machines go on.
+        return {"failed": str(error)}
+    if network is None:
+        raise RuntimeError(f"method '{request.method}' left no network")
+    minutes = sum(part.samples for part in data.train) / data.task.rate_hz / 60.0
+    facts = {"machine": config["machine"], "method": request.method, "minutes": round(minutes, 3)}
+    content = delta_of(base.predictor, network, facts, config["most_bytes"]).to_bytes()
+    delta = delta_from_bytes(content, "the delta")
+    errors = {
+        "before": _errors(base.predictor, data),
+        "full": _errors(network, data),
+        "delta": _errors(with_delta(base.predictor, delta), data),
+    }
+    facts_of_delta = {"bytes": len(content), "rank": delta.rank, "trained_min": facts["minutes"]}
+    return WithState({**facts_of_delta, "mae": errors}, content)
+
+
+def _errors(network: Predictor, data: Prepared) -> float:
+    """Mean absolute error over the outputs at the first horizon, on the ends of the recordings, in report units."""
+    skip = max(network.spec.window, data.task.features.starting_ticks)
+    scores = score_predictions(stream_predictions(network, data.test), data, skip)
+    return float(scores["overall"][str(data.task.horizons[0])]["mean"]["mae"])
+
+
+@lru_cache(maxsize=1)
+def _source(path: str, digest: str) -> SourceModel:
+    """The fleet's network, once for all machines that a process tunes; `digest` tells it from another one."""
+    source = read_source(path, recordings=False)
+    if weights_digest(source.predictor) != digest:
+        raise ConfigError(f"'{path}' holds another network on this node; all nodes must see the same file there")
+    return source
+
+
+def errors_by_machine(content: Mapping[str, Any]) -> Sequence[tuple[str, float, float, float]]:
+    """Machine and errors before, after its own fine-tuning, and of its delta, of those that have one."""
+    rows = [row for row in content["machines"] if "mae" in row]
+    return [(row["machine"], row["mae"]["before"], row["mae"]["full"], row["mae"]["delta"]) for row in rows]

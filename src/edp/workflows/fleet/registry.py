@@ -1,0 +1,315 @@
+"""A registry of networks on disk: bundles and fleets of deltas, each with its lineage: which data, base and judge.
+
+A folder with ``entries/ID.json`` and ``files/ID``; an identifier is the content address of what it is of. Nothing in it
+is ever overwritten: the same network enters once, and another one has another identifier.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.errors import ConfigError, EdpError, StorageError, closest
+from edp.networks.predictor import describe
+from edp.storage import (
+    check_writable,
+    hold,
+    make_folder,
+    object_with,
+    read_bytes,
+    read_object,
+    release,
+    write_bytes,
+    write_json,
+)
+from edp.storage.runs import read_provenance
+from edp.training import Bundle, load_bundle, save_bundle
+from edp.training.bundle import weights_digest
+from edp.training.delta import MOST_BYTES, read_delta
+from edp.workflows.fleet.personal import FLEET, read_fleet
+
+ENTRIES, FILES, LOCK = "entries", "files", ".lock"
+SCHEMA = 1
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+SCORES = "scores.json"
+NETWORK, FLEET_KIND = "network", "fleet"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistryEntry:
+    """A network, or the deltas of a fleet, in a registry.
+
+    Attributes:
+        id: content address of the weights, or of all deltas.
+        kind: ``network`` or ``fleet``.
+        name: that it was given; several entries may share one, the latest is meant.
+        label: what it is, in words.
+        base: identifier of the network that it was trained on from; empty for one that began at random.
+        data: where its recordings were, their digest, count and hours, and for a fleet its machines.
+        judge: errors of the network and of the best baseline by horizon, how they were judged and on what; empty where
+            nobody judged it.
+        added: when it entered.
+        edp: version that entered it.
+    """
+
+    id: str
+    kind: str
+    name: str
+    label: str
+    base: str
+    data: Mapping[str, Any]
+    judge: Mapping[str, Any]
+    added: str
+    edp: str
+
+
+def add_to_registry(registry: str | Path, source: str | Path, name: str) -> RegistryEntry:
+    """Enter a run, a bundle, or the folder of `edp finetune --fleet`.
+
+    Args:
+        registry: folder; made where absent.
+        source: what is entered; its files are copied.
+        name: letters, digits, dots, dashes and underscores.
+
+    Returns:
+        The entry; the earlier one, under its earlier name, where the same network is there already.
+
+    Raises:
+        ConfigError: a name that is none.
+        EdpError: a source that is no network and no fleet, or a registry that cannot be written.
+    """
+    if not NAME.fullmatch(name):
+        raise ConfigError(f"'{name}' is no name of an entry; give up to 64 letters, digits, dots, dashes, underscores")
+    folder = Path(source)
+    top = check_writable(registry)
+    lock = hold(top / LOCK)
+    try:
+        if (folder / FLEET).is_file():
+            return _add_fleet(top, folder, name)
+        return _add_network(top, folder, name)
+    finally:
+        release(top / LOCK, lock)
+
+
+def _add_network(top: Path, folder: Path, name: str) -> RegistryEntry:
+    bundle = load_bundle(folder)
+    digest = weights_digest(bundle.predictor)
+    if _is_there(top, digest):
+        return read_entry(top, digest)
+    entry = RegistryEntry(
+        id=digest,
+        kind=NETWORK,
+        name=name,
+        label=describe(bundle.predictor.spec),
+        base=_base_of(bundle.provenance),
+        data=_data_of(bundle.provenance),
+        judge=_judge_of(folder, bundle),
+        added=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        edp=__version__,
+    )
+    save_bundle(bundle, make_folder(top / FILES) / digest)
+    return _entered(top, entry)
+
+
+def _add_fleet(top: Path, folder: Path, name: str) -> RegistryEntry:
+    content = read_fleet(folder)
+    names = [_plain_name(row["delta"]) for row in content["machines"] if "delta" in row]
+    files = {name: read_bytes(folder / name, MOST_BYTES) for name in names}
+    for file in files:
+        if read_delta(folder / file).base != content["base"]:
+            raise StorageError(f"'{folder / file}' is a delta of another network than '{folder / FLEET}' says")
+    state = hashlib.blake2b(digest_size=16)
+    for file in sorted(files):
+        state.update(f"{file}\0".encode() + files[file])
+    digest = state.hexdigest()
+    if _is_there(top, digest):
+        return read_entry(top, digest)
+    errors = [row["mae"] for row in content["machines"] if "mae" in row]
+    judge = {} if not errors else {
+        "judged": "ends of the machines' recordings, which did not train",
+        "unit": content["unit"],
+        "horizon": content["horizon"],
+        **{part: sum(one[part] for one in errors) / len(errors) for part in ("before", "full", "delta")},
+    }  # fmt: skip
+    entry = RegistryEntry(
+        id=digest,
+        kind=FLEET_KIND,
+        name=name,
+        label=f"{len(files)} deltas, {sum(map(len, files.values())) / 1024:,.0f} kB, method {content['method']}",
+        base=content["base"],
+        data={"source": content["store"], "machines": [row["machine"] for row in content["machines"]]},
+        judge=judge,
+        added=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        edp=__version__,
+    )
+    target = make_folder(top / FILES / digest)
+    for file, data in files.items():
+        make_folder((target / file).parent)
+        write_bytes(target / file, data)
+    write_json(target / FLEET, content)
+    return _entered(top, entry)
+
+
+def _plain_name(file: str) -> str:
+    """A file of a fleet's folder, which must not lead out of it."""
+    if not re.fullmatch(r"deltas/[0-9a-f]{24}\.delta", file):
+        raise StorageError(f"fleet.json names '{file}' for a delta, which no fine-tuning writes; it is damaged")
+    return file
+
+
+def _is_there(top: Path, digest: str) -> bool:
+    return (top / ENTRIES / f"{digest}.json").is_file()
+
+
+def _entered(top: Path, entry: RegistryEntry) -> RegistryEntry:
+    """Write an entry, last of all: its files are there when it is."""
+    write_json(make_folder(top / ENTRIES) / f"{entry.id}.json", {"schema": SCHEMA, **asdict(entry)})
+    return entry
+
+
+def _base_of(provenance: Mapping[str, Any]) -> str:
+    """Content address of the weights that a training began with."""
+    strategy = provenance.get("strategy")
+    if not isinstance(strategy, Mapping):
+        return ""
+    source = strategy.get("source")
+    weights = source.get("weights") if isinstance(source, Mapping) else strategy.get("start")
+    return str(weights or "")
+
+
+def _data_of(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    data = provenance.get("data")
+    if not isinstance(data, Mapping):
+        return {}
+    parts = [data[part] for part in ("train", "validation", "test") if isinstance(data.get(part), Mapping)]
+    return {
+        "source": str(data.get("source", "")),
+        "digest": str(data.get("digest", "")),
+        "recordings": sum(int(part.get("recordings", 0)) for part in parts),
+        "hours": round(sum(float(part.get("hours", 0.0)) for part in parts), 4),
+    }
+
+
+def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
+    """Errors of the run's own test part beside the best baseline, as ``scores.json`` has them."""
+    file = folder / SCORES
+    if not file.is_file():
+        return {}
+    scores = object_with(read_object(file), ("models", "task", "targets"), f"'{file}'")
+    try:
+        errors = {
+            name: {horizon: entry["mean"]["mae"] for horizon, entry in model["overall"].items()}
+            for name, model in scores["models"].items()
+        }
+    except (KeyError, TypeError, AttributeError) as error:
+        raise StorageError(f"'{file}' is damaged: {error}; give `edp evaluate {folder}` again") from error
+    best = {}
+    for horizon in errors.get("network", {}):
+        others = {name: by[horizon] for name, by in errors.items() if name != "network" and horizon in by}
+        best[horizon] = min(others.items(), key=lambda pair: pair[1]) if others else None
+    provenance = read_provenance(folder) if (folder / "provenance.json").is_file() else {}
+    data = provenance.get("data", {})
+    test = data.get("test", {}) if isinstance(data, Mapping) else {}
+    return {
+        "judged": "test recordings of the run",
+        "recordings": test.get("recordings"),
+        "hours": test.get("hours"),
+        "skip": scores["task"].get("skip"),
+        "unit": sorted({str(target["unit"]) for target in scores["targets"]}),
+        "mae": errors.get("network", {}),
+        "best_baseline": {horizon: None if pair is None else list(pair) for horizon, pair in best.items()},
+        "key": str(scores.get("key", "")),
+    }
+
+
+def list_registry(registry: str | Path) -> tuple[list[RegistryEntry], list[str]]:
+    """Entries, the oldest first, and what is wrong with those that are damaged.
+
+    Raises:
+        ConfigError: no registry.
+    """
+    top = Path(registry)
+    if not (top / ENTRIES).is_dir():
+        raise ConfigError(f"'{registry}' is no registry; `edp registry add {registry} RUN --name NAME` makes one")
+    entries, damaged = [], []
+    for file in sorted((top / ENTRIES).glob("*.json")):
+        try:
+            entries.append(read_entry(top, file.stem))
+        except EdpError as error:
+            damaged.append(str(error))
+    return sorted(entries, key=lambda entry: (entry.added, entry.id)), damaged
+
+
+def read_entry(registry: str | Path, digest: str) -> RegistryEntry:
+    """An entry by its identifier.
+
+    Raises:
+        StorageError: missing or damaged.
+    """
+    file = Path(registry, ENTRIES, f"{digest}.json")
+    names = [field.name for field in fields(RegistryEntry)]
+    content = object_with(read_object(file), ("schema", *names), f"'{file}'")
+    if content["schema"] != SCHEMA:
+        raise StorageError(f"'{file}' has schema {content['schema']}, {SCHEMA} is read here: update EDP")
+    texts = ("id", "kind", "name", "label", "base", "added", "edp")
+    if content["id"] != digest or not all(isinstance(content[name], str) for name in texts):
+        raise StorageError(f"'{file}' is damaged: it is no entry of '{digest}'; restore it")
+    if not isinstance(content["data"], dict) or not isinstance(content["judge"], dict):
+        raise StorageError(f"'{file}' is damaged: data and judge must be tables; restore it")
+    return RegistryEntry(**{name: content[name] for name in names})
+
+
+def find_entry(registry: str | Path, asked: str) -> RegistryEntry:
+    """An entry by its name, of several the latest, or by the beginning of its identifier.
+
+    Raises:
+        ConfigError: none, or an identifier that begins several.
+    """
+    entries, _ = list_registry(registry)
+    named = [entry for entry in entries if entry.name == asked]
+    if named:
+        return named[-1]
+    begun = [entry for entry in entries if len(asked) >= 4 and entry.id.startswith(asked)]
+    if len(begun) == 1:
+        return begun[0]
+    if begun:
+        raise ConfigError(f"'{asked}' begins {len(begun)} identifiers; give more of it")
+    raise ConfigError(f"'{registry}' has no entry '{asked}'{closest(asked, {entry.name for entry in entries})}")
+
+
+def lineage(registry: str | Path, entry: RegistryEntry) -> list[RegistryEntry | str]:
+    """Where an entry comes from: its base, the base of that, and so on; an identifier where one is not entered."""
+    steps: list[RegistryEntry | str] = []
+    seen = {entry.id}
+    while entry.base:
+        if entry.base in seen or not _is_there(Path(registry), entry.base):
+            steps.append(entry.base)
+            break
+        entry = read_entry(registry, entry.base)
+        seen.add(entry.id)
+        steps.append(entry)
+    return steps
+
+
+def check_entry(registry: str | Path, entry: RegistryEntry) -> None:
+    """Hold the files of an entry to its identifier.
+
+    Raises:
+        EdpError: they are missing, damaged, or others.
+    """
+    folder = Path(registry, FILES, entry.id)
+    if entry.kind == NETWORK:
+        if weights_digest(load_bundle(folder).predictor) != entry.id:
+            raise StorageError(f"'{folder}' holds another network than its entry; restore it")
+        return
+    state = hashlib.blake2b(digest_size=16)
+    for file in sorted(folder.glob("deltas/*.delta")):
+        state.update(f"deltas/{file.name}\0".encode() + read_bytes(file, MOST_BYTES))
+    if state.hexdigest() != entry.id:
+        raise StorageError(f"'{folder}' holds other deltas than its entry; restore it")

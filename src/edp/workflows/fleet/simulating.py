@@ -1,0 +1,75 @@
+"""`edp simulate` by many processes or nodes: a unit a recording, which whoever simulates it writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+from edp.logs import WriteOptions, write_recording
+from edp.sim.data_set import Simulated, SimulationOrder, simulate_data_set
+from edp.sim.scenario import Scenario, plain
+from edp.sim.simulate import simulate
+from edp.storage.ledger import TrainingIdentity
+from edp.workflows.executors import Workforce
+from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
+
+
+def simulate_with(
+    workforce: Workforce,
+    out: str | Path,
+    order: SimulationOrder,
+    on_done: Callable[[Simulated, bool], None] | None = None,
+) -> list[Path]:
+    """As `edp.sim.data_set.simulate_data_set`, by a workforce.
+
+    Logs do not depend on who writes them: each scenario carries its own seed. One whose writer was killed is written
+    by another; what is in the folder stays.
+
+    Args:
+        workforce: who simulates; nodes see the folder under the same path.
+        out: folder.
+        order: what to simulate.
+        on_done: called with each recording and whether it was there already.
+
+    Raises:
+        StorageError: as `simulate_data_set`, or the nodes do not see the folder.
+    """
+
+    def elsewhere(missing: Sequence[Scenario], folder: Path, wrote: Callable[[Simulated], None]) -> None:
+        units = [_unit(scenario, folder, order) for scenario in missing]
+        by_name = {scenario.name: scenario for scenario in missing}
+
+        def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
+            scenario = by_name[str(result.values["name"])]
+            if not (folder / f"{scenario.name}{order.suffix}").exists():
+                raise StorageError(
+                    f"'{scenario.name}' was written on another node, and is not in '{folder.resolve()}' here; give a "
+                    "folder that all nodes see under the same path"
+                )
+            wrote(scenario)
+
+        run_units(units, workforce, on_done=note)
+
+    return simulate_data_set(out, order, on_done=on_done, elsewhere=elsewhere)
+
+
+def _unit(scenario: Scenario, folder: Path, order: SimulationOrder) -> WorkUnit:
+    arguments = {"scenario": plain(scenario), "suffix": order.suffix, "files": asdict(order.files())}
+    return WorkUnit(
+        f"{__name__}:write_one", f"recording '{scenario.name}'", arguments, where={"folder": str(folder.resolve())}
+    )
+
+
+def write_one(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any]:
+    """Simulate a recording and write its log, unless somebody has: the folder is bound to one order."""
+    scenario = Scenario(**identity.config["scenario"])
+    folder = Path(where["folder"])
+    if not folder.is_dir():
+        raise StorageError(f"'{folder}' is not on this node; give a folder that all nodes see under the same path")
+    path = folder / f"{scenario.name}{identity.config['suffix']}"
+    if not path.exists():
+        write_recording(simulate(scenario), path, WriteOptions(**identity.config["files"]))
+    return {"name": scenario.name}

@@ -1,0 +1,156 @@
+"""Commands on a real Ray cluster of three nodes, one of which is killed in the middle: what one process gives."""
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from ray_nodes import needs_ray, three_nodes
+
+from edp.config.experiment import load_experiment
+from edp.errors import ConfigError
+from edp.logs.source import DataSource
+from edp.logs.store import read_store
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.training import load_bundle
+from edp.training.bundle import weights_digest
+from edp.workflows.executors import Workforce, cluster
+from edp.workflows.feature_selection.select import SelectionOrder, select_features
+from edp.workflows.fleet.inspecting import inspect_with
+from edp.workflows.fleet.judging import evaluate_with
+from edp.workflows.fleet.simulating import simulate_with
+from edp.workflows.fleet.storing import store_with
+from edp.workflows.fleet.training import finetune_with, pretrain_with
+from edp.workflows.pretraining import Pretrain
+from edp.workflows.train_evaluate import evaluate
+from edp.workflows.transfer import FinetuneRequest, FinetuneSpec
+
+SETTINGS = (
+    'split.kind="machines"',
+    "task.horizons=[10]",
+    "training.epochs=2",
+    "training.updates=8",
+    'training.chunks={regime="chunk",length=40,batch=4,burn_in=20}',
+    'model.backbone={kind="lstm",units=4}',
+    "model.head.hidden=4",
+    "model.window=20",
+    "judge.history=10",
+    'judge.baselines=["persistence","ridge_arx","small_mlp"]',
+)
+ORDER = SimulationOrder(minutes=1.8, recordings=6, seed=5, family=3)
+
+
+class Plug:
+    """Kills the third node when something happened for the first time, and puts a new one in its place afterwards."""
+
+    def __init__(self, nodes):
+        self.nodes, self.pulled = nodes, 0
+
+    def pull(self, *_):
+        if not self.pulled:
+            self.pulled = 1
+            self.nodes.kill(len(self.nodes.groups) - 1)
+
+    def mend(self):
+        import ray
+
+        assert self.pulled
+        self.pulled = 0
+        ray.init(address=self.nodes.address, log_to_driver=False)
+        until = time.monotonic() + 120
+        while ray.cluster_resources().get("CPU", 0) > 2 and time.monotonic() < until:
+            time.sleep(0.5)  # until the loss is noticed
+        self.nodes.join(3)
+        ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def nodes():
+    with pytest.MonkeyPatch.context() as patch, three_nodes(patch, Path(__file__).parent) as running:
+        yield running
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_every_command_survives_a_killed_node_with_the_results_of_one_process(nodes, tmp_path):
+    there, plug = Workforce(cluster=nodes.address), Plug(nodes)
+    one = tmp_path / "one"
+    paths = simulate_data_set(one / "logs", ORDER, workers=1)
+    made = simulate_with(there, tmp_path / "logs", ORDER, plug.pull)
+    assert [path.read_bytes() for path in made] == [path.read_bytes() for path in paths]
+    plug.mend()
+
+    source = DataSource.of(one / "logs")
+    store_with(there, source, tmp_path / "store", lambda progress: progress.logs and plug.pull())
+    source.store(one / "store", 1)
+    digests = [[entry.digest for entry in read_store(folder / "store")] for folder in (tmp_path, one)]
+    assert digests[0] == digests[1]
+    plug.mend()
+
+    stored = DataSource.of(one / "store")
+    assert inspect_with(there, stored, None, plug.pull).quality == stored.inspect()
+    plug.mend()
+
+    looked = []
+
+    def inspected(data, on_log):
+        looked.append(data)
+        return inspect_with(there, data, None, plug.pull).quality
+
+    order = SelectionOrder(pictures=False)
+    apart = select_features(stored, tmp_path / "screen", order, inspected=inspected)
+    together = select_features(stored, one / "screen", order)
+    assert apart.screening.proposal.kept == together.screening.proposal.kept
+    assert len(looked) == 1
+    plug.mend()
+
+    experiment = load_experiment(preset="quick", overrides=SETTINGS)
+    started = threading.Thread(target=_pull_when, args=(tmp_path / "run" / "config.toml", plug))
+    started.start()
+    found = pretrain_with(there, stored, experiment, Pretrain(), tmp_path / "run")
+    started.join()
+    usual = pretrain_with(Workforce(), stored, experiment, Pretrain(), one / "run")
+    assert found == usual
+    assert _digest(tmp_path / "run") == _digest(one / "run")
+    plug.mend()
+
+    scored = evaluate_with(there, tmp_path / "run", on_step=plug.pull)
+    evaluate(one / "run")
+    assert _scores(scored) == _scores(one / "run")
+    plug.mend()
+
+    tuned = FinetuneRequest(spec=FinetuneSpec(rounds=2, batch=4), method="full", baselines=("low_rank", "linear_probe"))
+    logs = DataSource.of(paths[0])
+    started = threading.Thread(target=_pull_when, args=(tmp_path / "tuned" / "config.toml", plug))
+    started.start()
+    found = finetune_with(there, tmp_path / "run", logs, tuned, tmp_path / "tuned")
+    started.join()
+    usual = finetune_with(Workforce(), one / "run", logs, tuned, one / "tuned")
+    assert json.dumps(found["methods"]) == json.dumps(usual["methods"])
+
+
+def _pull_when(file, plug):
+    until = time.monotonic() + 600
+    while not file.exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    plug.pull()
+
+
+def _digest(run):
+    return weights_digest(load_bundle(run).predictor)
+
+
+def _scores(folder):
+    models = json.loads((folder / "scores.json").read_text())["models"]
+    return {name: model["overall"] for name, model in models.items()}
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_node_with_another_version_is_refused_with_one_error(nodes, monkeypatch):
+    monkeypatch.setattr(cluster, "code_version", lambda whole: "0.0.9+another")  # here; nodes have their own
+    with pytest.raises(ConfigError, match=r"node .* has other code or versions: code .*install the same there"):
+        Workforce(cluster=nodes.address).open()

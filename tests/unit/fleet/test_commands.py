@@ -1,0 +1,100 @@
+"""Commands in units give what the commands give in one process, to the bit."""
+
+import json
+
+import numpy as np
+import pytest
+
+from edp.data.coverage import Coverage
+from edp.errors import ConfigError
+from edp.logs.source import DataSource
+from edp.logs.store import read_store
+from edp.workflows.executors import Workforce
+from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
+from edp.workflows.fleet.simulating import simulate_with
+from edp.workflows.fleet.storing import store_with
+from edp.workflows.train_evaluate import coverage
+
+
+def test_simulated_logs_are_the_same_and_a_stopped_set_goes_on(small_logs, small_order, here, tmp_path):
+    seen = []
+
+    def on_done(recording, kept):
+        seen.append((recording.name, kept))
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_with(here, tmp_path / "logs", small_order, on_done)
+    assert len(list((tmp_path / "logs").glob("*.parquet"))) == 2
+    seen.clear()
+    paths = simulate_with(here, tmp_path / "logs", small_order, lambda recording, kept: seen.append(kept))
+    assert sorted(seen) == [False, False, True, True]
+    for path in paths:
+        assert path.read_bytes() == (small_logs / path.name).read_bytes()
+
+
+def test_a_store_built_in_units_holds_the_same_recordings_and_reads_nothing_twice(small_logs, here, tmp_path):
+    source = DataSource.of(small_logs)
+    told = []
+    index = store_with(here, source, tmp_path / "store", told.append)
+    assert index.hours() == pytest.approx(0.01)
+    assert [progress.logs for progress in told][-1] == 4
+    DataSource.of(small_logs).store(tmp_path / "usual", 1)
+    for ours, usual in zip(read_store(tmp_path / "store"), read_store(tmp_path / "usual"), strict=True):
+        assert (ours.name, ours.digest, dict(ours.meta)) == (usual.name, usual.digest, dict(usual.meta))
+        np.testing.assert_array_equal(ours.values, usual.values)
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "store" / "rows").iterdir()}
+    store_with(here, source, tmp_path / "store")
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "store" / "rows").iterdir()} == before
+
+
+def test_logs_that_cannot_be_read_are_refused_as_in_one_process(small_logs, here, tmp_path):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for log in sorted(small_logs.glob("*.parquet"))[:2]:
+        (folder / log.name).write_bytes(log.read_bytes())
+    (folder / "bad.parquet").write_bytes(b"PAR1 and nothing else")
+    index = store_with(here, DataSource.of(folder), tmp_path / "store")
+    usual = DataSource.of(folder).store(tmp_path / "usual", 1)
+    assert index.refused == usual.refused
+    assert len(index.recordings) == 2
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="is no store and not empty"):
+        store_with(here, DataSource.of(folder), tmp_path / "full")
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_an_inspection_in_units_is_that_of_one_process(small_logs, here, tmp_path, stored):
+    source = DataSource.of(small_logs)
+    if stored:
+        source.store(tmp_path / "store", 1)
+        source = DataSource.of(tmp_path / "store")
+    told = []
+    found = inspect_with(here, source, CoverageOrder(), lambda path, number, count: told.append((number, count)))
+    usual = source.inspect()
+    assert found.quality.reports == usual.reports
+    assert found.quality == usual
+    assert isinstance(found.coverage, Coverage)
+    assert json.dumps(found.coverage.to_json()) == json.dumps(coverage(source).to_json())
+    assert told[-1][0] == told[-1][1]
+
+
+def test_a_coverage_that_cannot_be_told_says_why(small_logs, here):
+    found = inspect_with(here, DataSource.of(small_logs), CoverageOrder(("no_such_channel",)))
+    assert found.coverage is None
+    assert "no_such_channel" in found.why
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_same_logs_store_and_inspection(small_logs, small_order, tmp_path):
+    two = Workforce(workers=2)
+    for path in simulate_with(two, tmp_path / "logs", small_order):
+        assert path.read_bytes() == (small_logs / path.name).read_bytes()
+    source = DataSource.of(small_logs)
+    index = store_with(two, source, tmp_path / "store")
+    usual = source.store(tmp_path / "usual", 1)
+    assert [entry.digest for entry in index.recordings] == [entry.digest for entry in usual.recordings]
+    assert inspect_with(two, source).quality == source.inspect()

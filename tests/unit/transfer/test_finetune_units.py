@@ -1,0 +1,51 @@
+"""Methods of a fine-tuning, and models of an evaluation, as units of work: the same numbers as in one process."""
+
+import json
+import shutil
+
+import pytest
+
+from edp.errors import BundleError
+from edp.workflows.executors import Workforce
+from edp.workflows.fleet.judging import UNITS, evaluate_with
+from edp.workflows.fleet.training import finetune_with
+from edp.workflows.train_evaluate import evaluate
+from edp.workflows.transfer import FinetuneCallbacks, FinetuneRequest, finetune
+
+
+def without_times(value):
+    """A table without what differs from repeat to repeat."""
+    if isinstance(value, dict):
+        return {key: without_times(part) for key, part in value.items() if key not in ("seconds", "key", "created")}
+    return [without_times(part) for part in value] if isinstance(value, list) else value
+
+
+def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small, tmp_path):
+    order = FinetuneRequest(spec=small, method="full", baselines=("low_rank", "ridge_arx"))
+    notes = []
+    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", FinetuneCallbacks(on_note=notes.append))
+    here = finetune(run, target, order, tmp_path / "here")
+    assert json.dumps(without_times(there)) == json.dumps(without_times(here))
+    assert [note for note in notes if note.startswith("trained:")] == [
+        "trained: full, 1 of 2",
+        "trained: low_rank, 2 of 2",
+    ]
+    with pytest.raises(BundleError):
+        finetune_with(Workforce(), tmp_path / "nothing", target, order, tmp_path / "no")
+    assert not (tmp_path / "no").exists()
+
+
+def test_models_run_apart_have_the_scores_of_one_process(run, target, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    names = ("persistence", "ridge_arx", "small_mlp")
+    told = []
+    for source in (None, target):
+        folder = evaluate_with(Workforce(), tmp_path / "run", source, names, told.append)
+        there = json.loads((folder / "scores.json").read_text())
+        (folder / "scores.json").unlink()
+        here = json.loads((evaluate(tmp_path / "run", source, names) / "scores.json").read_text())
+        assert without_times(there) == without_times(here)
+        assert list(there["models"]) == list(here["models"])
+        assert there["key"] == here["key"]
+    assert told[-1] == "network, 4 of 4"
+    assert not (tmp_path / "run" / UNITS).exists()
