@@ -74,9 +74,9 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
         speeds = twin.channels.parts["velocities"]
         for row, gain in enumerate(GAINS):
             answers = forecast(twin, commands, measured, ends, gain)[..., speeds]
-            for place, k in enumerate(ends):
-                apart = (answers[:-k, place] - measured[k:, speeds]) / twin.scales.answer_width[speeds]
-                errors[row, place] += np.nansum(np.abs(apart))
+            for at, k in enumerate(ends):
+                apart = (answers[:-k, at] - measured[k:, speeds]) / twin.scales.answer_width[speeds]
+                errors[row, at] += np.nansum(np.abs(apart))
     if not errors.any():
         return GAINS[0]
     # Errors of near and far horizons differ by a factor: each is taken in shares of the best.
@@ -123,10 +123,10 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
 
 def _ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: int) -> Array:
     """Free runs from each state with its command held ``(moment, tick, answer)``."""
-    held = np.repeat(commands[:, None], ticks, axis=1)
+    constant_commands = np.repeat(commands[:, None], ticks, axis=1)
     fed = np.full((len(commands), ticks, ports.shape[1]), np.nan, np.float32)
     fed[:, 0] = ports
-    return twin.rollout(held, states, fed)[0]
+    return twin.rollout(constant_commands, states, fed)[0]
 
 
 def _stacked(states: Sequence[TwinState]) -> TwinState:

@@ -97,8 +97,8 @@ def forecast_logs(
 def _chosen_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
     """A gain by logs from which the twin learned; where none of these is among the logs, by the first ones."""
     parts = bundle.provenance.get("data", {}).get("names", {})
-    known = {name for part in ("train", "validation") for name in parts.get(part, ())}
-    chosen = [logged for logged in recordings if logged.name in known] or list(recordings)
+    learned_names = {name for part in ("train", "validation") for name in parts.get(part, ())}
+    chosen = [logged for logged in recordings if logged.name in learned_names] or list(recordings)
     task = bundle.twin.channels.task()
     series = [task.series(_checked(bundle.twin, logged)) for logged in chosen[:CHOICE_LOGS]]
     return choose_gain(bundle.twin, series, horizons)
@@ -163,10 +163,10 @@ def _extended(
 ) -> Recording:
     """The recording with its forecasts behind its own channels."""
     added = _channels(twin, horizons, columns)
-    taken = [channel.name for channel in added if channel.name in recording.channel_names]
-    if taken:
+    doubled = [channel.name for channel in added if channel.name in recording.channel_names]
+    if doubled:
         raise DataError(
-            f"recording '{recording.name}' ({recording.source}) has a channel '{taken[0]}' already; give the logs as "
+            f"recording '{recording.name}' ({recording.source}) has a channel '{doubled[0]}' already; give the logs as "
             "they were before they had forecasts"
         )
     whole = np.concatenate([recording.values, values.reshape(len(values), -1)], axis=1, dtype=np.float32)
@@ -178,13 +178,13 @@ def _errors(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """For each horizon, sums of absolute errors of forecast and present value ``(column,)``, and how many count."""
     sums = []
-    for place, k in enumerate(horizons):
+    for at, k in enumerate(horizons):
         truth = measured[prefix + k :]
-        pair = np.stack([values[prefix : len(values) - k, place], measured[prefix : len(measured) - k]])
+        pair = np.stack([values[prefix : len(values) - k, at], measured[prefix : len(measured) - k]])
         apart = np.abs(pair[:, : len(truth)] - truth).astype(np.float64)
-        known = np.isfinite(apart).all(axis=0)
-        ours, present = np.where(known, apart, 0.0).sum(axis=1)
-        sums.append((ours, present, known.sum(axis=0)))
+        finite = np.isfinite(apart).all(axis=0)
+        ours, present = np.where(finite, apart, 0.0).sum(axis=1)
+        sums.append((ours, present, finite.sum(axis=0)))
     return sums
 
 
@@ -196,8 +196,8 @@ def _scores(
 ) -> dict[str, Any]:
     forecast_channels = [twin.channels.answers[column] for column in columns]
     rows: dict[str, Any] = {}
-    for place, k in enumerate(horizons):
-        ours, present, counted = (sum(each) for each in zip(*(log[place] for log in errors), strict=True))
+    for at, k in enumerate(horizons):
+        ours, present, counted = (sum(each) for each in zip(*(log[at] for log in errors), strict=True))
         row: dict[str, Any] = {"ticks": k, "seconds": k / twin.channels.rate_hz, "moments": int(np.min(counted))}
         for name, total in (("twin", ours), ("persistence", present)):
             row[name] = by_channel(forecast_channels, np.divide(total, np.maximum(counted, 1)))
