@@ -15,9 +15,12 @@ from edp.errors import DataError, EdpError
 
 if TYPE_CHECKING:
     from edp.data.coverage import Coverage
+    from edp.logs import DataQuality
     from edp.logs.source import DataSource
     from edp.workflows.fleet.inspecting import Inspection
 
+SETTINGS = "settings.toml"
+"""What `edp init` writes beside a map."""
 # Scripts can tell unusable data by the exit code.
 FAULTY = 3
 
@@ -95,11 +98,10 @@ def inspect(
         if coverage_facts is not None and page is not None:
             out.print(f"page: {page.resolve()}")
         out.print(verdict_text(quality))
-        if quality.proposed:
+        if quality.proposed or (errors and signal_map is None and _undescribed(quality)):
             out.print(f"next: edp init {data}, which writes a signal map and settings; then edp train with both")
         elif not errors:
-            mapped = "" if signal_map is None else f" --map {signal_map}"
-            out.print(f"next: edp train {data}{mapped} --out runs/first")
+            out.print(f"next: {_training(data, signal_map)}")
 
     covers = None
     if coverage_facts is not None:
@@ -110,6 +112,21 @@ def inspect(
     if errors:
         err.print("see the advice beside each error, or ask for a repair with --repair when training")
         raise typer.Exit(FAULTY)
+
+
+def _undescribed(quality: DataQuality) -> bool:
+    """Whether no channel of a log was taken, which a signal map mends."""
+    return any(not report.channels for report in quality.reports)
+
+
+def _training(data: Path, signal_map: Path | None) -> str:
+    """The command that trains: with the settings of `edp init` where they lie beside its map or data-set file."""
+    described = signal_map or (data if data.suffix == ".toml" else None)
+    settings = None if described is None else described.parent / SETTINGS
+    mapped = "" if signal_map is None else f" --map {signal_map}"
+    if settings is None or not settings.is_file():
+        return f"edp train {data}{mapped} --out runs/first"
+    return f"edp train {data}{mapped} --config {settings} --out {settings.parent / 'runs' / 'first'}"
 
 
 def _coverage(
@@ -178,19 +195,24 @@ def show_coverage(coverage: Coverage, whole: bool = True) -> None:
 def _show_all_coverage(coverage: Coverage) -> None:
     """Print commands, events and joint histograms."""
     moves = [(a.axis, *(_count(v) for v in (a.reversals, a.crossings)), _share(a.active)) for a in coverage.activity]
-    table("commands", ["axis", "reversals", "dead-band crossings", "time active"], moves)
-    out.print()
-    if coverage.together:
-        table("in use at once", ["", "time"], [(name, _share(share)) for name, share in coverage.together.items()])
-        out.print()
-    counted = [(e.name, _count(e.count), _share(e.share), e.note) for e in coverage.events]
-    table("events", ["", "count", "time", "note"], counted)
-    out.print()
+    together = [(name, _share(share)) for name, share in coverage.together.items()]
+    # Where nothing is counted, a table of what could be would tell nothing of this log.
+    counts = coverage.events if any(e.count is not None for e in coverage.events) or moves else ()
+    counted = [(e.name, _count(e.count), _share(e.share), e.note) for e in counts]
     pairs = [
         (f"{j.group}: {j.x}", j.y, _share(j.filled), f"{j.correlation:.2f}", f"{j.information:.2f}")
         for j in coverage.joints
     ]
-    table("joint histograms", ["", "with", "bins filled", "correlation", "mutual information, nat"], pairs)
+    tables: list[tuple[str, list[str], Any]] = [
+        ("commands", ["axis", "reversals", "dead-band crossings", "time active"], moves),
+        ("in use at once", ["", "time"], together),
+        ("events", ["", "count", "time", "note"], counted),
+        ("joint histograms", ["", "with", "bins filled", "correlation", "mutual information, nat"], pairs),
+    ]
+    for title, headings, rows in tables:
+        if rows:
+            table(title, headings, rows)
+            out.print()
 
 
 def _verdict(met: bool) -> str:

@@ -74,14 +74,15 @@ def show_lines(quality: DataQuality) -> None:
         rows.append([report.name, *figures])
     table("", ["log", "s", "Hz", "channels", "errors", "warnings", "notes", "verdict"], rows)
     out.print()
-    kinds: dict[tuple[str, str | None, str], list[tuple[str, Finding]]] = {}
+    kinds: dict[tuple[str, str | None, str, str], list[tuple[str, Finding]]] = {}
     for report in quality.reports:
         for finding in report.findings:
             # The same finding has other numbers in each log.
             what = _NUMBER.sub("#", finding.what.replace(report.source, ""))
-            kinds.setdefault((finding.severity, finding.channel, what), []).append((report.name, finding))
+            advice = _NUMBER.sub("#", finding.advice)
+            kinds.setdefault((finding.severity, finding.channel, what, advice), []).append((report.name, finding))
     for severity in ("error", "warning", "note"):
-        chosen = [each for (of, _, _), each in kinds.items() if of == severity]
+        chosen = [each for (of, *_), each in kinds.items() if of == severity]
         if severity == "note" and chosen:
             out.print(f"  {len(chosen)} kind(s) of notes; --details shows them")
             break

@@ -171,6 +171,7 @@ def cover(
         )
     absent: list[str] = []
     moving, constant = _inputs(recordings, roles)
+    axes = _known_axes(first, roles, absent)
     occupancy = _occupancy(recordings, roles.axes, absent)
     if not roles.inputs:
         absent.append("excitation: no channel is known to command; name the inputs")
@@ -183,14 +184,28 @@ def cover(
         constant,
         _spectrum(recordings, roles),
         occupancy,
-        tuple(_joints(recordings, roles.axes, absent)),
-        events.activity_of(recordings, roles.axes, dead_band),
-        events.together(recordings, roles.axes, dead_band),
+        tuple(_joints(recordings, axes, absent)) if axes else (),
+        events.activity_of(recordings, axes, dead_band),
+        events.together(recordings, axes, dead_band),
         events.events_of(recordings, None if occupancy is None or not occupancy.full_stroke else _ends(occupancy)),
         None if split is None else split_distance(recordings, roles.axes, split),
         tuple(absent),
         tuple(_contradictions(recordings, roles.axes)),
     )
+
+
+def _known_axes(first: Recording, roles: Roles, absent: list[str]) -> tuple[Axis, ...]:
+    """The axes of which something is known to move; numbers of no kind may be anything, and are named as absent."""
+    kinds = {channel.name: channel.kind for channel in first.channels}
+    unknown = [axis.velocity for axis in roles.axes if kinds.get(axis.velocity) is Kind.GENERIC]
+    if not unknown:
+        return roles.axes
+    named = ", ".join(unknown[:3]) + (", ..." if len(unknown) > 3 else "")
+    absent.append(
+        f"reversals, time active and joint histograms: {named} are numbers of no kind (generic); give those that move "
+        "a kind in the signal map (velocity, position, pressure, ...)"
+    )
+    return tuple(axis for axis in roles.axes if axis.velocity not in unknown)
 
 
 def _contradictions(recordings: Sequence[Recording], axes: Sequence[Axis]) -> Iterator[str]:

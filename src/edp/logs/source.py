@@ -13,9 +13,9 @@ import numpy as np
 from edp.errors import ConfigError, DataError
 from edp.logs.detect import known_suffixes
 from edp.logs.quality.cross_recording import DataQuality, compare
-from edp.logs.quality.inspection import look_into
-from edp.logs.quality.quality import inspect
-from edp.logs.quality.repeats import sketch
+from edp.logs.quality.inspection import look_into, unreadable
+from edp.logs.quality.quality import QualityReport, inspect
+from edp.logs.quality.repeats import Sketch, sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
 from edp.logs.store.building import StoredLog, StoreProgress, build_store
@@ -36,6 +36,7 @@ class RecordingEntry:
         rows: ``[start, stop]`` to use a part of the log.
         map: signal map for this log: a table, or the path of a map file; the data set's map by default.
         machine: which machine was recorded, where parts are divided by machine.
+        repair: what may be repaired of this log; what the data set allows by default.
     """
 
     path: str
@@ -43,6 +44,7 @@ class RecordingEntry:
     rows: tuple[int, int] | None = None
     map: str | SignalMap | None = None
     machine: str = ""
+    repair: Repair | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,16 +127,23 @@ class DataSource:
             on_log: called with the path of each log before it is read, its number from 1, and how many there are.
 
         Raises:
-            DataError: a file that cannot be read at all.
+            DataError: none of the files can be read at all; where some can, each of the others has an error.
         """
         if self.stored:
             return self._inspect_store(on_log)
         logs = self.logs()
-        seen = []
+        seen: list[tuple[QualityReport, Sketch | None]] = []
+        broken: list[DataError] = []
         for i, log in enumerate(logs):
             if on_log is not None:
                 on_log(log.path, i + 1, len(logs))
-            seen.append(look_into(log.path, log.signal_map, log.name, log.rows))
+            try:
+                seen.append(look_into(log.path, log.signal_map, log.name, log.rows, log.repair))
+            except DataError as error:
+                broken.append(error)
+                seen.append((unreadable(log.path, error), None))
+        if len(broken) == len(logs) and broken:
+            raise broken[0]
         # Before they are compared: a finding on two recordings must tell which is which.
         names = unique_names([report.name for report, _ in seen], [log.path for log in logs])
         reports = [replace(report, name=name) for (report, _), name in zip(seen, names)]
@@ -234,13 +243,13 @@ def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> 
     def resolved(entry: str | SignalMap | None) -> SignalMap | None:
         return load_signal_map(path.parent / entry) if isinstance(entry, str) else entry
 
-    shared, allowed = signal_map or resolved(settings.map), repair or settings.repair
+    shared = signal_map or resolved(settings.map)
     return [
         # An absolute path stands for itself.
         Log(
             path.parent / _expanded(entry.path, path),
             resolved(entry.map) or shared,
-            allowed,
+            repair or entry.repair or settings.repair,
             entry.name,
             entry.rows,
             entry.machine,

@@ -15,15 +15,15 @@ import tomli_w
 from edp.data.even_split import blocks_where_time_is_uneven
 from edp.data.splits import ByTime
 from edp.errors import ConfigError, DataError, StorageError
-from edp.logs.proposal.columns import LogColumn, LogLook
+from edp.logs.proposal.columns import LogLook
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
+from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings, unique_names
 from edp.logs.source import map_of_table
-from edp.logs.timebase import judge
 from edp.recording import Recording
 from edp.settings.tree import parse_toml
-from edp.signals import TIME_UNITS, VOCABULARY, Channel, Kind, SignalMap
+from edp.signals import VOCABULARY, Channel, Kind, SignalMap
 from edp.storage import make_folder, write_bytes
 
 MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
@@ -84,8 +84,13 @@ class LogsProposal:
             data, mapped = _quoted(folder / DATA), ""
         repair = "".join(f" --repair {one}" for one in self.repairs)
         run = _quoted(folder / "runs" / "first")
+        # Where no kind tells which channels command, the coverage of the logs is seen only if they are named.
+        commands = self.proposal.of_role("command")
+        named = ",".join(guess.channel for guess in commands)
+        plain = not any(guess.kind.kind is not Kind.GENERIC for guess in commands) and named.count(",") < len(commands)
+        inputs = "" if not plain or not commands else f" --inputs {shlex.quote(named)}"
         return [
-            f"edp inspect {data}{mapped}",
+            f"edp inspect {data}{mapped}{inputs}",
             f"edp train {data}{mapped} --config {_quoted(folder / SETTINGS)} --out {run}{repair}",
             f"edp evaluate {run}",
             f"edp report {run}",
@@ -112,11 +117,12 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     paths = find_recordings(source)
     groups, broken = group_logs(paths, on_log)
     group, others = groups[0], tuple(groups[1:])
-    proposal = propose_map(group.looks[0], group.common)
+    proposal = propose_map(group.looks[0], group.common, group.looks[1:])
     pairs = _side_by_side(proposal)
     if pairs:
         return _of_pairs(source, group, others, broken, proposal, pairs)
-    notes = _notes(group, others, broken, proposal)
+    proposal, timing = _timed(group, proposal)
+    notes = [*_notes(group, others, broken, proposal), *timing.notes]
     targets, more = _targets(proposal)
     notes += more
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
@@ -129,11 +135,27 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         MAP: _text(_map_table(proposal.signal_map), _remarks(source, proposal)),
         SETTINGS: _settings(proposal, channels, targets, split),
     }
-    if others or broken:
-        files[DATA] = _data_set([{"path": _listed(one), "name": name} for one, name in _named(group.paths)], MAP)
+    repairs = timing.shared
+    apart = timing.apart
+    if others or broken or apart:
+        recordings = [
+            {"path": _listed(one), "name": name} | ({"repair": repair_table(apart[one])} if one in apart else {})
+            for one, name in _named(group.paths)
+        ]
+        files[DATA] = _data_set(recordings, MAP, repair_table(repairs) if apart else {})
     _check(files)
-    repairs = repairs_of(proposal)
+    repairs = () if apart else repairs
     return LogsProposal(source, group, others, broken, proposal, files, targets, repairs, tuple(notes))
+
+
+def _timed(group: LogGroup, proposal: MapProposal) -> tuple[MapProposal, Timing]:
+    """A proposal with one rate where its logs have several, and the repairs that they need."""
+    mapped = [guess.column for guess in proposal.columns if guess.channel]
+    timing = timing_of(group.looks, proposal.clock, mapped)
+    if timing.rate_hz is None:
+        return proposal, timing
+    clock = replace(proposal.clock, wanted_hz=timing.rate_hz)
+    return replace(proposal, clock=clock, signal_map=replace(proposal.signal_map, rate_hz=timing.rate_hz)), timing
 
 
 def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool = False) -> list[Path]:
@@ -154,30 +176,6 @@ def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool =
     for path, text in zip(paths, proposal.files.values()):
         write_bytes(path, text.encode())
     return paths
-
-
-def repairs_of(proposal: MapProposal) -> tuple[str, ...]:
-    """Repairs without which training refuses what was looked at of a log."""
-    columns = {column.name: column for column in proposal.look.columns}
-    mapped = [columns[guess.column] for guess in proposal.columns if guess.channel]
-    repairs = ["nan=hold"] if any(not np.isfinite(column.values).all() for column in mapped) else []
-    time = columns.get(proposal.clock.column or "")
-    return (*repairs, *([] if time is None else _repairs_of_time(time, TIME_UNITS[proposal.clock.unit])))
-
-
-def _repairs_of_time(time: LogColumn, factor: float) -> list[str]:
-    """Repairs of stamps, by the rule with which a log is read."""
-    repairs = set()
-    for piece in time.pieces:
-        try:
-            clock = judge(piece * factor, time.name)
-        except DataError:  # which inspection and training name in their words
-            continue
-        if not clock.uniform:
-            repairs |= {"falling=sort"} if len(clock.falling) else set()
-            repairs |= {"duplicates=last"} if len(clock.duplicates) else set()
-            repairs |= {"gaps=hold"} if len(clock.gaps) else set()
-    return sorted(repairs)
 
 
 def horizons_for(rate_hz: float | None) -> tuple[int, int]:
@@ -327,10 +325,13 @@ def _named(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     return list(zip(usable, unique_names([path.stem for path in usable], usable)))
 
 
-def _data_set(recordings: list[dict[str, Any]], map_file: str | None = None) -> str:
+def _data_set(
+    recordings: list[dict[str, Any]], map_file: str | None = None, repair: dict[str, str] | None = None
+) -> str:
     if not recordings:
         raise DataError("no path of these logs can be listed in a file ($ or unprintable characters); rename them")
-    table: dict[str, Any] = ({"map": map_file} if map_file else {}) | {"recordings": recordings}
+    table: dict[str, Any] = ({"map": map_file} if map_file else {}) | ({"repair": repair} if repair else {})
+    table["recordings"] = recordings
     return _text(table, ["Proposed by edp init: the logs with one set of columns."])
 
 
@@ -387,6 +388,7 @@ def _of_pairs(
     renamed_columns = tuple(replace(guess, channel=stem) for stem, guess in pairs[train].items())
     renamed_proposal = replace(proposal, columns=renamed_columns)
     targets, notes = _targets(renamed_proposal)
+    repairs = _timed(group, proposal)[1].shared
     channels = [guess.channel for guess in renamed_proposal.of_role("reference", "command", "measured")]
     tests = [str(one["name"]) for one in recordings if str(one["name"]).endswith(f"_{test}")]
     files = {
@@ -396,4 +398,4 @@ def _of_pairs(
     _check(files)
     notes += _notes(group, others, broken, proposal)
     notes.append(f"two experiments stand side by side: columns of '{train}' train, those of '{test}' test")
-    return LogsProposal(source, group, others, broken, proposal, files, targets, repairs_of(proposal), tuple(notes))
+    return LogsProposal(source, group, others, broken, proposal, files, targets, repairs, tuple(notes))

@@ -41,6 +41,10 @@ def load_column(table: ColumnTable, name: str, samples: int) -> Column:
     return np.concatenate(parts).astype(np.float64, copy=False) if parts else np.empty(0)
 
 
+TORN_LINE = "torn_line"
+"""Fact of a text file: the number of its last line, which was never finished and is left out."""
+
+
 @dataclass(frozen=True, eq=False)
 class RawSignal:
     """One column as the file has it.

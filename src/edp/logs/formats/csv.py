@@ -18,6 +18,7 @@ from edp.errors import DataError
 from edp.logs.formats.base import (
     FORMATS,
     MOST_COLUMNS,
+    TORN_LINE,
     Column,
     RawLog,
     RawSignal,
@@ -84,7 +85,7 @@ class CsvFormat:
             signals[name] = RawSignal(
                 name, load, table.rows, time, unit=layout.units[column_index], table=table, key=key
             )
-        return RawLog(path, signals)
+        return RawLog(path, signals, meta={} if table.torn_line is None else {TORN_LINE: table.torn_line})
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write ``time_s`` and every channel as ``name [unit]``; numbers read back bit for bit."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -105,6 +106,7 @@ class CsvTable:
         self.kept: pa.Table | None = None
         self.rows = 0
         self.ragged: list[Any] = []
+        self.torn_line: int | None = None
         size = path.stat().st_size
         small = size <= WHOLE_BYTES and _WIDEST * size <= _WHOLE_SHARE * free_bytes()
         for tried in range(_TRIES):
@@ -222,8 +224,22 @@ class CsvTable:
         behind = row.text.split(self.layout.delimiter)[row.expected_columns :]
         return bool(behind) and all(re.search(r"[^\W\d_]{2}", cell) and '"' not in cell for cell in behind)
 
+    def _is_torn(self, row: Any) -> bool:
+        """Whether a row has too few cells, and the file ends within it."""
+        if row.actual_columns >= row.expected_columns:
+            return False
+        end = row.text.encode(self.layout.encoding.removesuffix("-sig"), errors="replace")
+        with self.path.open("rb") as stream:
+            size = stream.seek(0, io.SEEK_END)
+            stream.seek(max(size - len(end), 0))
+            return bool(end) and stream.read() == end
+
     def refuse_ragged(self) -> None:
         damaged = [row for row in self.ragged if not self._is_remark(row)]
+        # A logger that was switched off leaves its last row unfinished: no row of the table.
+        if damaged and self._is_torn(damaged[-1]):
+            self.torn_line = damaged.pop().number
+            self.ragged = [row for row in self.ragged if row.number != self.torn_line]
         if damaged or len(self.ragged) > max(_FEW_REMARKS, _REMARKS * self.rows):
             bad = (damaged or self.ragged)[0]
             raise DataError(

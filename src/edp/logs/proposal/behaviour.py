@@ -14,6 +14,10 @@ RELATED = 24
 _ALIKE = 0.97
 """Correlation from which one column is a change, a copy or a reference of another; chance and common motion reach
 0.9 on logs of a machine that repeats one cycle."""
+_ROUNDED_ALIKE = 0.999
+"""Least correlation of copies that were rounded on their own."""
+_MANY_COUNTS = 50
+"""Last digits that the range of a rounded copy spans at least."""
 _LAGS = 25
 """Samples by which a reference may lead what follows it."""
 _HOLDS = 0.9
@@ -42,6 +46,7 @@ class Behaviour:
         climbs: every row is above the one before.
         step: median of the steps that are not zero, 0 where there are none.
         even: nearly all steps have one size.
+        steady: nearly all steps are between half and twice their median, as those of a clock that waits for others.
         restarts: rows at which an even rise begins anew.
         coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
     """
@@ -59,6 +64,7 @@ class Behaviour:
     even: bool
     restarts: int
     coarse: bool = False
+    steady: bool = False
 
     @property
     def counts(self) -> bool:
@@ -96,6 +102,7 @@ def behaviour_of(column: LogColumn) -> Behaviour:
     # The mean step knows more than a printed one, unless rows are lost.
     if step > 0 and abs(rounded - step) < 0.1 * step:
         step = float(rounded)
+    paced = (moving >= 0.5 * step) & (moving <= 2.0 * step)
     near = np.abs(moving - step) <= 0.1 * abs(step)
     falls = int(np.count_nonzero(steps < 0))
     constant = bool(finite.min() == finite.max())
@@ -115,6 +122,7 @@ def behaviour_of(column: LogColumn) -> Behaviour:
         even=bool(len(moving)) and float(near.mean()) > 0.9,
         restarts=falls if step > 0 and falls and float(near.mean()) > 0.9 else 0,
         coarse=levels > 4 and len(sizes) > 0 and float(np.mean(sizes <= 1.1 * least)) > 0.9,
+        steady=step > 0 and float(paced.mean()) > 0.95,
     )
 
 
@@ -157,12 +165,22 @@ def _relation(column: LogColumn, other: LogColumn) -> Relation | None:
     if _scatter(own) == 0 or _scatter(theirs) == 0:
         return None
     level = _correlation(own, theirs)
-    if abs(level) > 1 - 1e-9:
+    if abs(level) > 1 - 1e-9 or (abs(level) > _ROUNDED_ALIKE and _differ_by_rounding(own, theirs)):
         return Relation("copy", other.name, float(np.std(own) / np.std(theirs)), abs(level))
     change = _change(own, theirs)
     if change is not None and change[1] > max(_ALIKE, abs(level)):
         return Relation("change", other.name, *change)
     return Relation("reference", other.name, 1.0, level) if _leads(own, theirs, level) else None
+
+
+def repeats(column: LogColumn, other: LogColumn) -> bool:
+    """Whether a column says what another one says, in another unit; also where one of them stands still."""
+    own, theirs = column.pieces[0], other.pieces[0]
+    good = np.isfinite(own) & np.isfinite(theirs) if len(own) == len(theirs) else np.zeros(0, dtype=bool)
+    if good.any() and (_scatter(own[good]) == 0 or _scatter(theirs[good]) == 0):
+        return _scatter(own[good]) == _scatter(theirs[good])
+    relation = _relation(column, other)
+    return relation is not None and relation.how == "copy"
 
 
 def _scatter(values: Column) -> float:
@@ -173,6 +191,23 @@ def _correlation(a: Column, b: Column) -> float:
     if len(a) < 3 or _scatter(a) == 0 or _scatter(b) == 0:
         return 0.0
     return float(np.corrcoef(a, b)[0, 1])
+
+
+def _differ_by_rounding(own: Column, theirs: Column) -> bool:
+    """Whether a column is a scaled other one but for the last digits with which both were written."""
+    slope, offset = np.polyfit(theirs, own, 1)
+    printed = _last_digit(own) + abs(slope) * _last_digit(theirs)
+    # Encoders side by side agree to a count, too: only columns of many counts tell.
+    many = min(np.ptp(own) / _last_digit(own), np.ptp(theirs) / _last_digit(theirs)) > _MANY_COUNTS
+    return bool(many and np.abs(own - slope * theirs - offset).max() <= printed)
+
+
+def _last_digit(values: Column) -> float:
+    """The least difference between two values that are not the same."""
+    steps = np.diff(np.unique(values))
+    # Binary rounding makes differences far below the last printed digit.
+    steps = steps[steps > 1e-9 * max(float(np.abs(values).max()), 1e-300)]
+    return float(steps.min()) if len(steps) else np.inf
 
 
 def _change(own: Column, theirs: Column) -> tuple[float, float] | None:

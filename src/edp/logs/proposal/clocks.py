@@ -66,10 +66,20 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
     ]
     if named:
         return named[0]
-    front = look.columns[0] if look.columns else None
-    if front is not None and front in rising and behaviours[front.name].climbs and behaviours[front.name].even:
-        return front
+    for column in _fronts(look):
+        behaviour = behaviours[column.name]
+        # A name that says nothing of time is doubted more than no name at all.
+        nameless = look.headerless or column is not look.columns[0]
+        if column in rising and behaviour.climbs and (behaviour.even or (nameless and behaviour.steady)):
+            return column
     return None
+
+
+def _fronts(look: LogLook) -> list[LogColumn]:
+    """The first column of the log, and that of each matrix in it (``data_1`` beside ``data_2``)."""
+    names = set(look.names)
+    first = [c for c in look.columns if c.name.endswith("_1") and f"{c.name[:-1]}2" in names]
+    return [*look.columns[:1], *(column for column in first if column is not look.columns[0])]
 
 
 def _of_column(column: LogColumn, behaviour: Behaviour, by_reader: bool) -> ClockGuess:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
-from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_steered_by, relations_of
+from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_steered_by, relations_of, repeats
 from edp.logs.proposal.clocks import ClockGuess, clock_of
 from edp.logs.proposal.columns import LogColumn, LogLook
 from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change
@@ -72,12 +72,13 @@ class MapProposal:
         return tuple(guess for guess in self.columns if guess.channel and guess.role in roles)
 
 
-def propose_map(look: LogLook, common: Collection[str] | None = None) -> MapProposal:
+def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Sequence[LogLook] = ()) -> MapProposal:
     """Propose what every column of a log is.
 
     Args:
         look: the columns.
         common: columns that all logs of a group have; None for all of this log. Others become no channels.
+        beside: further logs of the group: a column that repeats another one does so in each.
     """
     behaviours = {column.name: behaviour_of(column) for column in look.columns}
     clock = clock_of(look, behaviours)
@@ -101,7 +102,7 @@ def propose_map(look: LogLook, common: Collection[str] | None = None) -> MapProp
     ]
     if common is not None:
         guesses = [g if g.column in common else replace(g, channel="", check="not in all logs") for g in guesses]
-    guesses = _named(guesses)
+    guesses = _named(_without_copies(guesses, beside))
     texts = [
         ColumnGuess(name, "", "time" if name == clock.column else "text", _NO_KIND, 0.9, "holds text")
         for name in look.texts
@@ -201,6 +202,26 @@ def _role(
     if relation is not None and relation.how == "change":
         return "measured", 0.7, f"the change of {relation.other[:24]}"
     return "measured", 0.65, "moves by itself"
+
+
+def _without_copies(guesses: Sequence[ColumnGuess], beside: Sequence[LogLook]) -> list[ColumnGuess]:
+    """Columns that repeat an earlier one in another unit become no channels: the same would be predicted twice."""
+    columns = [{column.name: column for column in look.columns} for look in beside]
+    channels: set[str] = set()
+    single = []
+    for guess in guesses:
+        name, relation = guess.column, guess.relation
+        copied = relation is not None and relation.how == "copy" and relation.other in channels and not is_known(name)
+        if copied and relation is not None and all(_repeated(log, name, relation.other) for log in columns):
+            guess = replace(guess, channel="", why=f"repeats {relation.other[:40]}", check="a copy; not taken")
+        elif guess.channel:
+            channels.add(guess.column)
+        single.append(guess)
+    return single
+
+
+def _repeated(columns: dict[str, LogColumn], name: str, other: str) -> bool:
+    return name in columns and other in columns and repeats(columns[name], columns[other])
 
 
 def _named(guesses: Sequence[ColumnGuess]) -> list[ColumnGuess]:

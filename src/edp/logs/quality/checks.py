@@ -73,6 +73,7 @@ class Looked:
         measures: see `edp.logs.quality.measures`; of the finite samples.
         stuck: starts of the runs of one value strictly between the ends of the range.
         stuck_lengths: their lengths in samples.
+        in_gaps: missing samples that lie in gaps of time, which are a finding of their own.
     """
 
     channel: Channel
@@ -82,6 +83,7 @@ class Looked:
     measures: Measures
     stuck: NDArray[np.intp]
     stuck_lengths: NDArray[np.intp]
+    in_gaps: int = 0
 
     @property
     def samples(self) -> int:
@@ -102,7 +104,7 @@ class Looked:
 Check = Callable[[Looked], list[Finding]]
 
 
-def look_at(channel: Channel, values: Values, rate_hz: float) -> Looked:
+def look_at(channel: Channel, values: Values, rate_hz: float, in_gaps: int = 0) -> Looked:
     """Gather what the checks need of one channel, float32, shape ``(time,)``."""
     finite = np.isfinite(values)
     good = values if finite.all() else values[finite]
@@ -113,7 +115,7 @@ def look_at(channel: Channel, values: Values, rate_hz: float) -> Looked:
         lengths = stops - starts + 1
         inside = (values[starts] != good.min()) & (values[starts] != good.max())
         starts, lengths = starts[inside], lengths[inside]
-    return Looked(channel, values, good, rate_hz, measure(good), starts, lengths)
+    return Looked(channel, values, good, rate_hz, measure(good), starts, lengths, in_gaps)
 
 
 def place_of(row: int, rate_hz: float) -> str:
@@ -156,12 +158,12 @@ def copies(recording: Recording) -> list[Finding]:
 
 def _check_missing(at: Looked) -> list[Finding]:
     bad = np.flatnonzero(~np.isfinite(at.values))
-    if not len(bad):
+    if len(bad) <= at.in_gaps:
         return []
     infinite = int(np.isinf(at.values).sum())
     what = f"missing values (NaN), {infinite} of them infinite" if infinite else "missing values (NaN)"
     advice = "repair the file, or read with --repair nan=hold (gaps: gaps=hold or gaps=cut)"
-    return [Finding("error", at.channel.name, what, len(bad), place_of(int(bad[0]), at.rate_hz), advice)]
+    return [Finding("error", at.channel.name, what, len(bad) - at.in_gaps, place_of(int(bad[0]), at.rate_hz), advice)]
 
 
 def _check_constant(at: Looked) -> list[Finding]:

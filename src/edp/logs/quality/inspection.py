@@ -12,7 +12,7 @@ import numpy as np
 from edp.errors import DataError, EdpError, closest
 from edp.logs.assemble import assemble
 from edp.logs.detect import open_log
-from edp.logs.formats.base import RawLog
+from edp.logs.formats.base import TORN_LINE, RawLog
 from edp.logs.formats.names import name_of_file
 from edp.logs.proposal.columns import look_at_log
 from edp.logs.proposal.propose import plain_map
@@ -53,6 +53,7 @@ def look_into(
     signal_map: SignalMap | None = None,
     name: str | None = None,
     rows: tuple[int, int | None] | None = None,
+    repair: Repair | None = None,
 ) -> tuple[QualityReport, Sketch | None]:
     """As `inspect_log`, with a sketch to compare recordings by; None where no sample could be read.
 
@@ -61,6 +62,7 @@ def look_into(
         signal_map: as in `read_recording`.
         name: as in `read_recording`.
         rows: as in `read_recording`.
+        repair: what will be repaired when it is read: such defects of time are warnings. Nothing is repaired here.
 
     Raises:
         DataError: as `inspect_log`.
@@ -74,6 +76,9 @@ def look_into(
             "no map was given and no column has a name of the vocabulary: columns are taken for what edp init proposes"
         )
         findings.append(Finding("note", None, what, 1, "", "edp init writes a map to check"))
+    if TORN_LINE in raw.meta:
+        where = f"line {raw.meta[TORN_LINE]}"
+        findings.append(Finding("note", None, "the last line was never finished; it is left out", 1, where))
     if not signal_map.channels and not signal_map.others:
         findings += _near_misses(raw)
     findings += _unit_clashes(raw, signal_map)
@@ -89,9 +94,15 @@ def look_into(
         return replace(inspect(empty, tuple(findings)), proposed=proposed), None
     findings += _changed(raw, recording, signal_map, rows)
     for signal, clock in clocks:
-        findings += _time_findings(signal, clock)
+        findings += _time_findings(signal, clock, repair or Repair())
     facts = tuple(_clock_facts(signal, clock) for signal, clock in clocks)
     return replace(inspect(recording, tuple(findings), facts), proposed=proposed), sketch(recording)
+
+
+def unreadable(path: Path, why: DataError) -> QualityReport:
+    """The report on a file of which nothing can be read: one error."""
+    empty = Recording(name_of_file(path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(path))
+    return inspect(empty, (Finding("error", None, str(why)),))
 
 
 def _opened(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[ChannelSource], list[EdpError]]:
@@ -190,38 +201,23 @@ def _unit_clashes(raw: RawLog, signal_map: SignalMap) -> list[Finding]:
     return findings
 
 
-def _time_findings(name: str, clock: Clock) -> list[Finding]:
-    at = clock.stamps
-    findings = []
-    if len(clock.falling):
-        row = int(clock.falling[0])
-        what = f"time goes back ('{name}')"
-        where = f"row {row} (t = {at[row]:g} s)"
-        findings.append(
-            Finding("error", None, what, len(clock.falling), where, 'repair falling = "sort" (--repair falling=sort)')
-        )
-    if len(clock.duplicates):
-        row = int(clock.duplicates[0])
-        what = f"duplicate time stamps ('{name}')"
-        where = f"row {row} (t = {at[row]:g} s)"
-        findings.append(
-            Finding(
-                "error",
-                None,
-                what,
-                len(clock.duplicates),
-                where,
-                'repair duplicates = "last" (--repair duplicates=last)',
-            )
-        )
-    if len(clock.gaps):
-        row = int(clock.gaps[0])
-        longest = float((at[clock.gaps + 1] - at[clock.gaps]).max())
-        what = f"gaps in time ('{name}'), longest {longest:g} s"
-        where = f"after row {row} (t = {at[row]:g} s)"
-        findings.append(
-            Finding("error", None, what, len(clock.gaps), where, 'repair gaps = "hold" or "cut" (--repair gaps=hold)')
-        )
+def _time_findings(name: str, clock: Clock, repair: Repair) -> list[Finding]:
+    at, findings = clock.stamps, []
+    longest = float((at[clock.gaps + 1] - at[clock.gaps]).max()) if len(clock.gaps) else 0.0
+    defects = (
+        ("falling", clock.falling, f"time goes back ('{name}')", '"sort" (--repair falling=sort)'),
+        ("duplicates", clock.duplicates, f"duplicate time stamps ('{name}')", '"last" (--repair duplicates=last)'),
+        ("gaps", clock.gaps, f"gaps in time ('{name}'), longest {longest:g} s", '"hold" or "cut" (--repair gaps=hold)'),
+    )
+    for defect, rows, what, how in defects:
+        if not len(rows):
+            continue
+        where = f"{'after ' if defect == 'gaps' else ''}row {int(rows[0])} (t = {at[rows[0]]:g} s)"
+        allowed = getattr(repair, defect)
+        severity, advice = "error", f"repair {defect} = {how}"
+        if allowed != "refuse":
+            severity, advice = "warning", f"repaired when it is read: {defect} = {allowed}"
+        findings.append(Finding(severity, None, what, len(rows), where, advice))
     if not clock.uniform:
         what = f"time steps are not uniform ('{name}'): rms {clock.jitter:.3g} of a step, median {clock.step_s:g} s"
         advice = f"rows are resampled causally to {clock.rate_hz:g} Hz; set rate_hz for another rate"

@@ -135,8 +135,10 @@ def inspect(
     """
     findings = list(extra)
     facts = []
+    gaps = any(clock.gaps for clock in clocks)
+    in_gaps = int(np.count_nonzero(np.isnan(recording.values).all(axis=1))) if gaps else 0
     for channel_index, channel in enumerate(recording.channels):
-        looked = look_at(channel, recording.values[:, channel_index], recording.rate_hz)
+        looked = look_at(channel, recording.values[:, channel_index], recording.rate_hz, in_gaps)
         of_channel = [finding for check in CHECKS for finding in check(looked)]
         of_file = [finding for finding in extra if finding.channel == channel.name]
         facts.append(_facts(looked, verdict_of([*of_channel, *of_file])))

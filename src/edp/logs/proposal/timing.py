@@ -1,0 +1,123 @@
+"""What the time stamps of a group of logs need before training reads them: one rate, and repairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edp.errors import DataError
+from edp.logs.proposal.clocks import ClockGuess
+from edp.logs.proposal.columns import LogLook
+from edp.logs.timebase import Clock, judge
+from edp.signals import TIME_UNITS
+
+_ONE_RATE = 1.0005
+"""Ratio of rates up to which logs count as one; reading allows a thousandth."""
+_LONG_S, _LONG_STEPS = 1.0, 20.0
+"""A gap longer than both is a break in the session: held values would be motion that never was."""
+_MOST_KEPT = 0.8
+"""Share of the rows that must lie on one side of a break, for the rest to be cut away."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What was found of the time of a group's logs.
+
+    Attributes:
+        rate_hz: the rate to bring all of them to; None where they have one.
+        repairs: for each log that was looked at and needs some, as ``--repair`` takes them.
+    """
+
+    rate_hz: float | None
+    repairs: dict[Path, tuple[str, ...]]
+
+    @property
+    def shared(self) -> tuple[str, ...]:
+        """Repairs for all logs, one of each defect; ``hold`` where gaps of some are cut."""
+        by_defect: dict[str, str] = {}
+        for repair in sorted({one for repairs in self.repairs.values() for one in repairs}):
+            by_defect[repair.partition("=")[0]] = repair  # "gaps=hold" comes after "gaps=cut"
+        return tuple(by_defect[defect] for defect in sorted(by_defect, key=lambda defect: (defect != "nan", defect)))
+
+    @property
+    def apart(self) -> dict[Path, tuple[str, ...]]:
+        """Logs that need their own repairs, since others need another one of the same defect."""
+        return {path: repairs for path, repairs in self.repairs.items() if not set(repairs) <= set(self.shared)}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know of rates and breaks."""
+        rate = (
+            ()
+            if self.rate_hz is None
+            else (f"the logs differ in rate: all are brought to {self.rate_hz:g} Hz (rate_hz)",)
+        )
+        cut = (
+            f"{path.name[:40]}: a long break in time; its longest stretch is used ({', '.join(repairs)})"
+            for path, repairs in self.apart.items()
+        )
+        return (*rate, *cut)
+
+
+def timing_of(looks: Sequence[LogLook], clock: ClockGuess, mapped: Sequence[str]) -> Timing:
+    """Rates and repairs of logs with one map.
+
+    Args:
+        looks: the logs.
+        clock: time of their rows.
+        mapped: columns that become channels.
+    """
+    repairs, rates = {}, []
+    for look in looks:
+        clocks = _clocks(look, clock)
+        rates += [clocks[0].rate_hz] if clocks else []
+        columns = [column for column in look.columns if column.name in mapped]
+        missing = ["nan=hold"] if any(not np.isfinite(column.values).all() for column in columns) else []
+        needed = (*missing, *sorted({repair for one in clocks for repair in _repairs(one)}))
+        if needed:
+            repairs[look.path] = needed
+    apart = len(rates) > 1 and clock.wanted_hz is None and max(rates) > _ONE_RATE * min(rates)
+    return Timing(_plain(float(np.median(rates))) if apart else None, repairs)
+
+
+def repair_table(repairs: Sequence[str]) -> dict[str, str]:
+    """Repairs as a data-set file has them."""
+    return {defect: how for defect, _, how in (repair.partition("=") for repair in repairs)}
+
+
+def _plain(rate_hz: float) -> float:
+    """A rate in two digits, as a person would say it."""
+    return float(f"{rate_hz:.2g}")
+
+
+def _clocks(look: LogLook, clock: ClockGuess) -> list[Clock]:
+    """The clock of each piece of a log, by the rule with which it is read; none without a column of numbers."""
+    time = next((column for column in look.columns if column.name == clock.column), None)
+    clocks = []
+    for piece in () if time is None else time.pieces:
+        try:
+            clocks.append(judge(piece * TIME_UNITS[clock.unit], clock.column or ""))
+        except DataError:  # which inspection and training name in their words
+            continue
+    return clocks
+
+
+def _repairs(clock: Clock) -> set[str]:
+    if clock.uniform:
+        return set()
+    repairs = {"falling=sort"} if len(clock.falling) else set()
+    repairs |= {"duplicates=last"} if len(clock.duplicates) else set()
+    return repairs | ({f"gaps={_of_gaps(clock)}"} if len(clock.gaps) else set())
+
+
+def _of_gaps(clock: Clock) -> str:
+    """``cut`` where a long break leaves nearly all rows on one side, else ``hold``."""
+    breaks = clock.gaps[np.diff(clock.stamps)[clock.gaps] > max(_LONG_S, _LONG_STEPS * clock.step_s)]
+    if not len(breaks):
+        return "hold"
+    # Cutting keeps the longest stretch between any gaps, long or short.
+    edges = np.concatenate(([0], clock.gaps + 1, [len(clock.stamps)]))
+    return "cut" if np.diff(edges).max() >= _MOST_KEPT * len(clock.stamps) else "hold"
