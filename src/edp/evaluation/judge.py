@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.data.gathered import Slot
 from edp.data.prepared import Prepared
-from edp.data.scaling import feature_matrix
+from edp.data.scaling import feature_columns
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
@@ -213,13 +214,9 @@ def _as_baselines_read(data: Prepared, parts: Sequence[Series]) -> list[Series]:
     names, own = _derived(data), len(data.task.features.channels)
     if not names and own == len(data.task.inputs):
         return list(parts)
-    columns = [data.task.features.features.index(name) for name in names]
-    return [
-        replace(
-            part, inputs=np.concatenate([part.inputs[:, :own], feature_matrix(data.task, part)[:, columns]], axis=1)
-        )
-        for part in parts
-    ]
+    places = [*range(own), *(data.task.features.features.index(name) for name in names)]
+    slot = Slot()
+    return [replace(part, inputs=feature_columns(data.task, part, places, slot)) for part in parts]
 
 
 class _Ruler:

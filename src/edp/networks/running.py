@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from edp.networks.losses import Prediction
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import State
 
+A = TypeVar("A")
 Run = Callable[[Tensor, State], tuple[Tensor, State]]
 PIECE = 512  # ticks per call, or windows: long enough for speed, short enough for memory
 
@@ -147,18 +150,65 @@ def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[N
 
 
 def _run_group(predictor: Predictor, run: Run, group: list[Series]) -> list[NDArray[np.float32]]:
-    longest = max(part.samples for part in group)
-    like = next(predictor.parameters())
-    state = predictor.initial_state(len(group), like)
     out: list[list[NDArray[np.float32]]] = [[] for _ in group]
-    for start in range(0, longest, PIECE):
-        stop = min(start + PIECE, longest)
-        rows = np.arange(start, stop)
-        # A shorter stream repeats its last tick; those predictions are cut off below.
-        x = np.stack([part.inputs[np.minimum(rows, part.samples - 1)] for part in group])
-        y, state = run(torch.from_numpy(x).to(device=like.device, dtype=like.dtype), state)
-        values = y.float().cpu().numpy()
+
+    def numbers(x: Tensor, state: State) -> tuple[NDArray[np.float32], State]:
+        y, new = run(x, state)
+        return y.float().cpu().numpy(), new
+
+    for start, values in _pieces(predictor, numbers, group):
         for i, part in enumerate(group):
             if start < part.samples:
                 out[i].append(values[i, : part.samples - start])
     return [np.concatenate(pieces) for pieces in out]
+
+
+def _pieces(
+    predictor: Predictor, run: Callable[[Tensor, State], tuple[A, State]], group: Sequence[Series]
+) -> Iterator[tuple[int, A]]:
+    """First tick and what `run` gives of each piece of streams side by side; state is carried to the end."""
+    longest = max(part.samples for part in group)
+    like = next(predictor.parameters())
+    state = predictor.initial_state(len(group), like)
+    for start in range(0, longest, PIECE):
+        rows = np.arange(start, min(start + PIECE, longest))
+        # A shorter stream repeats its last tick; what is said of those ticks is for the caller to leave out.
+        x = np.stack([part.inputs[np.minimum(rows, part.samples - 1)] for part in group])
+        y, state = run(torch.from_numpy(x).to(device=like.device, dtype=like.dtype), state)
+        yield start, y
+
+
+def answered_pieces(
+    predictor: Predictor, series: Sequence[Series], batch: int = 16
+) -> Iterator[tuple[int, int, Prediction, Tensor]]:
+    """What the network says of each series, piece by piece, so that hours of answers need not lie in memory.
+
+    Returns:
+        number of the series, first tick of the piece, what is said of it and the features that it was said from
+        ``(1, tick, feature)``. Pieces of a series come in order, series of like length side by side.
+    """
+    order = sorted(range(len(series)), key=lambda i: series[i].samples)
+
+    def run(x: Tensor, state: State) -> tuple[tuple[Prediction, Tensor], State]:
+        answer, features, new = predictor.run(x, state)
+        return (answer, features), new
+
+    was_training = predictor.training
+    predictor.eval()
+    try:
+        with torch.inference_mode():
+            for at in range(0, len(order), batch):
+                group = order[at : at + batch]
+                for start, (answer, features) in _pieces(predictor, run, [series[i] for i in group]):
+                    for lane, i in enumerate(group):
+                        ticks = slice(0, max(0, series[i].samples - start))
+                        center, spread = (part[lane : lane + 1, ticks] for part in (answer.center, answer.spread))
+                        if center.shape[1]:
+                            yield (
+                                i,
+                                start,
+                                replace(answer, center=center, spread=spread),
+                                features[lane : lane + 1, ticks],
+                            )
+    finally:
+        predictor.train(was_training)
