@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.recording import FloatArray
-
 BLOCK_ROWS = 65_536
 """Rows taken to double precision at a time."""
 Vector = NDArray[np.float64]
@@ -29,7 +27,7 @@ class Moments:
         self.low, self.high = np.full(columns, np.inf), np.full(columns, -np.inf)
         self.mean, self.squares = np.zeros(columns), np.zeros(columns)
 
-    def update(self, rows: FloatArray) -> None:
+    def update(self, rows: NDArray[np.floating]) -> None:
         """Take in rows ``(time, column)``."""
         for start in range(0, len(rows), BLOCK_ROWS):
             block = np.asarray(rows[start : start + BLOCK_ROWS], dtype=np.float64)

@@ -15,7 +15,7 @@ from edp.logs.detect import known_suffixes
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into
 from edp.logs.quality.quality import inspect
-from edp.logs.quality.repeats import sketch
+from edp.logs.quality.repeats import Sketches, sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
 from edp.logs.store.building import StoredLog, StoreProgress, build_store
@@ -130,16 +130,19 @@ class DataSource:
         if self.stored:
             return self._inspect_store(on_log)
         logs = self.logs()
-        seen = []
+        reports, sketches, sketched = [], Sketches(), []
         for i, log in enumerate(logs):
             if on_log is not None:
                 on_log(log.path, i + 1, len(logs))
-            seen.append(look_into(log.path, log.signal_map, log.name, log.rows))
+            report, one = look_into(log.path, log.signal_map, log.name, log.rows)
+            reports.append(report)
+            if one is not None:
+                sketches.add(one)
+                sketched.append(i)
         # Before they are compared: a finding on two recordings must tell which is which.
-        names = unique_names([report.name for report, _ in seen], [log.path for log in logs])
-        reports = [replace(report, name=name) for (report, _), name in zip(seen, names)]
-        sketches = [replace(sketch, name=name) for (_, sketch), name in zip(seen, names) if sketch is not None]
-        return compare(reports, sketches)
+        names = unique_names([report.name for report in reports], [log.path for log in logs])
+        sketches.all = [replace(one, name=names[i]) for one, i in zip(sketches.all, sketched, strict=True)]
+        return compare([replace(report, name=name) for report, name in zip(reports, names)], sketches)
 
     def store(
         self, folder: str | Path, workers: int = 1, on_progress: Callable[[StoreProgress], None] | None = None
@@ -156,12 +159,12 @@ class DataSource:
     def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
         self._check_store_options()
         recordings = read_store(self.path)
-        reports, sketches = [], []
+        reports, sketches = [], Sketches()
         for i, recording in enumerate(recordings):
             if on_log is not None:
                 on_log(self.path / recording.name, i + 1, len(recordings))
             reports.append(inspect(recording))
-            sketches.append(sketch(recording))
+            sketches.add(sketch(recording))
         return compare(reports, sketches)
 
     def _check_store_options(self) -> None:

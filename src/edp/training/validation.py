@@ -11,14 +11,17 @@ from torch import Tensor
 
 from edp.data.prepared import Prepared
 from edp.data.series import Series
+from edp.data.spread_rows import spread_series
 from edp.networks.losses import Prediction
 from edp.networks.predictor import Predictor
 from edp.networks.running import answered_pieces, stream_answers
 from edp.signals import KINDS
 from edp.training.spec import TrainingSpec
 
-MOST_CALIBRATED = 1 << 20
-"""Ticks whose answers are in memory for the calibration of intervals; three hours at 100 Hz."""
+MOST_VALIDATED = 1 << 20
+"""Ticks that judge an epoch and calibrate intervals, about; three hours at 100 Hz."""
+STARTS_A_STRETCH = 100
+"""Times the start-up of a network that a stretch is long: of its ticks one per cent are not judged."""
 
 
 def validation_scores(
@@ -31,6 +34,7 @@ def validation_scores(
     # Double precision: sums over hours of ticks in float32 lose the digits in which epochs differ.
     scale = net.code.width.detach().cpu().double()
     factors = torch.tensor([KINDS[kind].report_factor for kind in data.target_kinds], dtype=torch.float64)
+    series = judged_stretches(net, series, spec)
     absolute, count, loss = torch.zeros(len(series), *scale.shape, dtype=torch.float64), 0, [0.0] * len(series)
     for i, answer, target in _answers(net, series, spec, windowed):
         absolute[i] += (answer.center - target).abs().sum(dim=(0, 1))
@@ -40,18 +44,21 @@ def validation_scores(
     return float(mean.mean()), float((mean * scale * factors).mean()), sum(loss) / max(1, count)
 
 
-def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> None:
-    """Stretch the intervals of a network so that they hold their share of `series`.
+def judged_stretches(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> list[Series]:
+    """What epochs are judged on: the series, or of more than `MOST_VALIDATED` ticks evenly spread stretches of them.
 
-    Of more than `MOST_CALIBRATED` ticks, evenly spread ones: the error of a share falls with their root.
+    Else an epoch of a fixed number of updates would take hours to judge where the store is large.
     """
-    every = -(-sum(part.samples for part in series) // MOST_CALIBRATED)
+    start_up = max(spec.chunks.burn_in, net.spec.window) + net.task.max_horizon
+    return spread_series(series, STARTS_A_STRETCH * start_up, MOST_VALIDATED)
+
+
+def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> None:
+    """Stretch the intervals of a network so that they hold their share of `series`."""
     answers, targets = [], []
-    for _, answer, target in _answers(net, series, spec, windowed=False):
-        # Copies: a view of some ticks would keep all of them in memory.
-        center, spread = (part[:, ::every].clone() for part in (answer.center, answer.spread))
-        answers.append(replace(answer, center=center, spread=spread))
-        targets.append(target[:, ::every].clone())
+    for _, answer, target in _answers(net, judged_stretches(net, series, spec), spec, windowed=False):
+        answers.append(answer)
+        targets.append(target)
     answer = replace(
         answers[0],
         center=torch.cat([one.center for one in answers], dim=1),
@@ -82,7 +89,8 @@ def _answers(
         if first < stop:
             ticks = slice(first - start, stop - start)
             future = np.stack([part.targets[first + k : stop + k] for k in net.task.horizons], axis=1)
-            target = net.code.encode(torch.from_numpy(future).unsqueeze(0).to(features), features[:, ticks])
+            with torch.inference_mode():
+                target = net.code.encode(torch.from_numpy(future).unsqueeze(0).to(features), features[:, ticks])
             center, spread = (one[:, ticks].float().cpu().double() for one in (answer.center, answer.spread))
             yield i, replace(answer, center=center, spread=spread), target.cpu().double()
 
