@@ -2,9 +2,9 @@
 
 The logs hold random walks of 45 channels at 100 Hz in Parquet: memory and time do not depend on what the numbers mean.
 Ten hours are written, stored and trained on as a user does it, once on the logs and once on the store, each in a
-process of its own. Stores of more hours list the same ten hours again and again under other names: 1,000 hours of numbers would
-take 65 GB of disk. So what a command holds in memory is that of so many hours, and so is the time that it computes; the
-time to read from a disk is not, since ten hours stay in the system's cache.
+process of its own. Stores of more hours list the same ten hours again and again under other names: 1,000 hours of
+numbers would take 65 GB of disk. So what a command holds in memory is that of so many hours, and so is the time that it
+computes; the time to read from a disk is not, since ten hours stay in the system's cache.
 
 Memory is what a process holds beside files that the system may drop and read again (anonymous memory), looked at every
 0.2 s. The time of an update is the difference of two trainings of one epoch, in processor time.

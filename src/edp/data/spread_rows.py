@@ -59,15 +59,16 @@ def spread_recordings(recordings: Sequence[Recording], seconds: float, most: int
 
 def spread_series(series: Sequence[Series], length: int, most: int) -> list[Series]:
     """Series, or evenly spread stretches of `length` ticks of them, of `most` ticks in all, about."""
-    return [
-        series[i]
-        if (start, stop) == (0, series[i].samples)
-        else replace(
-            series[i],
-            name=f"{series[i].name}[{start}:{stop}]",
-            inputs=series[i].inputs[start:stop],
-            targets=series[i].targets[start:stop],
-            teacher_targets=None if series[i].teacher_targets is None else series[i].teacher_targets[start:stop],
-        )
-        for i, start, stop in spread_stretches([part.samples for part in series], length, most)
-    ]
+    stretches = spread_stretches([part.samples for part in series], length, most)
+    return [_cut(series[i], start, stop) for i, start, stop in stretches]
+
+
+def _cut(part: Series, start: int, stop: int) -> Series:
+    if (start, stop) == (0, part.samples):
+        return part
+    rows = slice(start, stop)
+    teacher_targets = None if part.teacher_targets is None else part.teacher_targets[rows]
+    name = f"{part.name}[{start}:{stop}]"
+    return replace(
+        part, name=name, inputs=part.inputs[rows], targets=part.targets[rows], teacher_targets=teacher_targets
+    )
