@@ -67,7 +67,7 @@ class _Gathered(_OnDemand):
 
     def __getitem__(self, key: Any) -> Any:
         rows, *rest = key if isinstance(key, tuple) else (key,)
-        if len(rest) == 1 and isinstance(rest[0], int | list | slice):
+        if rows is not None and rows is not ... and len(rest) == 1 and isinstance(rest[0], int | list | slice):
             # Of a few columns the others need not be gathered.
             chosen = np.atleast_1d(np.arange(self.shape[1])[rest[0]])
             some = _Gathered(self._values, self._places[chosen].tolist(), self._gains[chosen].tolist(), self._rows)
