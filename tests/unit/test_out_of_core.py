@@ -10,7 +10,7 @@ import pytest
 
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.features import Derived, FeatureSet
-from edp.data.gathered import Slot, made_when_read, on_demand, some_columns
+from edp.data.gathered import LastMade, made_when_read, on_demand, some_columns
 from edp.data.moments import Moments
 from edp.data.order import RandomOrder
 from edp.data.prepared import prepare
@@ -179,7 +179,7 @@ def test_memory_does_not_grow_with_the_hours_of_a_store(logs, tmp_path):
 
 
 def test_features_are_made_when_they_are_read_one_recording_at_a_time(stored):
-    task, slot = task_of(), Slot()
+    task, slot = task_of(), LastMade()
     parts = [task.series(one) for one in stored[:3]]
     places = [3, 0]
     columns = [feature_columns(task, part, places, slot) for part in parts]

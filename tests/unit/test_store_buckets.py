@@ -11,7 +11,7 @@ import pytest
 
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs import buckets, read_data_set, write_recording
-from edp.logs.buckets import Bucket, bucket_address, cache_folder
+from edp.logs.buckets import BucketReader, bucket_address, cache_folder
 from edp.logs.source import DataSource
 from edp.logs.store import read_store, remote
 from edp.recording import Recording
@@ -118,7 +118,7 @@ def test_samples_that_are_not_what_the_index_says_are_refused_and_copied_again(s
 def test_a_copy_that_was_stopped_goes_on(server, top, monkeypatch):
     monkeypatch.setattr("edp.logs.store.building.BATCH_LOG_BYTES", 1)
     DataSource.of(top / "fleet" / "logs").store(top / "fleet" / "store")
-    real, copies = Bucket.copy, []
+    real, copies = BucketReader.copy, []
 
     def stop(self, file, target):
         if len(copies) == 2:
@@ -126,10 +126,10 @@ def test_a_copy_that_was_stopped_goes_on(server, top, monkeypatch):
         copies.append(file)
         return real(self, file, target)
 
-    monkeypatch.setattr(Bucket, "copy", stop)
+    monkeypatch.setattr(BucketReader, "copy", stop)
     with pytest.raises(KeyboardInterrupt):
         DataSource.of("s3://fleet/store").read()
-    monkeypatch.setattr(Bucket, "copy", real)
+    monkeypatch.setattr(BucketReader, "copy", real)
     before = len(server.requests)
     assert_same(DataSource.of("s3://fleet/store").read(), read_data_set(top / "fleet" / "logs"))
     fetched = {path for method, path, _ in server.requests[before:] if method == "GET" and ".f32" in path}
@@ -158,17 +158,17 @@ def test_an_endpoint_that_hangs_is_left_after_a_bounded_time(server, tmp_path, m
 
 
 def test_a_log_that_cannot_be_copied_is_refused_and_tried_again(server, top, tmp_path, monkeypatch):
-    real = Bucket.copy
+    real = BucketReader.copy
 
     def fail(self, file, target):
         if "run2" in file.address:
             raise StorageError(f"'{file.address}' did not answer within 1 s")
         return real(self, file, target)
 
-    monkeypatch.setattr(Bucket, "copy", fail)
+    monkeypatch.setattr(BucketReader, "copy", fail)
     index = DataSource.of("s3://fleet/logs").store(tmp_path / "store")
     assert [one.log for one in index.refused] == ["s3://fleet/logs/run2.parquet"]
-    monkeypatch.setattr(Bucket, "copy", real)
+    monkeypatch.setattr(BucketReader, "copy", real)
     assert DataSource.of("s3://fleet/logs").store(tmp_path / "store").refused == ()
     assert_same(read_store(tmp_path / "store"), read_data_set(top / "fleet" / "logs"))
 
@@ -188,9 +188,9 @@ def test_what_a_bucket_is_not_for_is_refused(server, top, tmp_path):
     with pytest.raises(ConfigError, match=r"a store is built on this machine"):
         DataSource.of(top / "fleet" / "logs").store("s3://fleet/store")
     with pytest.raises(ConfigError, match=r"holds credentials or options"):
-        Bucket("s3://key:secret@fleet/logs")
+        BucketReader("s3://key:secret@fleet/logs")
     with pytest.raises(ConfigError, match=r"set AZURE_STORAGE_ACCOUNT"):
-        Bucket("az://fleet/logs")
+        BucketReader("az://fleet/logs")
 
 
 def test_a_data_set_file_names_logs_in_buckets(server, top, tmp_path):

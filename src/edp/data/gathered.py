@@ -94,7 +94,7 @@ class _Gathered(_OnDemand):
         return block
 
 
-class Slot:
+class LastMade:
     """Holds the array that was made last."""
 
     def __init__(self) -> None:
@@ -112,14 +112,14 @@ class Slot:
 class _Made(_OnDemand):
     """An array that is made when it is read; of those with one slot, the last one stays in memory."""
 
-    def __init__(self, shape: tuple[int, int], make: Make, slot: Slot) -> None:
+    def __init__(self, shape: tuple[int, int], make: Make, slot: LastMade) -> None:
         self.shape, self._make, self._slot = shape, make, slot
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Any:
         return self._slot.values(self, self._make).astype(dtype or np.float32, copy=False)
 
 
-def made_when_read(shape: tuple[int, int], make: Make, slot: Slot) -> FloatArray:
+def made_when_read(shape: tuple[int, int], make: Make, slot: LastMade) -> FloatArray:
     """An array ``(time, column)`` that is made when it is read, for what is read recording by recording.
 
     Args:

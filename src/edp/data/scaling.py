@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.features import STARTING, derive
-from edp.data.gathered import Slot, made_when_read, some_columns
+from edp.data.gathered import LastMade, made_when_read, some_columns
 from edp.data.moments import Moments
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
@@ -63,7 +63,7 @@ def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
     return np.stack(columns, axis=1)
 
 
-def feature_columns(task: Task, series: Series, places: Sequence[int], slot: Slot) -> NDArray[np.float32]:
+def feature_columns(task: Task, series: Series, places: Sequence[int], slot: LastMade) -> NDArray[np.float32]:
     """Some features of a stretch, ``(time, len(places))``: channels as a view or on demand, derived ones when read.
 
     Args:
@@ -72,7 +72,7 @@ def feature_columns(task: Task, series: Series, places: Sequence[int], slot: Slo
         places: of the features, in the order wanted.
         slot: shared by stretches that are gone through one after the other.
     """
-    if all(place < len(task.features.channels) for place in places):
+    if max(places, default=0) < len(task.features.channels):
         return some_columns(series.inputs, places)
     shape = (series.samples, len(places))
     return made_when_read(shape, lambda: feature_matrix(task, series)[:, list(places)], slot)

@@ -28,12 +28,12 @@ def spread_stretches(lengths: Sequence[int], length: int, most: int = MOST_ROWS)
     count = max(1, most // length)
     chosen = []
     # Middles of equal shares of all rows, so that every sequence has its share.
-    places = (np.arange(count) + 0.5) * (total / count)
+    middles = (np.arange(count) + 0.5) * (total / count)
     ends = np.cumsum(lengths)
     last = (-1, 0)
-    for place, i in zip(places, np.searchsorted(ends, places, side="right"), strict=True):
+    for middle, i in zip(middles, np.searchsorted(ends, middles, side="right"), strict=True):
         rows = lengths[i]
-        start = int(min(max(place - (ends[i] - rows) - length / 2, 0), max(rows - length, 0)))
+        start = int(min(max(middle - (ends[i] - rows) - length / 2, 0), max(rows - length, 0)))
         # Near the ends of a sequence two middles may want the same rows.
         start = max(start, last[1]) if last[0] == i else start
         stop = min(start + length, rows)

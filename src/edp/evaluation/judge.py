@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.gathered import Slot
+from edp.data.gathered import LastMade
 from edp.data.prepared import Prepared
 from edp.data.scaling import feature_columns
 from edp.data.series import Series
@@ -64,12 +64,12 @@ class Evaluation:
 
     Attributes:
         scores: the content of ``scores.json`` (schema 1).
-        kept: truth, predictions, inputs and interval of the first `KEPT_RECORDINGS` and `KEPT_TICKS`, by
+        tensors: truth, predictions, inputs and interval of the first `KEPT_RECORDINGS` and `KEPT_TICKS`, by
             ``recording/name``.
     """
 
     scores: dict[str, Any]
-    kept: dict[str, NDArray[Any]]
+    tensors: dict[str, NDArray[Any]]
 
 
 class _Kept:
@@ -130,9 +130,9 @@ def judge(
     skip = predictor.spec.window if spec.skip is None else spec.skip
     if data.task.features.starting:  # While the start is read there is nothing to predict.
         skip = max(skip, data.task.features.starting_ticks)
-    ruler, kept = Ruler(data, skip), _Kept(data.test, len(data.inputs))
+    ruler, pictures = Ruler(data, skip), _Kept(data.test, len(data.inputs))
     say("network")
-    measured = ruler.measure(kept.seen(streamed(predictor, predictor.predict, data.test), "network"))
+    measured = ruler.measure(pictures.seen(streamed(predictor, predictor.predict, data.test), "network"))
     models = {"network": {"label": label, "seconds": seconds, **measured}}
     start, left_out = time.perf_counter(), []
     for name in sorted(spec.baselines, key=lambda name: BASELINES[name].effort):
@@ -142,17 +142,17 @@ def judge(
             continue
         say(name)
         baseline = _fitted(BASELINES[name], data, spec)
-        measured = ruler.measure(kept.seen(_predicted(baseline, data, data.test), name))
+        measured = ruler.measure(pictures.seen(_predicted(baseline, data, data.test), name))
         on_validation = _on_validation(baseline, data, max(skip, spec.history))
         models[name] = {"label": baseline.label, "seconds": time.perf_counter() - began, **measured, **on_validation}
     coverages = predictor.spec.output.coverages
     if coverages:
         say("intervals")
-        bounds = kept.bounds(streamed(predictor, predictor.intervals, data.test), nearest_to_shown(coverages))
+        bounds = pictures.bounds(streamed(predictor, predictor.intervals, data.test), nearest_to_shown(coverages))
         models["network"]["intervals"] = ruler.intervals(bounds, coverages)
     left = {"left_out": left_out} if left_out else {}
     scores = ruler.header() | {"models": models, "situation": situation_of(data)} | left
-    return Evaluation(scores, kept.tensors)
+    return Evaluation(scores, pictures.tensors)
 
 
 def _on_validation(baseline: Baseline, data: Prepared, skip: int) -> dict[str, Any]:
@@ -243,5 +243,5 @@ def _as_baselines_read(data: Prepared, parts: Sequence[Series]) -> list[Series]:
     if not names and own == len(data.task.inputs):
         return list(parts)
     places = [*range(own), *(data.task.features.features.index(name) for name in names)]
-    slot = Slot()
+    slot = LastMade()
     return [replace(part, inputs=feature_columns(data.task, part, places, slot)) for part in parts]

@@ -58,7 +58,7 @@ def bucket_address(path: str | Path) -> str:
     return f"{match[1]}://{match[2]}/{match[3] or ''}".rstrip("/") if match else ""
 
 
-class Bucket:
+class BucketReader:
     """One bucket, as far as EDP reads it.
 
     Args:
@@ -104,10 +104,10 @@ class Bucket:
             raise DataError(
                 f"'{address}' has {len(files):,} objects; at most {MOST_OBJECTS:,} are listed: give a part of it"
             )
-        found = [
+        objects = [
             RemoteFile(f"{self.scheme}://{entry.path}", int(entry.size), int(entry.mtime_ns or 0)) for entry in files
         ]
-        return sorted(found, key=lambda file: file.address)
+        return sorted(objects, key=lambda file: file.address)
 
     def read(self, address: str, most: int) -> bytes:
         """A whole object of at most so many bytes."""
@@ -191,8 +191,8 @@ def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> An
 
     if scheme == "s3":
         endpoint = environment.get("AWS_ENDPOINT_URL_S3") or environment.get("AWS_ENDPOINT_URL")
-        place = urlsplit(endpoint) if endpoint else None
-        server = {"endpoint_override": place.netloc, "scheme": place.scheme} if place else {}
+        url = urlsplit(endpoint) if endpoint else None
+        server = {"endpoint_override": url.netloc, "scheme": url.scheme} if url else {}
         region = environment.get("AWS_REGION") or environment.get("AWS_DEFAULT_REGION")
         return fs.S3FileSystem(
             connect_timeout=CONNECT_S,
@@ -203,9 +203,9 @@ def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> An
         )
     if scheme == "gs":
         host = environment.get("STORAGE_EMULATOR_HOST", "")
-        place = urlsplit(host if "://" in host else f"http://{host}") if host else None
-        server = {"endpoint_override": place.netloc, "scheme": place.scheme} if place else {}
-        return fs.GcsFileSystem(anonymous=place is not None, retry_time_limit=timedelta(seconds=ANSWER_S), **server)
+        url = urlsplit(host if "://" in host else f"http://{host}") if host else None
+        server = {"endpoint_override": url.netloc, "scheme": url.scheme} if url else {}
+        return fs.GcsFileSystem(anonymous=url is not None, retry_time_limit=timedelta(seconds=ANSWER_S), **server)
     account = environment.get("AZURE_STORAGE_ACCOUNT")
     if not account:
         raise ConfigError(f"az:// needs the name of the storage account: set {HELP['az']}")
@@ -217,13 +217,13 @@ def copied(file: RemoteFile) -> Iterator[Path]:
     """An object as a file of this machine, under its own name, gone afterwards.
 
     Raises:
-        EdpError: as `Bucket.copy`.
+        EdpError: as `BucketReader.copy`.
     """
     with TemporaryDirectory(prefix="edp_") as folder:
         check_room(Path(folder), file.size, file.address)
         # A key may hold anything: its last part alone names the file, and a folder of our own holds it.
         target = Path(folder) / (re.sub(r"[^\w.+-]", "_", file.name)[-120:] or "log")
-        Bucket(file.address).copy(file, target)
+        BucketReader(file.address).copy(file, target)
         yield target
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError, DataError
-from edp.logs.buckets import Bucket, RemoteFile, bucket_address
+from edp.logs.buckets import BucketReader, RemoteFile, bucket_address
 from edp.logs.detect import known_suffixes
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into
@@ -238,7 +238,7 @@ class Log:
 
 def _in_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
     """The logs below an address of a bucket, or the one at it, by the endings of their names."""
-    objects = Bucket(address).objects(address)
+    objects = BucketReader(address).objects(address)
     suffixes = known_suffixes()
     chosen = [file for file in objects if Path(file.name).suffix.lower() in suffixes]
     if not chosen:
@@ -294,11 +294,11 @@ def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> 
     shared, allowed = signal_map or resolved(settings.map), repair or settings.repair
     logs = []
     for entry in settings.recordings:
-        place = _expanded(entry.path, path)
-        address = bucket_address(place)
-        remote = Bucket(address).objects(address)[0] if address else None
+        expanded = _expanded(entry.path, path)
+        address = bucket_address(expanded)
+        remote = BucketReader(address).objects(address)[0] if address else None
         # An absolute path stands for itself, and so does an address.
-        where = Path(address) if address else path.parent / place
+        where = Path(address) if address else path.parent / expanded
         logs.append(Log(where, resolved(entry.map) or shared, allowed, entry.name, entry.rows, entry.machine, remote))
     return logs
 

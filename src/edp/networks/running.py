@@ -225,5 +225,5 @@ def answered_pieces(
                     ticks = slice(0, max(0, series[i].samples - start))
                     center, spread = (part[lane : lane + 1, ticks] for part in (answer.center, answer.spread))
                     if center.shape[1]:
-                        said = replace(answer, center=center, spread=spread)
-                        yield i, start, said, features[lane : lane + 1, ticks]
+                        piece_answer = replace(answer, center=center, spread=spread)
+                        yield i, start, piece_answer, features[lane : lane + 1, ticks]

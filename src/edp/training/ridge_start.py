@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from edp.data.gathered import Slot
+from edp.data.gathered import LastMade
 from edp.data.lags import LagTask, origins
 from edp.data.ridge import crossed_solution, ridge_solution
 from edp.data.scaling import feature_columns
@@ -42,7 +42,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
     # A target that is no feature has no level to start from: the regression then finds it from the features.
     present = tuple(None if column is None else read.index(column) for column in task.present)
     lags = LagTask(task.horizons, present, bypass.spec.taps)
-    slot = Slot()
+    slot = LastMade()
     series_of_parts = [
         [Series(part.name, feature_columns(task, part, read, slot), part.targets) for part in parts]
         for parts in (train, validation)

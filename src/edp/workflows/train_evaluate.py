@@ -280,7 +280,7 @@ def evaluate(
         evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
         # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
-        write_bytes(target / "predictions.safetensors", save(evaluation.kept))
+        write_bytes(target / "predictions.safetensors", save(evaluation.tensors))
         write_json(target / "scores.json", scores)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))

@@ -266,9 +266,9 @@ def _thinned(pieces: tuple[Piece, ...], max_lag: int) -> tuple[Piece, ...]:
         return pieces
     owners = [p for p, piece in enumerate(pieces) for _ in piece.stretches]
     whole = [stretch for piece in pieces for stretch in piece.stretches]
-    kept: list[list[FloatArray]] = [[] for _ in pieces]
+    stretches_of_piece: list[list[FloatArray]] = [[] for _ in pieces]
     for i, start, stop in spread_stretches(lengths, LAGS_A_STRETCH * max_lag):
         # Rest at the end of a recording may be too short for the lags.
         if stop - start >= LEAST_LAGS * max_lag:
-            kept[owners[i]].append(np.ascontiguousarray(whole[i][start:stop]))
-    return tuple(Piece(piece.name, tuple(own)) for piece, own in zip(pieces, kept, strict=True) if own)
+            stretches_of_piece[owners[i]].append(np.ascontiguousarray(whole[i][start:stop]))
+    return tuple(Piece(piece.name, tuple(own)) for piece, own in zip(pieces, stretches_of_piece, strict=True) if own)

@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from edp.errors import DataError
-from edp.logs.buckets import Bucket, RemoteFile, cache_folder, check_room
+from edp.logs.buckets import BucketReader, RemoteFile, cache_folder, check_room
 from edp.logs.store.index import INDEX, INDEX_BYTES, LOCK, ROWS, StoreIndex, checked_index, rows_path
 from edp.logs.store.opening import check_store
 from edp.storage import hold, make_folder, write_bytes
@@ -23,7 +23,7 @@ def local_store(address: str) -> Path:
         DataError: no store, one that this version does not read, or files that are not what its index says.
         StorageError: the bucket refuses or does not answer, or the disk is too small.
     """
-    bucket = Bucket(address)
+    bucket = BucketReader(address)
     text = bucket.read(f"{address}/{INDEX}", INDEX_BYTES)
     index = checked_index(text.decode(errors="replace"), f"index of the store '{address}'")
     name = hashlib.blake2b(address.encode() + b"\0" + text, digest_size=16).hexdigest()
@@ -36,7 +36,7 @@ def local_store(address: str) -> Path:
     return folder
 
 
-def _fill(bucket: Bucket, address: str, index: StoreIndex, folder: Path, text: bytes) -> None:
+def _fill(bucket: BucketReader, address: str, index: StoreIndex, folder: Path, text: bytes) -> None:
     """Copy what is missing; the index comes last, so that a copy that was stopped is none."""
     make_folder(folder / ROWS)
     missing = [file for file in index.files if _size(rows_path(folder, file.key)) != file.bytes]
@@ -67,6 +67,6 @@ def is_remote_store(address: str) -> bool:
         StorageError: the bucket refuses or does not answer.
     """
     try:
-        return bool(Bucket(address).objects(f"{address}/{INDEX}"))
+        return bool(BucketReader(address).objects(f"{address}/{INDEX}"))
     except DataError:
         return False

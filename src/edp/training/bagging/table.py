@@ -131,7 +131,7 @@ def bank_rows(net: Predictor, part: Series, chosen: range | None = None) -> NDAr
         part: the stretch.
         chosen: rows that are wanted; all where it is None. Of a long stretch all would fill the memory.
     """
-    wanted = range(part.samples) if chosen is None else chosen
+    chosen_rows = range(part.samples) if chosen is None else chosen
     bank = committee_of(net).bank
     like = next(net.parameters())
     rows = []
@@ -142,7 +142,13 @@ def bank_rows(net: Predictor, part: Series, chosen: range | None = None) -> NDAr
             features, front = net.front(x, front)
             values, state = bank(net.front.scale(features), state)
             # The first wanted row of the piece; a copy, since a view would keep the whole piece.
-            first = start + (wanted.start - start) % wanted.step if start > wanted.start else wanted.start
-            within = slice(first - start, max(first, min(wanted.stop, start + len(x[0]))) - start, wanted.step)
+            first = (
+                start + (chosen_rows.start - start) % chosen_rows.step
+                if start > chosen_rows.start
+                else chosen_rows.start
+            )
+            within = slice(
+                first - start, max(first, min(chosen_rows.stop, start + len(x[0]))) - start, chosen_rows.step
+            )
             rows.append(values[0, within].float().numpy().copy())
     return np.concatenate(rows)
