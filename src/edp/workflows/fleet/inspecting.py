@@ -11,6 +11,7 @@ from typing import Any
 from edp.data.coverage import Coverage
 from edp.errors import EdpError
 from edp.logs import DataQuality, QualityReport, Sketch, compare, inspect, look_into, sketch, unique_names
+from edp.logs.quality.repeats import Sketches
 from edp.logs.source import DataSource
 from edp.logs.store import read_index, read_store
 from edp.recording import Recording
@@ -97,7 +98,11 @@ def inspect_with(
         names = unique_names([report.name for report in reports], [log.path for log in source.logs()])
         reports = [replace(report, name=name) for report, name in zip(reports, names, strict=True)]
         sketches = [None if s is None else replace(s, name=name) for s, name in zip(sketches, names, strict=True)]
-    return Inspection(compare(reports, [entry for entry in sketches if entry is not None]), covered, why)
+    bounded = Sketches()
+    for entry in sketches:
+        if entry is not None:
+            bounded.add(entry)
+    return Inspection(compare(reports, bounded), covered, why)
 
 
 def _units_of_logs(source: DataSource) -> list[WorkUnit]:
@@ -127,13 +132,13 @@ def look_at_log(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithSta
 
 def _units_of_store(source: DataSource) -> list[WorkUnit]:
     source.check_store_options()
-    entries = read_index(source.path).recordings
+    entries = read_index(source.store_folder()).recordings
     each = max(1, -(-len(entries) // STORED_UNITS))
     units = []
     for first in range(0, len(entries), each):
         part = entries[first : first + each]
         arguments = {"first": first, "digests": [entry.digest for entry in part]}
-        where = {"store": str(source.path.resolve())}
+        where = {"store": str(source.store_folder().resolve())}
         units.append(WorkUnit(f"{__name__}:look_at_stored", str(source.path / part[0].name), arguments, where=where))
     return units
 
