@@ -153,8 +153,8 @@ class Size:
 
 
 SIZES = {
-    True: Size(1.0, 4, 3, 3.0, 20, ()),
-    False: Size(30.0, 10, 24, 48.0, 900, (10.0, 40.0, 160.0)),
+    True: Size(1.0, 4, 3, 3.0, 20, (2.0, 4.0)),
+    False: Size(12.0, 8, 24, 48.0, 450, (10.0, 40.0, 160.0)),
 }
 
 
@@ -264,7 +264,7 @@ def fleet_orders(bench: Bench) -> dict[str, SimulationOrder]:
     """Machines that train, machines never seen with six minutes each, and growing data sets for the curve."""
     size = bench.size
     soil: dict[str, Any] = {"materials": {"air": 1.0, "sandy_loam": 1.0}, "scatter": 2.0}
-    own = 2 if bench.quick else 4
+    own = 2 if bench.quick else 3
     train_set = SimulationOrder(
         minutes=size.fleet_minutes, recordings=2 * size.machines, family=size.machines, seed=bench.seed + 1, **soil
     )
@@ -380,26 +380,27 @@ def cost(bench: Bench, rows: Sequence[dict[str, Any]], coordinator_ms: float) ->
     }
 
 
-def measure(bench: Bench) -> dict[str, Any]:
+def measure(bench: Bench, with_curve: bool) -> dict[str, Any]:
     def part(name: str, found: Callable[[], Any]) -> Any:
         return kept(bench.work / f"{name}.json", lambda: {"found": found()})["found"]
 
-    found: dict[str, Any] = {"deltas": part("deltas", lambda: deltas(bench))}
-    found["coordinator"] = coordinator = part("coordinator", lambda: coordinating(2))
+    found: dict[str, Any] = {"coordinator": part("coordinator", lambda: coordinating(2))}
+    found["deltas"] = part("deltas", lambda: deltas(bench))
     found["commands"] = rows = part("two_against_one", lambda: two_against_one(bench))
-    if bench.size.curve:
+    if with_curve:
         found["curve"] = part("curve", lambda: curve(bench))
-    return found | {"cost": part("cost", lambda: cost(bench, rows, coordinator["ms_a_unit"]))}
+    return found | {"cost": part("cost", lambda: cost(bench, rows, found["coordinator"]["ms_a_unit"]))}
 
 
 def main() -> None:
     made = parser(__doc__ or "")
     made.add_argument("--work", type=Path, default=None, help="folder of data, runs and parts, kept between runs")
+    made.add_argument("--curve", action="store_true", help="also the error by the minutes of logs that train")
     arguments = made.parse_args()
     quick = arguments.quick
     with contextlib.ExitStack() as stack:
         work = arguments.work or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        found = measure(Bench(work, arguments.seed, quick))
+        found = measure(Bench(work, arguments.seed, quick), arguments.curve)
     table(list(found["commands"][0]), [list(row.values()) for row in found["commands"]])
     cost_of, coordinator = found["cost"], found["coordinator"]
     share = coordinator["ms_a_unit"] / 1e3 * 2 / cost_of["unit_mean_s"]

@@ -23,11 +23,10 @@ from edp.evaluation.channel_importance import ChannelImportances, ChannelImporta
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import Evaluation, JudgeSpec, ModelPredictions, judge, score_models, score_predictions
+from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, judge, score_network
 from edp.evaluation.scores_file import earlier_scores
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
-from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
@@ -42,9 +41,6 @@ from edp.training.strategy import DirectFit, TrainingStrategy
 
 if TYPE_CHECKING:
     from edp.sim.data_set import SimulationOrder, simulate_data_set
-
-# Ten minutes at 100 Hz: more than a picture can show.
-SHOWN_RECORDINGS, SHOWN_TICKS = 6, 60_000
 
 
 def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
@@ -243,8 +239,8 @@ def _provenance(
     }
 
 
-PredictedBy = Callable[[JudgeSpec, str], Mapping[str, ModelPredictions]]
-"""Gives the predictions of all models for how to judge and the digest of what is judged."""
+JudgedBy = Callable[[JudgeSpec, str], Mapping[str, JudgedModel]]
+"""Measures all models, for how to judge and the digest of what is judged."""
 
 
 @one_blas_thread()
@@ -254,7 +250,7 @@ def evaluate(
     baselines: Sequence[str] | None = None,
     on_step: Callable[[str], None] | None = None,
     minutes: float | None = None,
-    predicted: PredictedBy | None = None,
+    judged_by: JudgedBy | None = None,
 ) -> Path:
     """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
 
@@ -266,7 +262,7 @@ def evaluate(
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
         minutes: after which no further baseline is begun; a later call judges it.
-        predicted: gives the predictions of all models in place of this process; `minutes` is then not looked at.
+        judged_by: measures all models in place of this process; `minutes` is then not looked at.
 
     Returns:
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
@@ -287,13 +283,14 @@ def evaluate(
     scores = earlier_scores(target, key)
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
-        if predicted is None:
+        if judged_by is None:
             evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
         else:
-            evaluation = score_models(predicted(chosen, " ".join(judged)), bundle.predictor, data, chosen)
+            models = judged_by(chosen, " ".join(judged))
+            evaluation = ModelBench(bundle.predictor, data, chosen).together(models)
         # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
-        write_bytes(target / "predictions.safetensors", save(evaluation.kept(SHOWN_RECORDINGS, SHOWN_TICKS)))
+        write_bytes(target / "predictions.safetensors", save(evaluation.tensors))
         write_json(target / "scores.json", scores)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
@@ -363,7 +360,7 @@ def _floor_scores(folder: Path, data: Prepared, scores: Mapping[str, Any]) -> di
     if not (folder / FLOOR).is_dir():
         return None
     floor = load_bundle(folder / FLOOR).predictor
-    return score_predictions(stream_predictions(floor, data.test), data, scores["task"]["skip"])
+    return score_network(floor, data, scores["task"]["skip"])
 
 
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:

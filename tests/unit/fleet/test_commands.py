@@ -1,15 +1,18 @@
 """Commands in units give what the commands give in one process, to the bit."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from edp.data.coverage import Coverage
-from edp.errors import ConfigError
+from edp.errors import ConfigError, StorageError
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
 from edp.workflows.executors import Workforce
+from edp.workflows.executors.units import UnitError
+from edp.workflows.fleet import simulating
 from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 from edp.workflows.fleet.simulating import simulate_with
 from edp.workflows.fleet.storing import store_with
@@ -32,6 +35,26 @@ def test_simulated_logs_are_the_same_and_a_stopped_set_goes_on(small_logs, small
     assert sorted(seen) == [False, False, True, True]
     for path in paths:
         assert path.read_bytes() == (small_logs / path.name).read_bytes()
+
+
+def test_a_machine_file_that_differs_on_a_node_is_refused(small_order, here, tmp_path, monkeypatch):
+    seen = iter(["mine", "theirs"])
+    monkeypatch.setattr(simulating, "_machine", lambda scenario: next(seen))
+    with pytest.raises(UnitError, match=r"machine '.*' has other numbers on this node"):
+        simulate_with(here, tmp_path / "logs", replace(small_order, recordings=1, family=0))
+    assert not list((tmp_path / "logs").glob("*.parquet"))
+
+
+def test_a_folder_that_only_the_node_sees_is_told(small_order, here, tmp_path, monkeypatch):
+    real = simulating.write_one
+
+    def elsewhere(identity, where):
+        (tmp_path / "node").mkdir(exist_ok=True)
+        return real(identity, {"folder": str(tmp_path / "node")})
+
+    monkeypatch.setattr(simulating, "write_one", elsewhere)
+    with pytest.raises(StorageError, match="was written on another node"):
+        simulate_with(here, tmp_path / "logs", replace(small_order, recordings=1))
 
 
 def test_a_store_built_in_units_holds_the_same_recordings_and_reads_nothing_twice(small_logs, here, tmp_path):

@@ -232,3 +232,57 @@ def test_damage_in_a_registry_is_told(own, run, tmp_path):
     (tmp_path / "own" / FLEET).write_text(json.dumps(content))
     with pytest.raises(StorageError, match="no fine-tuning writes"):
         add_to_registry(top, tmp_path / "own", "hostile")
+
+
+@pytest.fixture
+def told(monkeypatch, capsys):
+    """Exit code, JSON or text, and errors of a command."""
+    from edp.cli import app
+    from edp.cli.console import run_app
+
+    def command(*words):
+        monkeypatch.setenv("COLUMNS", "400")
+        monkeypatch.setattr("sys.argv", ["edp", *map(str, words)])
+        code = run_app(app)
+        said = capsys.readouterr()
+        return code, json.loads(said.out) if "--json" in words else said.out, said.err
+
+    return command
+
+
+def test_the_commands_of_a_fleet_say_what_they_did(told, own, run, store, tmp_path):
+    code, facts, _ = told("fleet", "report", run, store, "--out", tmp_path / "report", "--deltas", own, "--json")
+    assert code == 0
+    assert len(facts["machines"]) == 6
+    code, text, _ = told("fleet", "report", run, store, "--out", tmp_path / "report")
+    assert "The 6 machines with the largest error" in text
+    code, facts, _ = told("fleet", "network", own, "Press-1", "--out", tmp_path / "press", "--json")
+    assert (code, facts["machine"]) == (0, "Press-1")
+    registry = tmp_path / "registry"
+    assert told("registry", "add", registry, run, "--name", "base")[0] == 0
+    assert told("registry", "add", registry, tmp_path / "press", "--name", "press")[0] == 0
+    code, facts, _ = told("registry", "show", registry, "press", "--json")
+    assert facts["lineage"] == [facts["base"]]
+    assert "from: base" in told("registry", "show", registry, "press")[1]
+    assert len(told("registry", "list", registry, "--json")[1]["entries"]) == 2
+    assert "press" in told("registry", "list", registry)[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (("finetune", "RUN", "--out", "OUT"), "give LOGS of one machine, or --fleet"),
+        (("finetune", "RUN", "STORE", "--fleet", "STORE", "--out", "OUT"), "do not go with --fleet"),
+        (("finetune", "RUN", "STORE", "--delta-kb", "9", "--out", "OUT"), "to which --delta-kb belongs"),
+        (("evaluate", "RUN", "--workers", "2", "--minutes", "1"), "--minutes bounds what one process does"),
+        (("inspect", "STORE", "--workers", "2", "--cluster", "127.0.0.1:9"), "give one of the two"),
+        (("fleet", "network", "OWN", "Press-77", "--out", "OUT"), "has no machine 'Press-77'"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_contradictions_are_one_message_and_write_nothing(words, error, told, own, run, store, tmp_path):
+    places = {"RUN": run, "STORE": store, "OWN": own, "OUT": tmp_path / "out"}
+    code, _, errors = told(*(places.get(word, word) for word in words))
+    assert code == 1
+    assert error in errors
+    assert not (tmp_path / "out").exists()

@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from edp.data.coverage import Coverage
-from edp.errors import EdpError
+from edp.errors import DataError, EdpError
 from edp.logs import DataQuality, QualityReport, Sketch, compare, inspect, look_into, sketch, unique_names
+from edp.logs.quality.inspection import unreadable
+from edp.logs.quality.repeats import Sketches
+from edp.logs.repair import Repair
 from edp.logs.source import DataSource
 from edp.logs.store import read_index, read_store
 from edp.recording import Recording
@@ -71,7 +74,7 @@ def inspect_with(
         on_log: called with a path, how many units are done and how many there are.
 
     Raises:
-        UnitError: a file that cannot be read at all.
+        DataError: no log can be read at all.
     """
     units = _units_of_store(source) if source.stored else _units_of_logs(source)
     looks = len(units)
@@ -90,6 +93,9 @@ def inspect_with(
         why = str(first.values["why"])
         covered = None if first.content is None else unpacked(first.content, Coverage)
     looked = [unpacked(result.content or b"", LookedAt) for result in results[:looks]]
+    broken = [str(result.values.get("broken", "")) for result in results[:looks]]
+    if broken and all(broken):  # as one process says it
+        raise DataError(broken[0])
     reports = [report for one in looked for report in one.reports]
     sketches = [entry for one in looked for entry in one.sketches]
     if not source.stored:
@@ -97,7 +103,11 @@ def inspect_with(
         names = unique_names([report.name for report in reports], [log.path for log in source.logs()])
         reports = [replace(report, name=name) for report, name in zip(reports, names, strict=True)]
         sketches = [None if s is None else replace(s, name=name) for s, name in zip(sketches, names, strict=True)]
-    return Inspection(compare(reports, [entry for entry in sketches if entry is not None]), covered, why)
+    bounded = Sketches()
+    for entry in sketches:
+        if entry is not None:
+            bounded.add(entry)
+    return Inspection(compare(reports, bounded), covered, why)
 
 
 def _units_of_logs(source: DataSource) -> list[WorkUnit]:
@@ -107,6 +117,7 @@ def _units_of_logs(source: DataSource) -> list[WorkUnit]:
             "map": None if log.signal_map is None else plain_tree(log.signal_map),
             "name": log.name,
             "rows": None if log.rows is None else list(log.rows),
+            "repair": None if log.repair is None else plain_tree(log.repair),
         }
         where = {"path": str(log.path.resolve()), "shown": str(log.path)}
         units.append(WorkUnit(f"{__name__}:look_at_log", str(log.path), arguments, stored.key, where))
@@ -121,19 +132,25 @@ def look_at_log(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithSta
     shown = Path(where["shown"])
     path = shown if shown.exists() else Path(where["path"])
     span = None if rows is None else (rows[0], rows[1])
-    report, drawn = look_into(path, signal_map, identity.config["name"], span)
-    return WithState({"verdict": report.verdict}, packed(LookedAt((report,), (drawn,))))
+    repairs = identity.config["repair"]
+    repair = None if repairs is None else build(Repair, repairs, f"repairs of '{where['shown']}'")
+    broken = ""
+    try:
+        report, drawn = look_into(path, signal_map, identity.config["name"], span, repair)
+    except DataError as error:
+        broken, report, drawn = str(error), unreadable(shown, error), None
+    return WithState({"verdict": report.verdict, "broken": broken}, packed(LookedAt((report,), (drawn,))))
 
 
 def _units_of_store(source: DataSource) -> list[WorkUnit]:
     source.check_store_options()
-    entries = read_index(source.path).recordings
+    entries = read_index(source.store_folder()).recordings
     each = max(1, -(-len(entries) // STORED_UNITS))
     units = []
     for first in range(0, len(entries), each):
         part = entries[first : first + each]
         arguments = {"first": first, "digests": [entry.digest for entry in part]}
-        where = {"store": str(source.path.resolve())}
+        where = {"store": str(source.store_folder().resolve())}
         units.append(WorkUnit(f"{__name__}:look_at_stored", str(source.path / part[0].name), arguments, where=where))
     return units
 

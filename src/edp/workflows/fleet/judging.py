@@ -10,7 +10,7 @@ from typing import Any
 
 from edp.config.experiment import build, plain_tree
 from edp.data.prepared import Prepared
-from edp.evaluation.judge import JudgeSpec, ModelPredictions, by_effort, predict_baseline, predict_network
+from edp.evaluation.judge import JudgedModel, JudgeSpec, ModelBench, by_effort
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -35,7 +35,7 @@ def evaluate_with(
 
     Args:
         workforce: who runs them; nodes see run and recordings under the same paths.
-        run: run folder; what was predicted stays in it until the scores are written.
+        run: run folder; what was measured stays in it until the scores are written.
         source: other recordings.
         baselines: names; None takes those of the settings.
         on_step: called with a sentence when a model is done.
@@ -48,7 +48,7 @@ def evaluate_with(
     """
     folder = Path(run)
 
-    def predicted(spec: JudgeSpec, digest: str) -> dict[str, ModelPredictions]:
+    def judged(spec: JudgeSpec, digest: str) -> dict[str, JudgedModel]:
         # Costly ones first, so that none of them begins last.
         names = [*reversed(by_effort(spec.baselines)), NETWORK]
         units = [_unit(name, spec, digest, folder, source) for name in names]
@@ -59,11 +59,11 @@ def evaluate_with(
 
         results = run_units(units, workforce, folder / UNITS, note)
         models = {
-            name: unpacked(result.content or b"", ModelPredictions) for name, result in zip(names, results, strict=True)
+            name: unpacked(result.content or b"", JudgedModel) for name, result in zip(names, results, strict=True)
         }
         return {name: models[name] for name in [NETWORK, *by_effort(spec.baselines)]}
 
-    scored = evaluate(folder, source, baselines, predicted=predicted)
+    scored = evaluate(folder, source, baselines, judged_by=judged)
     forget_units(folder / UNITS)
     return scored
 
@@ -71,22 +71,24 @@ def evaluate_with(
 def _unit(name: str, spec: JudgeSpec, digest: str, folder: Path, source: DataSource | None) -> WorkUnit:
     where = {"run": str(folder.resolve()), "source": None if source is None else source.to_plain()}
     return WorkUnit(
-        f"{__name__}:predict_model", f"model '{name}'", {"model": name, "judge": plain_tree(spec)}, digest, where
+        f"{__name__}:judge_model", f"model '{name}'", {"model": name, "judge": plain_tree(spec)}, digest, where
     )
 
 
 @one_blas_thread()
-def predict_model(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
-    """Predictions of one model of a run."""
+def judge_model(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Scores of one model of a run, and what pictures show of it."""
     name = identity.config["model"]
     bundle, provenance_seconds, data = _loaded(where["run"], identity.data)
     if where["source"] is not None:
         recordings = DataSource.from_plain(where["source"]).read()
         data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
+    spec = build(JudgeSpec, identity.config["judge"], "of the unit")
+    bench = ModelBench(bundle.predictor, data, spec)
     if name == NETWORK:
-        model = predict_network(bundle.predictor, data, describe(bundle.predictor.spec), provenance_seconds)
+        model = bench.network(describe(bundle.predictor.spec), provenance_seconds)
     else:
-        model = predict_baseline(name, data, build(JudgeSpec, identity.config["judge"], "of the unit"))
+        model = bench.baseline(name)
     return WithState({"model": name}, packed(model))
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edp.errors import StorageError
+from edp.errors import ConfigError, StorageError
 from edp.logs import WriteOptions, write_recording
 from edp.sim.data_set import Simulated, SimulationOrder, simulate_data_set
 from edp.sim.scenario import Scenario, plain
@@ -58,14 +59,22 @@ def simulate_with(
 
 def _unit(scenario: Scenario, folder: Path, order: SimulationOrder) -> WorkUnit:
     arguments = {"scenario": plain(scenario), "suffix": order.suffix, "files": asdict(order.files())}
-    return WorkUnit(
-        f"{__name__}:write_one", f"recording '{scenario.name}'", arguments, where={"folder": str(folder.resolve())}
-    )
+    where = {"folder": str(folder.resolve())}
+    return WorkUnit(f"{__name__}:write_one", f"recording '{scenario.name}'", arguments, _machine(scenario), where)
+
+
+def _machine(scenario: Scenario) -> str:
+    """Hash of the machine's numbers, which a file may hold."""
+    return hashlib.blake2b(repr(scenario.load()).encode(), digest_size=16).hexdigest()
 
 
 def write_one(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any]:
     """Simulate a recording and write its log, unless somebody has: the folder is bound to one order."""
     scenario = Scenario(**identity.config["scenario"])
+    if _machine(scenario) != identity.data:
+        raise ConfigError(
+            f"machine '{scenario.machine}' has other numbers on this node; all nodes must see the same file there"
+        )
     folder = Path(where["folder"])
     if not folder.is_dir():
         raise StorageError(f"'{folder}' is not on this node; give a folder that all nodes see under the same path")

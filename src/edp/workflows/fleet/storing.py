@@ -62,15 +62,19 @@ def store_with(
 
 def stored_logs(source: DataSource) -> list[StoredLog]:
     """The logs of a source as a store takes them; a store has none."""
+    logs = source.logs()
+    for log in logs:
+        if log.remote is not None:
+            raise ConfigError(f"'{log.path}' lies in a bucket, whose logs one computer reads; leave --cluster out")
     return [
         StoredLog(log.path, log.signal_map or SignalMap(), log.repair or Repair(), log.name, log.rows, log.machine)
-        for log in source.logs()
+        for log in logs
     ]
 
 
 def keys_of(source: DataSource) -> str:
     """What tells two states of a source apart without reading it: hashes of a store, sizes and times of logs."""
-    keys = [entry.digest for entry in read_index(source.path).recordings] if source.stored else []
+    keys = [entry.digest for entry in read_index(source.store_folder()).recordings] if source.stored else []
     return " ".join([*keys, *(log.key for log in stored_logs(source))])
 
 
