@@ -317,6 +317,15 @@ def test_trees_of_many_outputs_keep_most_of_the_rows():
     assert plan.rounds >= 40
     assert (plan.models, plan.folds) == (2, 2)
     assert 0.1 < plan.rate <= 0.2
+    # Left-out trees have about as many rows as those in use, unless there is time for nothing else.
+    for rows in (1_000, 11_000, 20_000, 31_000, 90_000):
+        for minutes in (1.0, 3.0, 5.0):
+            short = tree_plan(replace(amount, rows=rows, outputs=6, minutes=minutes))
+            left = {5: 0.8, 3: 0.6, 2: 0.4}[short.folds] * rows
+            assert short.rounds >= 40
+            assert left >= 0.8 * min(short.rows, rows)
+    little = tree_plan(replace(amount, rows=1_000, outputs=12, minutes=0.3))
+    assert (little.folds, little.rounds >= 40) == (2, True)
     small = tree_plan(replace(amount, rows=1_000, outputs=3))
     assert (small.trees, small.models, small.folds, small.rate) == (300, 3, 5, 0.1)
     plans = [tree_plan(replace(amount, minutes=minutes)) for minutes in (0.01, 1.0, 5.0, 20.0, 200.0)]

@@ -18,7 +18,7 @@ from edp.errors import ConfigError, DataError
 from edp.networks.backbones import CommitteeSpec, HybridSpec
 from edp.networks.heads import LinearHead, MlpHead
 from edp.networks.lag_bank import LagBank
-from edp.networks.predictor import ModelSpec
+from edp.networks.predictor import ModelSpec, build_model
 from edp.networks.radial import RadialFeatures
 from edp.networks.running import stream_predictions
 from edp.recording import Recording
@@ -28,6 +28,7 @@ from edp.training.bagging.boosting import TreeLearner
 from edp.training.bagging.fit import fit_bagged
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.stacking import stacking_weights
+from edp.training.bagging.table import table_of
 from edp.training.fit import fit
 from edp.training.spec import TrainingSpec, check_fitted_parts
 
@@ -337,6 +338,21 @@ def test_without_members_it_is_the_linear_model_of_the_folds():
     np.testing.assert_allclose(scaled, wanted, atol=1e-4)
 
 
+def test_folds_leave_out_pieces_as_long_as_what_tests():
+    def pieces_of(*recordings, **bagging):
+        data = data_of(*recordings)
+        # Nothing but how long the parts are that test may be looked at.
+        data = replace(data, test=[replace(one, inputs=one.inputs * np.nan) for one in data.test])
+        table = table_of(build_model(data.task, MODEL, data.scaler(), 0), data, BaggingSpec(folds=4, **bagging))
+        return (np.count_nonzero(np.diff(table.folds.owner)) + 1) / 4
+
+    # A single log is divided as it was; of four logs of which each one's end tests, a fold leaves out a piece of each.
+    assert pieces_of(recording()) == 1
+    logs = [recording(600, seed, f"log{seed}") for seed in range(4)]
+    assert pieces_of(*logs) == 4
+    assert pieces_of(*logs, rows=800) == 4
+
+
 def test_long_recordings_are_thinned_out_evenly():
     found = fit_bagged(data_of(recording()), MODEL, spec(rows=300, steps=10))
     assert 250 < len(found.table.columns) <= 310
@@ -379,8 +395,12 @@ def test_too_few_rows_for_the_folds_are_refused():
         fit(data_of(recording(100), horizons=(1,), window=1), MODEL, spec(folds=4))
 
 
-def test_a_fold_leaves_its_rows_and_their_neighbours_out():
-    folds = blocked_folds([100, 60], 4, gap=5)
+@pytest.mark.parametrize("pieces", [1, 2, 3])
+def test_a_fold_leaves_its_rows_and_their_neighbours_out(pieces):
+    folds = blocked_folds([100, 60], 4, gap=5, pieces=pieces)
+    assert [len(folds.left_out(fold)) for fold in range(4)] == pytest.approx([40] * 4, abs=2)
+    # Unbroken pieces, which the folds take in turn.
+    assert np.count_nonzero(np.diff(folds.owner)) == 4 * pieces - 1
     assert sorted(row for fold in range(4) for row in folds.left_out(fold)) == list(range(160))
     for fold in range(4):
         judged, trained = set(folds.left_out(fold)), set(folds.training[fold])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.data.even_split import blocks_at_rest, blocks_of_motion, is_even, moving_ticks
+from edp.data.even_split import blocks_of_motion, blocks_where_time_is_uneven, is_even, most_unlike, moving_ticks
 from edp.data.splits import ByBlocks, ByName, ByRecording, ByTime
 from edp.recording import Recording
 from edp.signals import Channel, Kind
@@ -97,10 +97,62 @@ def test_blocks_are_longer_than_their_gaps():
     assert blocks_of_motion([short], 42).block_s * RATE >= 8 * 42
 
 
-def test_a_single_recording_is_asked_for_blocks_where_its_end_rests():
+def test_a_recording_whose_end_rests_is_given_the_blocks_that_training_takes():
     log = recording("a", RESTS_AT_ITS_END)
-    assert blocks_at_rest(log, 10) == divide([log], settings())[0].split
-    assert blocks_at_rest(recording("b", MOVES), 10) is None
+    blocks, _ = blocks_where_time_is_uneven([log], ["x"], [1, 10], ByTime())
+    assert blocks == divide([log], settings())[0].split
+    assert blocks_where_time_is_uneven([recording("b", MOVES)], ["x"], [1, 10], ByTime()) is None
+
+
+def sweep(name, last_hz, ticks=6000):
+    """A position that swings at 0.5 Hz first and at another frequency last."""
+    hertz = np.geomspace(0.5, last_hz, ticks)
+    values = np.sin(2 * np.pi * np.cumsum(hertz) / RATE)
+    return Recording(name, (Channel("x", Kind.GENERIC),), values[:, None].astype(np.float32), RATE)
+
+
+@pytest.mark.parametrize(("last_hz", "ratio"), [(8.0, 2.0), (0.12, 0.5)])
+def test_a_sweep_is_divided_by_blocks_and_says_by_what(last_hz, ratio):
+    logs = [sweep("a", last_hz), sweep("b", last_hz, 5000)]
+    furthest, name, span = most_unlike(ByTime(), logs, 42, ["x"], [1])
+    assert (name, span) == ("x", 1)
+    assert (furthest > ratio) if ratio > 1 else (furthest < ratio)
+    blocks, why = blocks_where_time_is_uneven(logs, ["x"], [1], ByTime())
+    assert "changes of x in 1 tick are" in why
+    assert abs(np.log(most_unlike(blocks, logs, 42, ["x"], [1])[0])) < abs(np.log(furthest)) / 2
+    divided, (words,) = divide(logs[:1], settings("task.horizons=[1]"))
+    assert isinstance(divided.split, ByBlocks)
+    assert "moves unlike the rest" in words
+
+
+def test_a_recording_in_which_everything_changes_once_stays_divided_by_time():
+    late = recording("a", np.ones(6000, dtype=bool))
+    late.values[5000:, 1] *= 50.0
+    late.values[4990:, 1] += np.linspace(0, 3000, 1010).astype(np.float32)
+    blocks = blocks_of_motion([late], 42)
+    assert most_unlike(ByTime(), [late], 42, ["x"], [1, 10])[0] > 2
+    assert abs(np.log(most_unlike(blocks, [late], 42, ["x"], [1, 10])[0])) > np.log(2)
+    assert divide([late], settings())[0].split == ByTime()
+
+
+def test_missing_values_and_what_stands_still_are_alike():
+    log = sweep("a", 0.5)
+    log.values[::7] = np.nan
+    assert most_unlike(ByTime(), [log], 42, ["x"], [1])[0] == pytest.approx(1.0, abs=0.1)
+    still = replace(log, values=np.zeros_like(log.values))
+    assert most_unlike(ByTime(), [still], 42, ["x", "absent"], [1]) == (1.0, "", 0)
+    still.values[5500] = 1.0
+    assert most_unlike(ByTime(), [still], 42, ["x"], [1]) == (np.inf, "x", 1)
+
+
+def test_the_proposal_for_two_sweeps_is_blocks(tmp_path):
+    for name in "ab":
+        log = sweep(name, 8.0)
+        table = np.column_stack([np.arange(6000) / RATE, log.values])
+        np.savetxt(tmp_path / f"{name}.csv", table, "%.6g", ",", header="time,x_pos", comments="")
+    found = propose(tmp_path)
+    assert 'kind = "blocks"' in found.files["settings.toml"]
+    assert any("moves unlike the rest" in note for note in found.notes)
 
 
 def test_the_proposal_for_a_log_that_rests_at_its_end_is_blocks(tmp_path):

@@ -1,4 +1,4 @@
-"""Blocked cross-validation: contiguous folds of the rows of all stretches, with a gap beside what is left out."""
+"""Blocked cross-validation: folds of unbroken pieces of the rows of all stretches, gaps beside what is left out."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ class Folds:
         return Folds(self.owner[::stride], training)
 
 
-def blocked_folds(lengths: Sequence[int], folds: int, gap: int) -> Folds:
-    """Contiguous folds with nearly equal shares of the rows of all stretches, laid end to end.
+def blocked_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int = 1) -> Folds:
+    """Folds with nearly equal shares of the rows of all stretches, laid end to end, each of so many unbroken pieces.
 
     Args:
         lengths: rows of each stretch, in order.
         folds: number of folds, 2 or more.
-        gap: rows beside a fold, in the same stretch, that share history or future with it and do not train.
+        gap: rows beside a piece, in the same stretch, that share history or future with it and do not train.
+        pieces: of each fold; the folds take the pieces in turn.
 
     Raises:
         DataError: too few rows for so many folds, or a fold would have nothing to train on.
@@ -59,17 +60,21 @@ def blocked_folds(lengths: Sequence[int], folds: int, gap: int) -> Folds:
             "where training.bagging.folds is among your settings, take fewer folds"
         )
     # Contiguous: rows drawn one by one would share history and future with those that are left out.
-    owner = np.arange(total) * folds // total
+    piece = np.arange(total) * (folds * pieces) // total
+    owner = piece % folds
     ends = np.cumsum(lengths)
     stretch = np.repeat(np.arange(len(lengths)), lengths)
+    # The first row of each run of one piece in one stretch, and the one behind its last.
+    edges = np.flatnonzero(np.diff(piece) + np.diff(stretch)) + 1
+    runs = list(zip([0, *edges.tolist()], [*edges.tolist(), total], strict=True))
     training = []
     for fold in range(folds):
         trains = owner != fold
-        rows = np.flatnonzero(~trains)
-        for number in np.unique(stretch[rows]):
-            inside = rows[stretch[rows] == number]
-            first, last = ends[number] - lengths[number], ends[number]
-            trains[max(first, inside[0] - gap) : min(last, inside[-1] + 1 + gap)] = False
+        for start, stop in runs:
+            if owner[start] == fold:
+                number = stretch[start]
+                first, last = ends[number] - lengths[number], ends[number]
+                trains[max(first, start - gap) : min(last, stop + gap)] = False
         training.append(np.flatnonzero(trains))
         if len(training[-1]) < FEWEST_ROWS:
             raise DataError(

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from edp.data.even_split import blocks_at_rest
+from edp.data.even_split import blocks_where_time_is_uneven
+from edp.data.splits import ByTime
 from edp.errors import ConfigError, DataError, StorageError
+from edp.logs.proposal.columns import LogLook
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
@@ -127,8 +129,8 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     if len(channels) > MOST_FEATURES:
         notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")
         channels = list(dict.fromkeys([*channels[:MOST_FEATURES], *targets]))
-    split = _split(group, proposal, targets)
-    notes += ["the machine rests at the end of the log: blocks of time test in turn"] * (split["kind"] == "blocks")
+    split, why = _split(group, proposal, targets)
+    notes += why
     files = {
         MAP: _text(_map_table(proposal.signal_map), _remarks(source, proposal)),
         SETTINGS: _settings(proposal, channels, targets, split),
@@ -263,24 +265,31 @@ def _remarks(source: Path, proposal: MapProposal) -> list[str]:
     return lines
 
 
-def _split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> dict[str, Any]:
-    """Whole logs where there are many, else time; blocks of a single log whose end, which would test, is at rest."""
+def _split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """Whole logs where there are many, else time; blocks where ends are unlike the rest; and why, for notes."""
     if len(group.paths) >= _LEAST_RECORDINGS:
-        return {"kind": "names"}
-    looked = {column.name: column for column in proposal.look.columns}
-    columns = [
-        looked[guess.column] for guess in proposal.columns if guess.channel in targets and guess.column in looked
-    ]
+        return {"kind": "names"}, []
     rate = proposal.clock.wanted_hz or proposal.clock.rate_hz
-    whole = all(len(column.values) == column.samples for column in columns)
-    if len(group.paths) == 1 and columns and rate and whole:
+    names = list(dict.fromkeys(guess.column for guess in proposal.columns if guess.channel in targets))
+    if rate and names and len(group.looks) == len(group.paths):
         step = max(1, round((proposal.clock.rate_hz or rate) / rate))
-        values = np.stack([column.values[::step] for column in columns], axis=1).astype(np.float32)
-        channels = tuple(Channel(column.name, Kind.GENERIC) for column in columns)
-        blocks = blocks_at_rest(Recording("log", channels, values, rate), horizons_for(rate)[-1])
-        if blocks is not None:
-            return {"kind": "blocks", "block_s": round(blocks.block_s, 2), "every": blocks.every}
-    return {"kind": "time"}
+        logs = [_targets_of(look, names, step, rate) for look in group.looks]
+        uneven = blocks_where_time_is_uneven(logs, names, horizons_for(rate), ByTime())
+        if uneven is not None:
+            blocks, why = uneven  # of a long log a part was looked at
+            longer = min(look.rows / step for look in group.looks) / min(log.samples for log in logs)
+            split = {"kind": "blocks", "block_s": round(blocks.block_s * max(1.0, longer), 2), "every": blocks.every}
+            return split, [f"{why}: blocks of time test in turn"]
+    return {"kind": "time"}, []
+
+
+def _targets_of(look: LogLook, names: Sequence[str], step: int, rate: float) -> Recording:
+    """Columns of what was looked at of a log; where pieces of it meet, a missing value keeps their changes apart."""
+    columns = {column.name: column for column in look.columns}
+    apart = np.full(1, np.nan)
+    values = [np.concatenate([x for piece in columns[name].pieces for x in (piece[::step], apart)]) for name in names]
+    channels = tuple(Channel(name, Kind.GENERIC) for name in names)
+    return Recording(look.path.name, channels, np.stack(values, axis=1).astype(np.float32), rate)
 
 
 def _text(table: dict[str, Any], remarks: Iterable[str] = ()) -> str:

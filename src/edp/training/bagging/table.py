@@ -115,12 +115,24 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
         for group in committee_of(net).members:
             # No gradient reaches these weights: random ones would answer a channel that moves later for the first time.
             group.weights[0][:, still] = 0.0
-    # Rows within the bank's reach and the largest horizon of a fold share samples with it.
-    gap = math.ceil((bank.reach + reach) / stride)
     lengths = [len(of) for of in chosen]
-    gap = min(gap, max(1, sum(lengths) // (4 * spec.folds)))
+    pieces = _pieces(rows / spec.folds, data.test, reach, stride)
+    # Rows within the bank's reach and the largest horizon of a fold share samples with it. Beside pieces as short as
+    # what tests there is the gap that lies beside that (`prepare`): wider ones would cost a third of what trains.
+    gap = math.ceil(((net.spec.window if pieces > 1 else bank.reach) + reach) / stride)
+    gap = min(gap, max(1, sum(lengths) // (4 * spec.folds * pieces)))
     starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), skips, strict=True)
-    return Table(columns, targets, blocked_folds(lengths, spec.folds, gap), stride, tuple(starts))
+    return Table(columns, targets, blocked_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
+
+
+def _pieces(share: float, test: Sequence[Series], reach: int, stride: int) -> int:
+    """Unbroken pieces of each fold of so many rows: as long as the stretches that test, of which only lengths are read.
+
+    What a fold leaves out should be as unlike the rest as what tests is: of three logs whose ends test a fold of one
+    piece would leave out most of one log, and a model that does well on a log it has not seen would be preferred.
+    """
+    lengths = [part.samples - reach for part in test if part.samples > reach]
+    return max(1, round(share * stride / float(np.median(lengths)))) if lengths else 1
 
 
 def bank_rows(net: Predictor, part: Series) -> NDArray[np.float32]:
