@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.augment import AugmentationSpec, input_deviation
+from edp.data.order import RandomOrder
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
 from edp.settings.bounds import MOST_BATCH, MOST_TICKS, check_bounds, integer
@@ -195,36 +196,32 @@ class ChunkSampler:
                 start += size - self.spec.burn_in if size < rest else size
 
     def _lanes(self, rng: np.random.Generator, number: int) -> Iterator[Batch]:
+        length = self.spec.length
+        plan = self._plan(rng)
+        lanes = [self._lane(lane, number) for lane in plan]
+        spare = self._cut(self.series[0], 0, 0, length)
+        for _ in range(max(_ticks(lane) for lane in plan) // length):
+            # A lane that has run out: nothing counts.
+            steps = [next(lane, (spare, True)) for lane in lanes]
+            yield stack([piece for piece, _ in steps], [reset for _, reset in steps])
+
+    def _lane(self, pieces: Sequence[tuple[int, int, int]], number: int) -> Iterator[tuple[Piece, bool]]:
+        """Chunks of one lane in order, and whether each begins a piece."""
         length, burn_in = self.spec.length, self.spec.burn_in
-        steps = [
-            [(i, start, stop, at) for i, start, stop in lane for at in range(start, stop, length)]
-            for lane in self._plan(rng)
-        ]
-        current_stretches = [(self.series[0], 0)] * len(steps)
-        for step in range(max(len(lane) for lane in steps)):
-            rows, resets = [], []
-            for which, lane in enumerate(steps):
-                if step < len(lane):
-                    i, start, stop, at = lane[step]
-                    if at == start:
-                        current_stretches[which] = self._stretch(i, start, stop, self._chance(number, i, start))
-                    part, origin = current_stretches[which]
-                    rows.append(self._cut(part, at - origin, at - start, burn_in))
-                    resets.append(at == start)
-                else:  # A lane that has run out: nothing counts.
-                    rows.append(self._cut(self.series[0], 0, 0, length))
-                    resets.append(True)
-            yield stack(rows, resets)
+        for i, start, stop in pieces:
+            part, origin = self._stretch(i, start, stop, self._chance(number, i, start))
+            for at in range(start, stop, length):
+                yield self._cut(part, at - origin, at - start, burn_in), at == start
 
     def _windows(self, rng: np.random.Generator, number: int) -> Iterator[Batch]:
         length, together = self.spec.length, self.spec.consecutive
         # Groups of consecutive windows begin at another sample in each epoch.
         offsets = rng.integers(0, together, len(self.series)) if together > 1 else np.zeros(len(self.series), np.int64)
         ends = np.cumsum([self._groups(part, int(at)) for part, at in zip(self.series, offsets, strict=True)])
-        order = rng.permutation(ends[-1])
+        order = RandomOrder(rng, int(ends[-1]))
         groups = self.spec.batch // together
         for first in range(0, len(order), groups):
-            chosen = order[first : first + groups]
+            chosen = order.part(first, first + groups)
             rows, chance = [], self._chance(number, first)
             for i, j in zip(np.searchsorted(ends, chosen, side="right"), chosen, strict=True):
                 start = int(offsets[i] + (j - (ends[i - 1] if i else 0)) * together)

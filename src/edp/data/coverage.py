@@ -18,6 +18,7 @@ from edp.data.distance import Distance, split_distance
 from edp.data.integrals import contradiction, integral_fit
 from edp.data.roles import Axis, Roles, roles_of, signed
 from edp.data.splits import Split
+from edp.data.spread_rows import spread_recordings
 from edp.data.twin_channels import INTEGRAL
 from edp.errors import DataError
 from edp.recording import Recording
@@ -32,6 +33,8 @@ TAIL = 5e-4
 """Share of the samples at either end that lies outside a joint histogram."""
 QUANTILES = 32
 """Bins of equal content for the mutual information."""
+STRETCH_S = 120.0
+"""Of the stretches that a large data set is looked at by."""
 INFORMED = 200_000
 """Samples for the mutual information, evenly spread."""
 MEASURED, INTEGRATED = "strokes", "integrated velocity"
@@ -170,14 +173,22 @@ def cover(
             "map channels with their kinds, or name the inputs"
         )
     absent: list[str] = []
+    whole, hours = recordings, sum(r.samples for r in recordings) / first.rate_hz / 3600.0
+    recordings = spread_recordings(whole, STRETCH_S)
+    if sum(r.samples for r in recordings) < sum(r.samples for r in whole):
+        shown = sum(r.samples for r in recordings) / first.rate_hz / 3600.0
+        absent.append(
+            f"all but {len(recordings):,} evenly spread stretches of {STRETCH_S:g} s: counts, shares and histograms "
+            f"are of these {shown:.1f} h of {hours:,.1f} h"
+        )
     moving, constant = _inputs(recordings, roles)
     axes = _known_axes(first, roles, absent)
     occupancy = _occupancy(recordings, roles.axes, absent)
     if not roles.inputs:
         absent.append("excitation: no channel is known to command; name the inputs")
     return Coverage(
-        len(recordings),
-        sum(r.samples for r in recordings) / first.rate_hz / 3600.0,
+        len(whole),
+        hours,
         first.rate_hz,
         roles.inputs,
         spectrum.smallest_singular_values([r.select(moving).astype(np.float64) for r in recordings]) if moving else {},
@@ -188,7 +199,7 @@ def cover(
         events.activity_of(recordings, axes, dead_band),
         events.together(recordings, axes, dead_band),
         events.events_of(recordings, None if occupancy is None or not occupancy.full_stroke else _ends(occupancy)),
-        None if split is None else split_distance(recordings, roles.axes, split),
+        None if split is None else split_distance(whole, roles.axes, split),
         tuple(absent),
         tuple(_contradictions(recordings, roles.axes)),
     )

@@ -16,6 +16,8 @@ from edp.recording import Recording
 Array = NDArray[np.float64]
 REFERENCES, QUERIES = 20_000, 4_000
 """Samples searched in and searched for: distances shrink with the references, so both sides get equally many."""
+MOST_STATES = 1 << 20
+"""Of which some are drawn; beyond, states are thinned evenly first."""
 EARLIER_S = 0.2
 """Commands are looked at now and this long ago: the delay of a hydraulic axis."""
 
@@ -64,6 +66,7 @@ def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split:
 def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Sequence[Stretch]) -> Array:
     """Commands now and a little earlier, velocities and pressures, shape ``(sample, signal)``."""
     parts = []
+    every = -(-sum(stretch.stop - stretch.start for stretch in stretches) // MOST_STATES)
     for stretch in stretches:
         recording = recordings[stretch.recording]
         # A stretch shorter than the delay keeps its last sample.
@@ -72,7 +75,7 @@ def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Se
         commands = [axis.signed_command(recording) for axis in axes if axis.command]
         columns = [u[rows] for u in commands] + [u[rows.start - back : rows.stop - back] for u in commands]
         names = [name for axis in axes for name in (axis.velocity, *axis.pressures) if name]
-        parts.append(np.column_stack([*columns, recording.select(names)[rows]]).astype(np.float64))
+        parts.append(np.column_stack([*columns, recording.select(names)[rows]])[::every].astype(np.float64))
     return np.concatenate(parts) if parts else np.zeros((0, 0))
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.features import STARTING, derive
+from edp.data.gathered import LastMade, made_when_read, some_columns
+from edp.data.moments import Moments
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.signals import KINDS, Kind
@@ -51,6 +52,8 @@ def least_spread(kind: Kind, largest: float) -> float:
 def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
     """Features of a whole stretch, ``(time, feature)``, those of the start as if they were read at every tick."""
     inputs = task.features.inputs
+    if not task.features.derived and not task.features.starting:
+        return series.inputs[:, : len(task.features.channels)]
     columns = [series.inputs[:, i] for i in range(len(task.features.channels))]
     for entry in task.features.derived:
         columns.append(derive(entry, series.inputs[:, inputs.index(entry.source)], task.rate_hz))
@@ -58,6 +61,21 @@ def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
         columns += [series.inputs[:, inputs.index(name)] for name in task.features.starting]
         columns.append(np.ones(series.samples, dtype=np.float32))
     return np.stack(columns, axis=1)
+
+
+def feature_columns(task: Task, series: Series, places: Sequence[int], slot: LastMade) -> NDArray[np.float32]:
+    """Some features of a stretch, ``(time, len(places))``: channels as a view or on demand, derived ones when read.
+
+    Args:
+        task: what is read.
+        series: the stretch.
+        places: of the features, in the order wanted.
+        slot: shared by stretches that are gone through one after the other.
+    """
+    if max(places, default=0) < len(task.features.channels):
+        return some_columns(series.inputs, places)
+    shape = (series.samples, len(places))
+    return made_when_read(shape, lambda: feature_matrix(task, series)[:, list(places)], slot)
 
 
 def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Scaler:
@@ -68,7 +86,8 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
         train: the training stretches, nothing else.
         kinds: kind of each feature, in order.
     """
-    low, high, mean, std = _moments([partial(feature_matrix, task, series) for series in train])
+    features, changes = _moments(task, train)
+    low, high, mean, std = features.low, features.high, features.mean, features.deviation
     offset, scale = mean.copy(), std.copy()
     constant = []
     for i, kind in enumerate(kinds):
@@ -82,9 +101,8 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
             offset[i], scale[i] = (low[i] + high[i]) / 2, (high[i] - low[i]) / 2
     target_offset = np.zeros((len(task.horizons), len(task.targets)))
     target_scale = np.ones_like(target_offset)
-    for row, horizon in enumerate(task.horizons):
-        longer = [series for series in train if series.samples > horizon]
-        _, _, target_mean, target_std = _moments([partial(_encoded, task, series, horizon) for series in longer])
+    for row in range(len(task.horizons)):
+        target_mean, target_std = changes[row].mean, changes[row].deviation
         if task.mode is TargetMode.ABSOLUTE:
             target_offset[row] = target_mean
         # A target that never changes keeps its unit instead of dividing by zero.
@@ -92,37 +110,19 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
     return Scaler(offset, scale, target_offset, target_scale, tuple(constant))
 
 
-def _encoded(task: Task, series: Series, horizon: int) -> NDArray[np.float32]:
-    future = series.targets[horizon:]
-    if task.mode is TargetMode.DELTA:
-        return future - series.targets[: len(future)]
-    return future
+def _moments(task: Task, train: Sequence[Series]) -> tuple[Moments, list[Moments]]:
+    """Moments of the features, and of the encoded targets at each horizon, in one pass over the series."""
+    features = Moments(len(task.features.features))
+    changes = [Moments(len(task.targets)) for _ in task.horizons]
+    for series in train:
+        features.update(feature_matrix(task, series))
+        targets = np.asarray(series.targets)
+        for moments, horizon in zip(changes, task.horizons, strict=True):
+            if series.samples > horizon:
+                moments.update(_encoded(task, targets, horizon))
+    return features, changes
 
 
-Vector = NDArray[np.float64]
-
-
-def _moments(parts: Sequence[Callable[[], NDArray[np.float32]]]) -> tuple[Vector, Vector, Vector, Vector]:
-    """Minimum, maximum, mean and standard deviation per column, merged over parts in double precision.
-
-    Each part is made twice instead of kept: hours of logs need not be in memory together.
-    """
-    count, lows, highs, sums = 0, [], [], []
-    for make in parts:
-        part = make()
-        count += len(part)
-        lows.append(part.min(axis=0))
-        highs.append(part.max(axis=0))
-        sums.append(part.sum(axis=0, dtype=np.float64))
-    low, high = np.min(lows, axis=0).astype(np.float64), np.max(highs, axis=0).astype(np.float64)
-    mean = sum(sums) / count
-    # In two passes: the sum of squares less the squared mean would cancel for pressures of 30 MPa.
-    spread = sum(_squares(make(), mean) for make in parts) / count
-    return low, high, np.asarray(mean), np.sqrt(spread)
-
-
-def _squares(part: NDArray[np.float32], mean: Vector) -> Vector:
-    total = np.zeros_like(mean)
-    for start in range(0, len(part), 65536):  # double-precision copies of a block, not of the whole recording
-        total += np.square(part[start : start + 65536] - mean).sum(axis=0)
-    return total
+def _encoded(task: Task, targets: NDArray[np.float32], horizon: int) -> NDArray[np.float32]:
+    future = targets[horizon:]
+    return future - targets[: len(future)] if task.mode is TargetMode.DELTA else future

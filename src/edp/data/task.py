@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from edp.data.features import Derived, FeatureSet, column, kind_of
+from edp.data.gathered import stored_columns
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, FloatArray, Recording
@@ -165,12 +166,15 @@ class Task:
                 "reads; map the columns that hold them (rad, rad/s, m), choose another pose for the base ('angles' or "
                 "'strokes'), or remove model.physics"
             )
-        rows = slice(start, stop)
-        inputs = recording.select(self.inputs)[rows]
-        # What a store keeps on disk is not copied into memory where its columns lie side by side.
-        if not recording.on_disk:
-            inputs = np.ascontiguousarray(inputs)
-        targets = np.stack([column(recording, target, self.derived)[rows] for target in self.targets], axis=1)
+        if recording.on_disk:
+            # What a store keeps on disk is not copied into memory.
+            inputs = stored_columns(recording, self.inputs, (), start, stop)
+            targets = stored_columns(recording, self.targets, self.derived, start, stop)
+        else:
+            rows = slice(start, stop)
+            inputs = np.ascontiguousarray(recording.select(self.inputs)[rows])
+            columns = [column(recording, target, self.derived)[rows] for target in self.targets]
+            targets = np.stack(columns, axis=1)
         for values, names in ((inputs, self.inputs), (targets, self.targets)):
             first_bad = first_not_finite(values)
             if first_bad is not None:
@@ -181,7 +185,7 @@ class Task:
                     f"{start + row}; repair the log or allow a repair (--repair nan=hold)"
                 )
         machine = str(recording.meta.get(MACHINE, "")).lower()
-        return Series(name or recording.name, inputs, np.ascontiguousarray(targets), machine=machine)
+        return Series(name or recording.name, inputs, targets, machine=machine)
 
 
 def first_not_finite(values: FloatArray) -> tuple[int, int] | None:

@@ -11,16 +11,18 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError, DataError
+from edp.logs.buckets import BucketReader, RemoteFile, bucket_address
 from edp.logs.detect import known_suffixes
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into, unreadable
-from edp.logs.quality.quality import QualityReport, inspect
-from edp.logs.quality.repeats import Sketch, sketch
+from edp.logs.quality.quality import inspect
+from edp.logs.quality.repeats import Sketches, sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
 from edp.logs.store.building import StoredLog, StoreProgress, build_store
 from edp.logs.store.index import StoreIndex, is_store
 from edp.logs.store.opening import read_store
+from edp.logs.store.remote import is_remote_store, local_store
 from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
@@ -61,7 +63,8 @@ class DataSource:
     """Where recordings come from.
 
     Attributes:
-        path: a log, a folder of logs, a data-set file (``.toml``), or a store.
+        path: a log, a folder of logs, a data-set file (``.toml``), or a store; ``s3://``, ``gs://`` or ``az://`` for a
+            store in a bucket, and for logs to build one from.
         signal_map: columns to channels; None takes the vocabulary's names.
         repair: what may be repaired.
     """
@@ -78,11 +81,20 @@ class DataSource:
     @property
     def stored(self) -> bool:
         """Whether it is a store, whose logs were mapped and repaired when it was built."""
-        return is_store(self.path)
+        return is_remote_store(self.address) if self.address else is_store(self.path)
+
+    @property
+    def address(self) -> str:
+        """Where in a bucket it lies; empty on this machine."""
+        return bucket_address(self.path)
+
+    def store_folder(self) -> Path:
+        """The folder of a store; of one in a bucket that of its copy."""
+        return local_store(self.address) if self.address else self.path
 
     def to_plain(self) -> dict[str, Any]:
         """What provenance keeps, to read the same data again."""
-        plain: dict[str, Any] = {"path": str(self.path.resolve())}
+        plain: dict[str, Any] = {"path": self.address or str(self.path.resolve())}
         if self.signal_map is not None:
             plain["map"] = plain_tree(self.signal_map)
         if self.repair is not None:
@@ -102,6 +114,8 @@ class DataSource:
             return []
         if self.path.suffix == ".toml":
             return _listed(self.path, self.signal_map, self.repair)
+        if self.address:
+            return _in_bucket(self.address, self.signal_map, self.repair)
         return [Log(path, self.signal_map, self.repair) for path in find_recordings(self.path)]
 
     def read(self) -> list[Recording]:
@@ -113,7 +127,8 @@ class DataSource:
         """
         if self.stored:
             self._check_store_options()
-            return read_store(self.path)
+            return read_store(self.store_folder())
+        self._refuse_bucket()
         if self.path.suffix != ".toml":
             return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
         recordings = [log.read() for log in self.logs()]
@@ -131,24 +146,28 @@ class DataSource:
         """
         if self.stored:
             return self._inspect_store(on_log)
+        self._refuse_bucket()
         logs = self.logs()
-        seen: list[tuple[QualityReport, Sketch | None]] = []
+        reports, sketches, sketched = [], Sketches(), []
         broken: list[DataError] = []
         for i, log in enumerate(logs):
             if on_log is not None:
                 on_log(log.path, i + 1, len(logs))
             try:
-                seen.append(look_into(log.path, log.signal_map, log.name, log.rows, log.repair))
+                report, one = look_into(log.path, log.signal_map, log.name, log.rows, log.repair)
             except DataError as error:
                 broken.append(error)
-                seen.append((unreadable(log.path, error), None))
-        if len(broken) == len(logs) and broken:
+                report, one = unreadable(log.path, error), None
+            reports.append(report)
+            if one is not None:
+                sketches.add(one)
+                sketched.append(i)
+        if broken and len(broken) == len(logs):
             raise broken[0]
         # Before they are compared: a finding on two recordings must tell which is which.
-        names = unique_names([report.name for report, _ in seen], [log.path for log in logs])
-        reports = [replace(report, name=name) for (report, _), name in zip(seen, names)]
-        sketches = [replace(sketch, name=name) for (_, sketch), name in zip(seen, names) if sketch is not None]
-        return compare(reports, sketches)
+        names = unique_names([report.name for report in reports], [log.path for log in logs])
+        sketches.all = [replace(one, name=names[i]) for one, i in zip(sketches.all, sketched, strict=True)]
+        return compare([replace(report, name=name) for report, name in zip(reports, names)], sketches)
 
     def store(
         self, folder: str | Path, workers: int = 1, on_progress: Callable[[StoreProgress], None] | None = None
@@ -156,22 +175,43 @@ class DataSource:
         """Read the logs into a store; see `edp.logs.store.build_store`."""
         if self.stored:
             raise ConfigError(f"'{self.path}' is a store already; give the logs that it is to be built from")
+        if bucket_address(folder):
+            raise ConfigError(
+                f"--out {bucket_address(folder)}: a store is built on this machine; build it in a folder, then copy "
+                "that with the tool of your service"
+            )
         stored = [
-            StoredLog(log.path, log.signal_map or SignalMap(), log.repair or Repair(), log.name, log.rows, log.machine)
+            StoredLog(
+                log.path,
+                log.signal_map or SignalMap(),
+                log.repair or Repair(),
+                log.name,
+                log.rows,
+                log.machine,
+                log.remote,
+            )
             for log in self.logs()
         ]
         return build_store(stored, folder, workers, on_progress)
 
     def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
         self._check_store_options()
-        recordings = read_store(self.path)
-        reports, sketches = [], []
+        recordings = read_store(self.store_folder())
+        reports, sketches = [], Sketches()
         for i, recording in enumerate(recordings):
             if on_log is not None:
                 on_log(self.path / recording.name, i + 1, len(recordings))
             reports.append(inspect(recording))
-            sketches.append(sketch(recording))
+            sketches.add(sketch(recording))
         return compare(reports, sketches)
+
+    def _refuse_bucket(self) -> None:
+        """Logs in buckets are read once: each command would copy them again."""
+        if self.address:
+            raise ConfigError(
+                f"'{self.address}' holds logs and no store; read them once with `edp store build {self.address} --out "
+                "store`, and give this command the store"
+            )
 
     def _check_store_options(self) -> None:
         options = [name for name, value in (("--map", self.signal_map), ("--repair", self.repair)) if value is not None]
@@ -192,11 +232,29 @@ class Log:
     name: str | None = None
     rows: tuple[int, int] | None = None
     machine: str = ""
+    remote: RemoteFile | None = None
 
     def read(self) -> Recording:
         """The recording."""
+        if self.remote is not None:
+            raise ConfigError(
+                f"'{self.remote.address}' lies in a bucket; read the data set once with `edp store build`, and give "
+                "the store"
+            )
         recording = read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
         return replace(recording, meta={**recording.meta, MACHINE: self.machine}) if self.machine else recording
+
+
+def _in_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
+    """The logs below an address of a bucket, or the one at it, by the endings of their names."""
+    objects = BucketReader(address).objects(address)
+    suffixes = known_suffixes()
+    chosen = [file for file in objects if Path(file.name).suffix.lower() in suffixes]
+    if not chosen:
+        raise DataError(f"'{address}' holds {len(objects):,} object(s), none with the ending of a log that EDP reads")
+    # As in a folder: what only a simulation knows of the log beside it is no log.
+    logs = [file for file in chosen if not Path(file.name).stem.endswith(".truth")]
+    return [Log(Path(file.address), signal_map, repair, remote=file) for file in logs]
 
 
 def load_signal_map(path: str | Path) -> SignalMap:
@@ -243,18 +301,16 @@ def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> 
         return load_signal_map(path.parent / entry) if isinstance(entry, str) else entry
 
     shared = signal_map or resolved(settings.map)
-    return [
-        # An absolute path stands for itself.
-        Log(
-            path.parent / _expanded(entry.path, path),
-            resolved(entry.map) or shared,
-            repair or entry.repair or settings.repair,
-            entry.name,
-            entry.rows,
-            entry.machine,
-        )
-        for entry in settings.recordings
-    ]
+    logs = []
+    for entry in settings.recordings:
+        expanded = _expanded(entry.path, path)
+        address = bucket_address(expanded)
+        remote = BucketReader(address).objects(address)[0] if address else None
+        # An absolute path stands for itself, and so does an address.
+        where = Path(address) if address else path.parent / expanded
+        chosen, allowed = resolved(entry.map) or shared, repair or entry.repair or settings.repair
+        logs.append(Log(where, chosen, allowed, entry.name, entry.rows, entry.machine, remote))
+    return logs
 
 
 def _check_listed(recordings: list[Recording], path: Path) -> None:

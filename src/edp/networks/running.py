@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,7 +18,9 @@ from edp.networks.losses import Prediction
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import State
 
+A = TypeVar("A")
 Run = Callable[[Tensor, State], tuple[Tensor, State]]
+MOST_TICKS_TOGETHER = 1 << 22  # of streams side by side whose answers are in memory: 11 hours at 100 Hz
 PIECE = 512  # ticks per call, or windows: long enough for speed, short enough for memory
 
 
@@ -103,21 +108,41 @@ def stream_hidden(predictor: Predictor, series: Sequence[Series], batch: int = 4
 
 
 def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int) -> list[NDArray[np.float32]]:
+    results = dict(streamed(predictor, run, series, batch))
+    return [results[i] for i in range(len(series))]
+
+
+def streamed(
+    predictor: Predictor, run: Run, series: Sequence[Series], batch: int = 16
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Number of each series and what `run` gives at every tick of it, ``(time, ...)``; shorter ones come first.
+
+    Args:
+        predictor: the network, which is in the state of evaluation until the last series was given.
+        run: a method of it, such as ``predictor.predict``.
+        series: each from reset, state carried to its end.
+        batch: streams side by side; fewer where they are so long that their answers would fill the memory.
+    """
     # Streams of like length run together, so that little is computed beyond the end of the shorter ones.
     order = sorted(range(len(series)), key=lambda i: series[i].samples)
-    results: dict[int, NDArray[np.float32]] = {}
+    at = 0
+    with _evaluating(predictor):
+        while at < len(order):
+            longest = max(1, series[order[min(at + batch, len(order)) - 1]].samples)
+            group = order[at : at + max(1, min(batch, MOST_TICKS_TOGETHER // longest))]
+            yield from zip(group, _run_group(predictor, run, [series[i] for i in group]), strict=True)
+            at += len(group)
+
+
+@contextmanager
+def _evaluating(predictor: Predictor) -> Iterator[None]:
     was_training = predictor.training
-    # Dropout off, and no graph: predictions must not depend on how often they are asked for.
+    # Dropout off: predictions must not depend on how often they are asked for.
     predictor.eval()
     try:
-        with torch.inference_mode():
-            for at in range(0, len(order), batch):
-                group = order[at : at + batch]
-                group_answers = _run_group(predictor, run, [series[i] for i in group])
-                results.update(zip(group, group_answers, strict=True))
+        yield
     finally:
         predictor.train(was_training)  # back to what the caller had
-    return [results[i] for i in range(len(series))]
 
 
 def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[NDArray[np.float32]]:
@@ -147,18 +172,58 @@ def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[N
 
 
 def _run_group(predictor: Predictor, run: Run, group: list[Series]) -> list[NDArray[np.float32]]:
-    longest = max(part.samples for part in group)
-    like = next(predictor.parameters())
-    state = predictor.initial_state(len(group), like)
     out: list[list[NDArray[np.float32]]] = [[] for _ in group]
-    for start in range(0, longest, PIECE):
-        stop = min(start + PIECE, longest)
-        rows = np.arange(start, stop)
-        # A shorter stream repeats its last tick; those predictions are cut off below.
-        x = np.stack([part.inputs[np.minimum(rows, part.samples - 1)] for part in group])
-        y, state = run(torch.from_numpy(x).to(device=like.device, dtype=like.dtype), state)
-        values = y.float().cpu().numpy()
+
+    def numbers(x: Tensor, state: State) -> tuple[NDArray[np.float32], State]:
+        y, new = run(x, state)
+        return y.float().cpu().numpy(), new
+
+    for start, values in _pieces(predictor, numbers, group):
         for i, part in enumerate(group):
             if start < part.samples:
                 out[i].append(values[i, : part.samples - start])
     return [np.concatenate(pieces) for pieces in out]
+
+
+def _pieces(
+    predictor: Predictor, run: Callable[[Tensor, State], tuple[A, State]], group: Sequence[Series]
+) -> Iterator[tuple[int, A]]:
+    """First tick and what `run` gives of each piece of streams side by side; state is carried to the end."""
+    longest = max(part.samples for part in group)
+    like = next(predictor.parameters())
+    state = predictor.initial_state(len(group), like)
+    for start in range(0, longest, PIECE):
+        rows = np.arange(start, min(start + PIECE, longest))
+        # A shorter stream repeats its last tick; what is said of those ticks is for the caller to leave out.
+        x = np.stack([part.inputs[np.minimum(rows, part.samples - 1)] for part in group])
+        # Inside the loop: a mode that a generator enters would stay on between its values.
+        with torch.inference_mode():
+            y, state = run(torch.from_numpy(x).to(device=like.device, dtype=like.dtype), state)
+        yield start, y
+
+
+def answered_pieces(
+    predictor: Predictor, series: Sequence[Series], batch: int = 16
+) -> Iterator[tuple[int, int, Prediction, Tensor]]:
+    """What the network says of each series, piece by piece, so that hours of answers need not lie in memory.
+
+    Returns:
+        number of the series, first tick of the piece, what is said of it and the features that it was said from
+        ``(1, tick, feature)``. Pieces of a series come in order, series of like length side by side.
+    """
+    order = sorted(range(len(series)), key=lambda i: series[i].samples)
+
+    def run(x: Tensor, state: State) -> tuple[tuple[Prediction, Tensor], State]:
+        answer, features, new = predictor.run(x, state)
+        return (answer, features), new
+
+    with _evaluating(predictor):
+        for at in range(0, len(order), batch):
+            group = order[at : at + batch]
+            for start, (answer, features) in _pieces(predictor, run, [series[i] for i in group]):
+                for lane, i in enumerate(group):
+                    ticks = slice(0, max(0, series[i].samples - start))
+                    center, spread = (part[lane : lane + 1, ticks] for part in (answer.center, answer.spread))
+                    if center.shape[1]:
+                        piece_answer = replace(answer, center=center, spread=spread)
+                        yield i, start, piece_answer, features[lane : lane + 1, ticks]

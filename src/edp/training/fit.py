@@ -118,7 +118,7 @@ class Loop:
                     f"{spec.chunks.burn_in} plus the horizon of {data.task.max_horizon}; give a longer one"
                 )
         if self.net.physics is not None:
-            self.net.physics.settle([torch.from_numpy(part.inputs) for part in data.train])
+            self.net.physics.settle(torch.from_numpy(part.inputs[:]) for part in data.train)
         started = start_bypass(self.net, data.train, data.validation)
         if strategy is not None:
             started = strategy.begin(self.net, spec) or started

@@ -11,6 +11,7 @@ from edp.networks.predictor import Predictor
 from edp.networks.streaming import state_numbers
 from edp.storage.memory import check_setting
 from edp.training.spec import TrainingSpec
+from edp.training.validation import MOST_VALIDATED
 
 FLOAT, DOUBLE = 4, 8
 COPIES = 6
@@ -71,8 +72,8 @@ def _batch(net: Predictor, spec: TrainingSpec) -> float:
 
 
 def _validation(net: Predictor, data: Prepared) -> float:
-    """What the network says of all ticks that validate, in double precision."""
-    ticks = sum(part.samples for part in data.validation)
+    """What the network says of ticks that validate, in double precision: of those that judge."""
+    ticks = min(sum(part.samples for part in data.validation), MOST_VALIDATED)
     return 3 * DOUBLE * ticks * len(net.task.horizons) * len(net.task.targets) * (1 + net.spec.output.values)
 
 

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from edp.data.gathered import LastMade
 from edp.data.lags import LagTask, origins
 from edp.data.ridge import crossed_solution, ridge_solution
-from edp.data.scaling import feature_matrix
+from edp.data.scaling import feature_columns
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import DataError
@@ -41,8 +42,9 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
     # A target that is no feature has no level to start from: the regression then finds it from the features.
     present = tuple(None if column is None else read.index(column) for column in task.present)
     lags = LagTask(task.horizons, present, bypass.spec.taps)
+    slot = LastMade()
     series_of_parts = [
-        [Series(part.name, feature_matrix(task, part)[:, read], part.targets) for part in parts]
+        [Series(part.name, feature_columns(task, part, read, slot), part.targets) for part in parts]
         for parts in (train, validation)
     ]
     # Validation alone cannot fit the regression; it only chooses its penalty.

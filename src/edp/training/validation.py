@@ -11,11 +11,17 @@ from torch import Tensor
 
 from edp.data.prepared import Prepared
 from edp.data.series import Series
+from edp.data.spread_rows import spread_series
 from edp.networks.losses import Prediction
 from edp.networks.predictor import Predictor
-from edp.networks.running import stream_answers
+from edp.networks.running import answered_pieces, stream_answers
 from edp.signals import KINDS
 from edp.training.spec import TrainingSpec
+
+MOST_VALIDATED = 1 << 20
+"""Ticks that judge an epoch and calibrate intervals, about; three hours at 100 Hz."""
+STARTS_A_STRETCH = 100
+"""Times the start-up of a network that a stretch is long: of its ticks one per cent are not judged."""
 
 
 def validation_scores(
@@ -28,37 +34,65 @@ def validation_scores(
     # Double precision: sums over hours of ticks in float32 lose the digits in which epochs differ.
     scale = net.code.width.detach().cpu().double()
     factors = torch.tensor([KINDS[kind].report_factor for kind in data.target_kinds], dtype=torch.float64)
-    absolute, count, loss = torch.zeros_like(scale), 0, 0.0
-    for answer, target in _answers(net, series, spec, windowed):
-        absolute += (answer.center - target).abs().sum(dim=(0, 1))
+    series = judged_stretches(net, series, spec)
+    absolute, count, loss = torch.zeros(len(series), *scale.shape, dtype=torch.float64), 0, [0.0] * len(series)
+    for i, answer, target in _answers(net, series, spec, windowed):
+        absolute[i] += (answer.center - target).abs().sum(dim=(0, 1))
         count += target.shape[1]
-        loss += float(spec.loss.evaluate(answer, target).mean(dim=(-1, -2)).sum())
-    mean = absolute / max(1, count)
-    return float(mean.mean()), float((mean * scale * factors).mean()), loss / max(1, count)
+        loss[i] += float(spec.loss.evaluate(answer, target).mean(dim=(-1, -2)).sum())
+    mean = absolute.sum(dim=0) / max(1, count)
+    return float(mean.mean()), float((mean * scale * factors).mean()), sum(loss) / max(1, count)
+
+
+def judged_stretches(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> list[Series]:
+    """What epochs are judged on: the series, or of more than `MOST_VALIDATED` ticks evenly spread stretches of them.
+
+    Else an epoch of a fixed number of updates would take hours to judge where the store is large.
+    """
+    start_up = max(spec.chunks.burn_in, net.spec.window) + net.task.max_horizon
+    return spread_series(series, STARTS_A_STRETCH * start_up, MOST_VALIDATED)
 
 
 def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> None:
     """Stretch the intervals of a network so that they hold their share of `series`."""
-    pairs = list(_answers(net, series, spec))
-    first = pairs[0][0]
+    answers, targets = [], []
+    for _, answer, target in _answers(net, judged_stretches(net, series, spec), spec, windowed=False):
+        answers.append(answer)
+        targets.append(target)
     answer = replace(
-        first,
-        center=torch.cat([one.center for one, _ in pairs], dim=1),
-        spread=torch.cat([one.spread for one, _ in pairs], dim=1),
+        answers[0],
+        center=torch.cat([one.center for one in answers], dim=1),
+        spread=torch.cat([one.spread for one in answers], dim=1),
     )
-    net.output.calibrate(answer, torch.cat([target for _, target in pairs], dim=1))
+    net.output.calibrate(answer, torch.cat(targets, dim=1))
 
 
 def _answers(
-    net: Predictor, series: Sequence[Series], spec: TrainingSpec, windowed: bool = False
-) -> Iterator[tuple[Prediction, Tensor]]:
-    """What the network says of each series after start-up, and the standardised targets; batches of one."""
+    net: Predictor, series: Sequence[Series], spec: TrainingSpec, windowed: bool
+) -> Iterator[tuple[int, Prediction, Tensor]]:
+    """Number of a series, what the network says of a piece of it, and the standardised targets; no start-up.
+
+    Batches of one, double precision.
+    """
     # Ticks of the start judge the reset and not the network; training gives them no loss either.
     skip = spec.chunks.burn_in if spec.chunks.regime == "chunk" else net.spec.window - 1
-    for part, answer in zip(series, stream_answers(net, series, windowed=windowed), strict=True):
-        target = standard_targets(net, part)[:, skip:]
-        ticks = slice(skip, skip + target.shape[1])
-        yield replace(answer, center=answer.center[:, ticks], spread=answer.spread[:, ticks]), target
+    if windowed:
+        for i, part in enumerate(series):
+            answer = stream_answers(net, [part], windowed=True)[0]
+            target = standard_targets(net, part)[:, skip:]
+            ticks = slice(skip, skip + target.shape[1])
+            yield i, replace(answer, center=answer.center[:, ticks], spread=answer.spread[:, ticks]), target
+        return
+    for i, start, answer, features in answered_pieces(net, series):
+        part = series[i]
+        first, stop = max(start, skip), min(start + features.shape[1], part.samples - net.task.max_horizon)
+        if first < stop:
+            ticks = slice(first - start, stop - start)
+            future = np.stack([part.targets[first + k : stop + k] for k in net.task.horizons], axis=1)
+            with torch.inference_mode():
+                target = net.code.encode(torch.from_numpy(future).unsqueeze(0).to(features), features[:, ticks])
+            center, spread = (one[:, ticks].float().cpu().double() for one in (answer.center, answer.spread))
+            yield i, replace(answer, center=center, spread=spread), target.cpu().double()
 
 
 def standard_targets(net: Predictor, part: Series) -> Tensor:

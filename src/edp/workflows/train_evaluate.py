@@ -23,11 +23,10 @@ from edp.evaluation.channel_importance import ChannelImportances, ChannelImporta
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import Evaluation, JudgeSpec, judge, score_predictions
+from edp.evaluation.judge import Evaluation, JudgeSpec, judge, score_network
 from edp.evaluation.scores_file import earlier_scores
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
-from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
@@ -42,9 +41,6 @@ from edp.training.strategy import DirectFit, TrainingStrategy
 
 if TYPE_CHECKING:
     from edp.sim.data_set import SimulationOrder, simulate_data_set
-
-# Ten minutes at 100 Hz: more than a picture can show.
-SHOWN_RECORDINGS, SHOWN_TICKS = 6, 60_000
 
 
 def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
@@ -284,7 +280,7 @@ def evaluate(
         evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
         # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
-        write_bytes(target / "predictions.safetensors", save(evaluation.kept(SHOWN_RECORDINGS, SHOWN_TICKS)))
+        write_bytes(target / "predictions.safetensors", save(evaluation.tensors))
         write_json(target / "scores.json", scores)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
@@ -354,7 +350,7 @@ def _floor_scores(folder: Path, data: Prepared, scores: Mapping[str, Any]) -> di
     if not (folder / FLOOR).is_dir():
         return None
     floor = load_bundle(folder / FLOOR).predictor
-    return score_predictions(stream_predictions(floor, data.test), data, scores["task"]["skip"])
+    return score_network(floor, data, scores["task"]["skip"])
 
 
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.data.gathered import on_demand, some_columns
 from edp.data.screening.result import Array
 from edp.data.screening.spec import ScreeningSpec
+from edp.data.spread_rows import MOST_ROWS, spread_stretches
 from edp.errors import DataError, closest
 from edp.recording import FloatArray, Recording
 from edp.signals import TABLE_A1, Kind
 
+LEAST_LAGS, LAGS_A_STRETCH = 5, 40
+"""Largest lags that a recording is long at least, and that a stretch of a large data set is."""
 MOST_PIECES = 24
 """Beyond, several recordings form a piece."""
 _GROUPS = {
@@ -123,9 +127,9 @@ class CandidateTable:
         return np.concatenate([s[rows] for s, rows in zip(stretches, self.thinned(count), strict=True)])
 
 
-def chunks(stretches: Sequence[FloatArray], rows: int = 32_768) -> list[Array]:
+def chunks(stretches: Sequence[FloatArray], rows: int = 32_768) -> Iterator[Array]:
     """Stretches in float64, some rows at a time."""
-    return [s[i : i + rows].astype(np.float64) for s in stretches for i in range(0, len(s), rows)]
+    return (s[i : i + rows].astype(np.float64) for s in stretches for i in range(0, len(s), rows))
 
 
 def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> CandidateTable:
@@ -154,7 +158,10 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
             )
     names = tuple(sorted(names, key=first.index))
     columns = [
-        recording.select(names) if recording.channel_names != names else recording.values for recording in recordings
+        on_demand(recording.values, [recording.index(name) for name in names])
+        if recording.on_disk
+        else recording.select(names)
+        for recording in recordings
     ]
     missing = _missing(names, columns)
     blind = [name for name in targets if name in missing]
@@ -165,14 +172,14 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
         )
     present_columns = [i for i, name in enumerate(names) if name not in missing]
     if missing:
-        columns = [values[:, present_columns] for values in columns]
+        columns = [some_columns(values, present_columns) for values in columns]
     names = tuple(names[i] for i in present_columns)
     kinds = {channel.name: channel.kind for channel in first.channels}
     table = CandidateTable(
         names,
         tuple(group_of(name, kinds[name]) for name in names),
         tuple(names.index(name) for name in targets),
-        _pieces([r.name for r in recordings], columns, spec),
+        _thinned(_pieces([r.name for r in recordings], columns, spec), spec.max_lag),
         first.rate_hz,
         missing,
         short,
@@ -208,7 +215,7 @@ def _usual_targets(recording: Recording) -> tuple[str, ...]:
 def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequence[Recording], tuple[str, ...]]:
     """Recordings of at least five times the largest lag, and the names of the others."""
     # A correlation at the largest lag then rests on four fifths of the rows at least.
-    least = 5 * max_lag
+    least = LEAST_LAGS * max_lag
     long = [recording for recording in recordings if recording.samples >= least]
     short = tuple(recording.name for recording in recordings if recording.samples < least)
     if sum(recording.samples for recording in long) < 4 * least:
@@ -250,3 +257,18 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
                 label = name if parts == 1 else f"{name} part {i + 1}"
                 pieces.append(Piece(label, (values[edges[i] : edges[i + 1]],)))
     return tuple(pieces)
+
+
+def _thinned(pieces: tuple[Piece, ...], max_lag: int) -> tuple[Piece, ...]:
+    """Pieces of at most `MOST_ROWS` in all, about: of more, evenly spread stretches of each recording, in memory."""
+    lengths = [len(stretch) for piece in pieces for stretch in piece.stretches]
+    if sum(lengths) <= MOST_ROWS:
+        return pieces
+    owners = [p for p, piece in enumerate(pieces) for _ in piece.stretches]
+    whole = [stretch for piece in pieces for stretch in piece.stretches]
+    stretches_of_piece: list[list[FloatArray]] = [[] for _ in pieces]
+    for i, start, stop in spread_stretches(lengths, LAGS_A_STRETCH * max_lag):
+        # Rest at the end of a recording may be too short for the lags.
+        if stop - start >= LEAST_LAGS * max_lag:
+            stretches_of_piece[owners[i]].append(np.ascontiguousarray(whole[i][start:stop]))
+    return tuple(Piece(piece.name, tuple(own)) for piece, own in zip(pieces, stretches_of_piece, strict=True) if own)

@@ -61,14 +61,16 @@ def sample_table(series: Sequence[Series], task: BaselineTask, means: DoubleArra
     """At most `cap` rows drawn without replacement over all series, in order; the same seed draws the same rows."""
     lengths = np.array([len(origins(one, task)) for one in series], dtype=np.int64)
     total = int(lengths.sum())
-    chosen = np.arange(total)
     # Sorted, so that rows keep the order of their recording; without replacement, so that none counts twice.
     if total > cap:
         chosen = np.sort(np.random.default_rng(task.seed).choice(total, size=cap, replace=False))
+    else:
+        chosen = np.arange(total)
     ends = np.cumsum(lengths)
     features, changes = [], []
     for one, start, end in zip(series, ends - lengths, ends):
-        ticks = chosen[(chosen >= start) & (chosen < end)] - start + task.history - 1
+        first, last = np.searchsorted(chosen, (start, end))
+        ticks = chosen[first:last] - start + task.history - 1
         if ticks.size:
             features.append(lag_features(one.inputs, ticks, task.history))
             change = future(one, task, ticks) - anchors(one.inputs[ticks], task, means)[:, None, :]

@@ -11,7 +11,7 @@ import numpy as np
 
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.quality import QualityReport, plain, verdict_of
-from edp.logs.quality.repeats import Repeat, Sketch, find_repeats
+from edp.logs.quality.repeats import Repeat, Sketches, find_repeats
 from edp.signals import UNITS, Kind
 
 _LEAST_RATIO = 9.0
@@ -61,18 +61,27 @@ class DataQuality:
         }
 
 
-def compare(reports: Sequence[QualityReport], sketches: Sequence[Sketch]) -> DataQuality:
+def compare(reports: Sequence[QualityReport], sketches: Sketches) -> DataQuality:
     """Compare the recordings of a data set.
 
     Args:
         reports: of the recordings, each alone.
         sketches: of those that could be read.
     """
-    repeats = find_repeats(sketches)
+    repeats = find_repeats(sketches.all)
     advice = (
         "keep one of them, or put both on one side of the split: a test that repeats training says nothing of new data"
     )
     findings = [Finding("warning", None, repeat.what, 1, "", advice) for repeat in repeats]
+    if sketches.by_hash:
+        first = len(sketches.all) - sketches.by_hash
+        what = (
+            f"sessions that repeat in part were looked for among the first {first:,} recordings; the other "
+            f"{sketches.by_hash:,} were compared by the hash of their samples alone"
+        )
+        findings.append(
+            Finding("note", None, what, sketches.by_hash, "", "inspect other parts of the data by themselves")
+        )
     return DataQuality(tuple(reports), repeats, (*findings, *_two_units(reports)))
 
 

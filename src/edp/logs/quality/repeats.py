@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,9 @@ from edp.recording import Recording
 
 SKETCH_HZ = 10.0
 """Rate of a sketch: fast enough for moves of a machine, and any logger reaches it."""
+MOST_BYTES = 256 * 2**20
+"""Of the sketches of a data set: 40 hours of 45 channels."""
+HASHED_ROWS = 65_536
 WINDOW = 128
 """Blocks of a fingerprint, 12.8 s."""
 _HOP = 32
@@ -62,6 +65,7 @@ class Sketch:
         values: means over 0.1 s, each channel over its deviation about its mean, shape ``(block, channel)``.
         hz: blocks per second; `SKETCH_HZ`, or the recording's own rate where that is lower.
         digest: of the samples, whatever the channels are called.
+        seconds: that the recording lasts.
     """
 
     name: str
@@ -69,6 +73,26 @@ class Sketch:
     values: Floats
     hz: float
     digest: str
+    seconds: float
+
+    def with_hash_alone(self) -> Sketch:
+        """The sketch less its values: the recording is compared by the hash of its samples alone."""
+        return replace(self, values=self.values[:0].copy())
+
+
+class Sketches:
+    """The sketches of a data set; once they take `most` bytes, further recordings leave their hash alone."""
+
+    def __init__(self, most: int = MOST_BYTES) -> None:
+        self.left, self.all, self.by_hash = most, list[Sketch](), 0
+
+    def add(self, sketch: Sketch) -> None:
+        """Keep one more."""
+        self.left -= sketch.values.nbytes
+        if self.left < 0:
+            sketch = sketch.with_hash_alone()
+            self.by_hash += 1
+        self.all.append(sketch)
 
 
 @dataclass(frozen=True)
@@ -136,8 +160,11 @@ def sketch(recording: Recording, name: str | None = None) -> Sketch:
         std = float(coarse.std())
         # Divided by a deviation of rounding, a channel at rest would become noise.
         block_means[:, channel_index] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
-    digest = hashlib.blake2b(np.ascontiguousarray(recording.values).tobytes(), digest_size=16).hexdigest()
-    return Sketch(name or recording.name, recording.channel_names, block_means, hz, digest)
+    digest = hashlib.blake2b(digest_size=16)
+    for start in range(0, recording.samples, HASHED_ROWS):
+        digest.update(np.ascontiguousarray(recording.values[start : start + HASHED_ROWS]).data)
+    text, seconds = digest.hexdigest(), recording.samples / rate
+    return Sketch(name or recording.name, recording.channel_names, block_means, hz, text, seconds)
 
 
 def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
@@ -165,7 +192,7 @@ def _equal_pairs(sketches: Sequence[Sketch]) -> list[tuple[int, int]]:
 def _identical(a: Sketch, b: Sketch) -> Repeat:
     count = len(a.channels)
     renamed = tuple((x, y) for x, y in zip(a.channels, b.channels, strict=True) if x != y)
-    return Repeat(a.name, b.name, len(a.values) / a.hz, 1.0, 0.0, 0.0, count, count, 1.0, renamed, True)
+    return Repeat(a.name, b.name, a.seconds, 1.0, 0.0, 0.0, count, count, 1.0, renamed, True)
 
 
 def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from edp.errors import ConfigError, DataError, EdpError, LostError
 from edp.logs.assemble import Assembly, parts, prepare
+from edp.logs.buckets import RemoteFile, copied
 from edp.logs.detect import open_log
 from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
@@ -64,7 +65,10 @@ MOST_FILES = 400
 
 @dataclass(frozen=True)
 class StoredLog:
-    """A log to be stored, and how it is read; see `edp.logs.source.Log`."""
+    """A log to be stored, and how it is read; see `edp.logs.source.Log`.
+
+    With `remote` it lies in a bucket, from which it is copied while it is read; `path` is then its address.
+    """
 
     path: Path
     signal_map: SignalMap = field(default_factory=SignalMap)
@@ -72,18 +76,28 @@ class StoredLog:
     name: str | None = None
     rows: tuple[int, int] | None = None
     machine: str = ""
+    remote: RemoteFile | None = None
+
+    @property
+    def where(self) -> str:
+        """Its address, or the path of the file in full."""
+        return str(self.path.resolve()) if self.remote is None else self.remote.address
 
     @property
     def size(self) -> int:
         """Bytes of the file, or of the files of a folder."""
+        if self.remote is not None:
+            return self.remote.size
         return sum(part.stat().st_size for part in self._files())
 
     @property
     def key(self) -> str:
         """A hash of where it lies, of its size and time, and of how it is read."""
         facts = [(str(part), part.stat().st_size, part.stat().st_mtime_ns) for part in self._files()]
+        if self.remote is not None:
+            facts = [(self.remote.address, self.remote.size, self.remote.written_ns)]
         how = [plain_tree(self.signal_map), asdict(self.repair), self.name, self.rows, self.machine]
-        text = json.dumps([SCHEMA, str(self.path.resolve()), facts, how], default=str)
+        text = json.dumps([SCHEMA, self.where, facts, how], default=str)
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def _files(self) -> list[Path]:
@@ -186,7 +200,7 @@ def _distinct(logs: Sequence[StoredLog]) -> dict[str, StoredLog]:
 
 def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
     """The index less recordings whose log was changed, or is to be read in another way."""
-    paths = {str(log.path.resolve()) for log in logs.values()}
+    paths = {log.where for log in logs.values()}
     unchanged = tuple(entry for entry in index.recordings if entry.log not in paths or entry.log_key in logs)
     used = {entry.rows for entry in unchanged}
     return replace(index, recordings=unchanged, files=tuple(file for file in index.files if file.key in used))
@@ -238,12 +252,25 @@ def store_batch(batch: LogBatch) -> dict[str, Any]:
         for key, log in batch.logs:
             at = stream.tell()
             try:
-                entry, channels = _stored(log, key, batch.key, first, stream.write)
+                with _at_hand(log) as near:
+                    entry, channels = _stored(replace(log, path=near), key, batch.key, first, stream.write)
+                # What a recording says of its source must not be the copy, which is gone.
+                entry = replace(
+                    entry,
+                    log=log.where,
+                    source=entry.source.replace(str(near), log.where) if log.remote else entry.source,
+                )
             except EdpError as error:
                 # What was written of it is overwritten by the next one.
                 stream.seek(at)
                 stream.truncate()
-                index = replace(index, refused=(*index.refused, RefusedLog(log=str(log.path), why=str(error))))
+                index = replace(
+                    index,
+                    refused=(
+                        *index.refused,
+                        RefusedLog(log=log.where if log.remote else str(log.path), why=str(error)),
+                    ),
+                )
                 continue
             lists, number = listed(index.lists, channels)
             entry = replace(entry, channels=number)
@@ -259,6 +286,11 @@ def store_batch(batch: LogBatch) -> dict[str, Any]:
     if index.recordings:
         write_plain(path.with_suffix(".json"), record)
     return record
+
+
+def _at_hand(log: StoredLog) -> AbstractContextManager[Path]:
+    """The log as a file of this machine."""
+    return nullcontext(log.path) if log.remote is None else copied(log.remote)
 
 
 def _stored(

@@ -126,12 +126,16 @@ def read_index(folder: str | Path) -> StoreIndex:
             f"the store '{folder}' is half built: it has no {INDEX} yet; give the same `edp store build` again, it "
             "goes on where it stopped"
         )
-    table = object_with(
-        parse_json(read_text(path, INDEX_BYTES, where, DataError), where, DataError),
-        ("kind", "schema"),
-        where,
-        DataError,
-    )
+    return checked_index(read_text(path, INDEX_BYTES, where, DataError), where)
+
+
+def checked_index(text: str, where: str) -> StoreIndex:
+    """An index from its file's content, with every recording within a file of the store.
+
+    Raises:
+        DataError: it is of another schema, or damaged.
+    """
+    table = object_with(parse_json(text, where, DataError), ("kind", "schema"), where, DataError)
     if table["kind"] != KIND:
         raise DataError(f"{where}: kind = {str(table['kind'])[:40]!r}, expected '{KIND}'; it is no store of EDP")
     if table["schema"] != SCHEMA:

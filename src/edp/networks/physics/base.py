@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -132,7 +132,7 @@ class PhysicsBase(Streaming):
         # Numbers come into buffers, so that a bundle carries the machine and needs no machine file.
         self.geometry.read(self.spec.machine)
 
-    def settle(self, parts: Sequence[Tensor]) -> None:
+    def settle(self, parts: Iterable[Tensor]) -> None:
         """Take averages over training inputs ``(time, input)`` where the base has any; most have none."""
 
     def usual(self) -> dict[str, tuple[float, float]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -44,15 +44,16 @@ class Force(Dynamic):
         with torch.no_grad():
             self.mass.copy_(self.geometry.mean_mass())
 
-    def settle(self, parts: Sequence[Tensor]) -> None:
+    def settle(self, parts: Iterable[Tensor]) -> None:
         """Average the equivalent masses over training inputs; before, they are averages over all strokes."""
         with torch.no_grad():
             # Double precision: sums over hours of ticks lose digits in float32.
-            total = torch.zeros(AXES, dtype=torch.float64)
+            total, ticks = torch.zeros(AXES, dtype=torch.float64), 0
             for part in parts:
+                ticks += len(part)
                 for block in part.split(BLOCK):
                     total += self.geometry.equivalent_mass(self.pose(block)).sum(dim=0, dtype=torch.float64)
-            self.mass.copy_(total / sum(len(part) for part in parts))
+            self.mass.copy_(total / ticks)
 
     def start(self, x: Tensor, pose: Pose, rate: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:
         measured = self.take(x, SPEEDS)

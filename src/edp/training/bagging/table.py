@@ -99,7 +99,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
         f"training: {rows:,} rows of {bank.columns:,} columns and {outputs:,} outputs",
         "make training.bagging.rows smaller, or the backbone's lags fewer",
     )
-    columns = np.concatenate([bank_rows(net, part)[list(of)] for part, of in zip(stretches, chosen, strict=True)])
+    columns = np.concatenate([bank_rows(net, part, of) for part, of in zip(stretches, chosen, strict=True)])
     targets = np.concatenate(
         [
             standard_targets(net, part)[0].flatten(1).numpy()[list(of)]
@@ -135,8 +135,15 @@ def _pieces(share: float, test: Sequence[Series], reach: int, stride: int) -> in
     return max(1, round(share * stride / float(np.median(lengths)))) if lengths else 1
 
 
-def bank_rows(net: Predictor, part: Series) -> NDArray[np.float32]:
-    """What the bank of a committee gives of a whole stretch, as a stream from its first tick, ``(time, column)``."""
+def bank_rows(net: Predictor, part: Series, chosen: range | None = None) -> NDArray[np.float32]:
+    """What the bank of a committee gives of a stretch, as a stream from its first tick, ``(row, column)``.
+
+    Args:
+        net: with a committee.
+        part: the stretch.
+        chosen: rows that are wanted; all where it is None. Of a long stretch all would fill the memory.
+    """
+    chosen_rows = range(part.samples) if chosen is None else chosen
     bank = committee_of(net).bank
     like = next(net.parameters())
     rows = []
@@ -146,5 +153,14 @@ def bank_rows(net: Predictor, part: Series) -> NDArray[np.float32]:
             x = torch.from_numpy(part.inputs[start : start + PIECE]).unsqueeze(0).to(like)
             features, front = net.front(x, front)
             values, state = bank(net.front.scale(features), state)
-            rows.append(values[0].float().numpy())
+            # The first wanted row of the piece; a copy, since a view would keep the whole piece.
+            first = (
+                start + (chosen_rows.start - start) % chosen_rows.step
+                if start > chosen_rows.start
+                else chosen_rows.start
+            )
+            within = slice(
+                first - start, max(first, min(chosen_rows.stop, start + len(x[0]))) - start, chosen_rows.step
+            )
+            rows.append(values[0, within].float().numpy().copy())
     return np.concatenate(rows)

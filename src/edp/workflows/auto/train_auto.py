@@ -29,6 +29,7 @@ from edp.workflows.auto.division import divide
 from edp.workflows.auto.foundation import Foundation, read_foundation
 from edp.workflows.auto.promise import blocks_of, choose
 from edp.workflows.auto.settings import AutoSettings
+from edp.workflows.auto.size import check_size
 from edp.workflows.auto.train_candidates import CandidateTraining, TrainedCandidate, train_all
 from edp.workflows.train_evaluate import keep_fitted, prepare_data
 
@@ -92,6 +93,7 @@ def train_auto(
     if finished is not None:
         return finished
     _check_moving(data)
+    check_size(data)
     jobs = _jobs(_experiments(settings, amount), data, amount, folder)
     outcomes = {job.name: one for job, one in zip(jobs, train_all(jobs, workers, on_event, on_candidate), strict=True)}
     trained = {name: one for name, one in outcomes.items() if isinstance(one, TrainedCandidate)}

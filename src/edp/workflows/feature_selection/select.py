@@ -13,6 +13,7 @@ from edp.config.experiment import Experiment, FeatureSettings, TaskSettings
 from edp.data.feature_files import set_text
 from edp.data.features import FEATURE_SETS, FeatureSet
 from edp.data.screening import FlagKind, OnProgress, ScreeningResult, ScreeningSpec, screen
+from edp.data.spread_rows import MOST_ROWS
 from edp.errors import DataError, closest
 from edp.logs import DataQuality, Repair, common_channels, open_log
 from edp.logs.formats.base import is_truth
@@ -118,7 +119,7 @@ def select_features(
     recordings, notes = _read(mapped, quality)
     spec, more = _candidates(recordings[0], order)
     screening = screen(recordings, spec, listeners.on_progress)
-    notes += more
+    notes += [*more, *_sampled(recordings, screening)]
     sets = _sets(screening, recordings[0])
     files = _write(folder, screening, quality, sets)
     needed = _needed_map(source, screening, recordings[0])
@@ -135,6 +136,15 @@ def select_features(
     tried = None if trials is None else trials.to_json()
     files["page"] = build_screening_page(screening, folder / "report.html", title, quality, tried, notes)
     return Selection(screening, quality, tuple(notes), sets, files, trials)
+
+
+def _sampled(recordings: Sequence[Recording], screening: ScreeningResult) -> list[str]:
+    """That a large data set was screened on a part of its rows."""
+    total = sum(recording.samples for recording in recordings)
+    if total <= MOST_ROWS:
+        return []
+    hours = screening.samples / screening.rate_hz / 3600.0
+    return [f"Screened on {screening.samples:,} of {total:,} rows ({hours:.1f} h): evenly spread stretches of them."]
 
 
 def _lists_maps(source: DataSource) -> bool:

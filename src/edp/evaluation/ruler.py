@@ -1,0 +1,191 @@
+"""Measures predictions of test recordings in report units, one recording after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.prepared import Prepared
+from edp.errors import DataError
+from edp.evaluation.tally import Tally, Values, named_scores
+from edp.signals import KINDS
+from edp.stats.metrics import interval_scores, score, spread
+from edp.stats.sketch import QuantileSketch
+
+# Six bins show where an error grows with speed and leave enough samples in each.
+SPEED_BINS = 6
+Numbered = Iterable[tuple[int, NDArray[np.float32]]]
+"""Numbers of test series, in any order, and what belongs to each tick of them."""
+
+
+class Ruler:
+    """Measures predictions in report units; the same ticks for every model that reaches them.
+
+    Args:
+        data: ``data.test`` has the truth.
+        skip: first ticks of each stretch that are not scored.
+
+    Raises:
+        DataError: no tick can be scored.
+    """
+
+    def __init__(self, data: Prepared, skip: int) -> None:
+        self.data, self.skip = data, skip
+        self.task = data.task
+        facts = [KINDS[kind] for kind in data.target_kinds]
+        self.units = [fact.report_unit for fact in facts]
+        self.factors = np.array([fact.report_factor for fact in facts])
+        ticks = [max(0, series.samples - self.task.max_horizon) for series in data.test]
+        if max(ticks) <= skip:
+            raise DataError(
+                f"no tick of the test recordings can be scored: the longest has {max(ticks)} ticks "
+                f"before the horizon, the first {skip} are start-up; give longer recordings"
+            )
+        speeds, first = QuantileSketch(), self.task.horizons[0]
+        for series, count in zip(data.test, ticks, strict=True):
+            if count > skip:
+                ahead = series.targets[first + skip : first + count].astype(np.float64) * self.factors
+                speeds.update(np.abs(ahead))
+        # The last half per cent of speeds are single events; they would stretch the bins and leave them empty.
+        self.edges = np.linspace(0.0, speeds.quantiles([0.995])[0] or 1.0, SPEED_BINS + 1)
+
+    def truth(self, number: int) -> Values:
+        """Of a test series, ``(tick, horizon, target)``; ticks whose targets lie beyond the end are left out."""
+        series = self.data.test[number]
+        ticks = max(0, series.samples - self.task.max_horizon)
+        future = np.stack([series.targets[k : k + ticks] for k in self.task.horizons], axis=1)
+        return np.asarray(future.astype(np.float64) * self.factors)
+
+    def header(self) -> dict[str, Any]:
+        """The task, its targets and inputs."""
+        targets = zip(self.task.targets, self.data.descriptions, self.units, self.factors, strict=True)
+        return {
+            "schema": 1,
+            "task": {
+                "name": self.task.features.name,
+                "horizons": list(self.task.horizons),
+                "rate_hz": self.task.rate_hz,
+                "mode": str(self.task.mode),
+                "skip": self.skip,
+            },
+            "targets": [
+                {"name": name, "description": text, "unit": unit, "factor": float(factor)}
+                for name, text, unit, factor in targets
+            ],
+            "inputs": [
+                {"name": c.name, "unit": KINDS[c.kind].report_unit, "factor": float(KINDS[c.kind].report_factor)}
+                for c in self.data.inputs
+            ],
+        }
+
+    def measure(self, predictions: Numbered) -> dict[str, Any]:
+        """Scores of one model: overall, by recording with spread, by speed, and of running integrals."""
+        tallies = [Tally(self.task.targets) for _ in self.task.horizons]
+        speeds = [_Speeds(self.edges) for _ in self.task.horizons]
+        integrals = {target: np.zeros(2) for target in self.task.integrate}
+        by_number: dict[int, dict[str, Any]] = {}
+        for number, values in predictions:
+            truth = self.truth(number)
+            predicted = values[: len(truth)] * self.factors
+            for h, horizon in enumerate(self.task.horizons):
+                p, t = self._ticks(predicted[:, h], truth[:, h])
+                tallies[h].update(p, t)
+                speeds[h].update(p, t)
+                if len(t):
+                    by_number.setdefault(number, {})[str(horizon)] = self._of_recording(p, t)
+            for target, sums in integrals.items():
+                sums += self._integrated(target, predicted, truth)
+        names = [str(horizon) for horizon in self.task.horizons]
+        recordings: dict[str, Any] = {}
+        for number in sorted(by_number):
+            recordings.setdefault(self.data.test[number].name, {}).update(by_number[number])
+        # Of each horizon by recording: `recordings` holds what was scored at all.
+        errors = {name: [r[name]["mean"]["mae"] for r in recordings.values() if name in r] for name in names}
+        scores = {
+            "overall": {name: tally.scores() for name, tally in zip(names, tallies, strict=True)},
+            "recordings": recordings,
+            "spread": {name: spread(values) for name, values in errors.items()},
+            "by_speed": {name: speed.rows() for name, speed in zip(names, speeds, strict=True)},
+        }
+        roots = {target: {"rmse": float(np.sqrt(sums[1] / sums[0]))} for target, sums in integrals.items()}
+        return scores | ({"integrated": roots} if roots else {})
+
+    def intervals(self, bounds: Numbered, coverages: Sequence[float]) -> dict[str, Any]:
+        """Share of the truth that each interval holds and its mean width, by horizon, coverage and target."""
+        shape = (len(self.task.horizons), len(coverages), len(self.task.targets))
+        covered, wide, ticks = np.zeros(shape), np.zeros(shape), 0
+        for number, pairs in bounds:
+            truth = self.truth(number)[self.skip :]
+            if not len(truth):
+                continue
+            within = pairs[self.skip : self.skip + len(truth)].astype(np.float64) * self.factors
+            ticks += len(truth)
+            for h, which, i in np.ndindex(*shape):
+                share, width = interval_scores(within[:, which, 0, h, i], within[:, which, 1, h, i], truth[:, h, i])
+                covered[h, which, i] += share * len(truth)
+                wide[h, which, i] += width * len(truth)
+        return {
+            str(horizon): [
+                {
+                    "coverage": coverage,
+                    "covered": self._named(covered[h, which] / ticks),
+                    "width": self._named(wide[h, which] / ticks),
+                }
+                for which, coverage in enumerate(coverages)
+            ]
+            for h, horizon in enumerate(self.task.horizons)
+        }
+
+    def _named(self, values: Values) -> dict[str, float]:
+        return {"mean": float(np.mean(values)), **dict(zip(self.task.targets, map(float, values), strict=True))}
+
+    def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Scored ticks: after start-up and where the model has its history."""
+        predicted, truth = predicted[self.skip :], truth[self.skip :]
+        # A baseline without its history says NaN; a tick counts only where all targets are predicted.
+        predicted_ticks = np.isfinite(predicted).all(axis=1)
+        return predicted[predicted_ticks], truth[predicted_ticks]
+
+    def _of_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> dict[str, Any]:
+        """All scores of the mean over outputs; of each output the error alone: runs have hundreds of recordings."""
+        scores = named_scores(
+            self.task.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.task.targets))]
+        )
+        return {name: values if name == "mean" else {"mae": values["mae"]} for name, values in scores.items()}
+
+    def _integrated(self, target: str, predicted: NDArray[Any], truth: NDArray[Any]) -> Values:
+        """Ticks, and sum of the squared error of the running integral, in report unit times seconds."""
+        h, column = self.task.horizons.index(0), self.task.targets.index(target)
+        difference = (predicted[:, h, column] - truth[:, h, column])[self.skip :]
+        # Ticks without a prediction add nothing to the integral; NaN would end it.
+        errors = np.nancumsum(difference) / self.task.rate_hz
+        return np.array([len(errors), float(np.square(errors).sum())])
+
+
+class _Speeds:
+    """Mean absolute error in bins of the target's magnitude, outputs pooled."""
+
+    def __init__(self, edges: Values) -> None:
+        self.edges = edges
+        self.count, self.total = np.zeros(SPEED_BINS, dtype=np.int64), np.zeros(SPEED_BINS)
+
+    def update(self, predicted: Values, truth: Values) -> None:
+        # Speeds beyond the last edge belong to the last bin.
+        places = np.clip(np.digitize(np.abs(truth), self.edges) - 1, 0, SPEED_BINS - 1).ravel()
+        self.count += np.bincount(places, minlength=SPEED_BINS)
+        self.total += np.bincount(places, weights=np.abs(predicted - truth).ravel(), minlength=SPEED_BINS)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """By bin, from slow to fast."""
+        return [
+            {
+                "low": float(self.edges[i]),
+                "high": float(self.edges[i + 1]),
+                "count": int(self.count[i]),
+                "mae": float(self.total[i] / self.count[i]) if self.count[i] else None,
+            }
+            for i in range(SPEED_BINS)
+        ]

@@ -1,0 +1,85 @@
+"""Scores of one model at one horizon, taken in part by part: hours of predictions need not lie in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.moments import Moments
+from edp.stats.metrics import Scores, composite, mean_scores, score
+from edp.stats.sketch import MOST_EXACT, QuantileSketch
+
+Values = NDArray[np.float64]
+
+
+class Tally:
+    """Errors of all targets at one horizon.
+
+    Up to `MOST_EXACT` ticks are kept and scored as they are; beyond, sums go on in double precision, and percentiles
+    come from bins of a thousandth.
+
+    Args:
+        targets: their names.
+    """
+
+    def __init__(self, targets: Sequence[str]) -> None:
+        self.targets = tuple(targets)
+        self.count = 0
+        self._kept: list[tuple[Values, Values]] = []
+        self._sums: _Sums | None = None
+
+    def update(self, predicted: Values, truth: Values) -> None:
+        """Take in ticks, each ``(tick, target)`` in report units."""
+        self.count += len(truth)
+        self._kept.append((predicted, truth))
+        if self.count > MOST_EXACT or self._sums is not None:
+            self._sums = self._sums or _Sums(len(self.targets))
+            for part in self._kept:
+                self._sums.update(*part)
+            self._kept = []
+
+    def scores(self) -> dict[str, Any]:
+        """By target, and their mean."""
+        if self._sums is not None:
+            return named_scores(self.targets, self._sums.scores())
+        predicted, truth = (np.concatenate(side) for side in zip(*self._kept, strict=True))
+        return named_scores(self.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.targets))])
+
+
+class _Sums:
+    """What scores are made of, for each target."""
+
+    def __init__(self, targets: int) -> None:
+        self.truth = Moments(targets)
+        self.errors = np.zeros((3, targets))  # their sum, that of their squares, that of their sizes
+        self.sizes = [QuantileSketch() for _ in range(targets)]
+
+    def update(self, predicted: Values, truth: Values) -> None:
+        if not len(truth):
+            return
+        self.truth.update(truth)
+        error = predicted - truth
+        size = np.abs(error)
+        self.errors += np.stack([error.sum(axis=0), np.square(error).sum(axis=0), size.sum(axis=0)])
+        for sketch, column in zip(self.sizes, size.T, strict=True):
+            sketch.update(column)
+
+    def scores(self) -> list[Scores]:
+        count, each = self.truth.count, []
+        for i, sketch in enumerate(self.sizes):
+            bias, mean_square, mae = (float(total) / count for total in self.errors[:, i])
+            p95, p99 = sketch.quantiles((0.95, 0.99))
+            moves = self.truth.low[i] < self.truth.high[i] and self.truth.squares[i] > 0
+            r2 = 1.0 - mean_square * count / float(self.truth.squares[i]) if moves else None
+            rmse = float(np.sqrt(mean_square))
+            each.append(Scores(mae, rmse, r2, p95, p99, composite(mae, rmse, p95, p99), bias, count))
+        return each
+
+
+def named_scores(targets: Sequence[str], each: Sequence[Scores]) -> dict[str, Any]:
+    """Scores of each target by name and their mean, as plain values."""
+    named = {"mean": mean_scores(each), **dict(zip(targets, each, strict=True))}
+    return {name: values.to_json() for name, values in named.items()}

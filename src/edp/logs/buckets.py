@@ -1,0 +1,244 @@
+"""Logs and stores in buckets of S3, Google Cloud and Azure: listed, and copied to this machine, within bounded time.
+
+Credentials are those that each service's own tools read from the environment; EDP takes none in an address.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO, Any, TypeVar
+from urllib.parse import urlsplit
+
+from edp.errors import ConfigError, DataError, StorageError, brief
+from edp.storage import make_folder, replacing
+
+ADDRESS = re.compile(r"(s3|gs|az):/{1,2}([^/]+)(?:/(.*))?", re.DOTALL)
+"""A path object leaves one of the two slashes."""
+CONNECT_S, ANSWER_S, STEP_S = 10.0, 30.0, 120.0
+"""To connect, for the answer to a request, and for a step (a listing, or a piece of an object) with its repetitions."""
+ATTEMPTS = 3
+PIECE_BYTES = 8 * 2**20
+MOST_OBJECTS = 1_000_000
+HELP = {
+    "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, or a profile; AWS_ENDPOINT_URL for another server",
+    "gs": "GOOGLE_APPLICATION_CREDENTIALS; STORAGE_EMULATOR_HOST for another server",
+    "az": "AZURE_STORAGE_ACCOUNT and AZURE_STORAGE_KEY, or a login of az",
+}
+"""Where each service looks for credentials."""
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """An object of a bucket: its address, bytes, and when it was written, in nanoseconds since 1970."""
+
+    address: str
+    size: int
+    written_ns: int
+
+    @property
+    def name(self) -> str:
+        """The last part of its key."""
+        return self.address.rsplit("/", 1)[-1]
+
+
+def bucket_address(path: str | Path) -> str:
+    """The address ``SCHEME://BUCKET/KEY`` that a path stands for; empty where it is a path of this machine."""
+    match = ADDRESS.fullmatch(str(path))
+    return f"{match[1]}://{match[2]}/{match[3] or ''}".rstrip("/") if match else ""
+
+
+class BucketReader:
+    """One bucket, as far as EDP reads it.
+
+    Args:
+        address: of anything in it.
+
+    Raises:
+        ConfigError: an address that names no bucket, or holds credentials.
+    """
+
+    def __init__(self, address: str) -> None:
+        match = ADDRESS.fullmatch(address)
+        if match is None:
+            raise ConfigError(f"'{address}' is no address of a bucket; write s3://BUCKET/KEY, gs:// or az:// likewise")
+        self.scheme, self.bucket = match[1], match[2]
+        if "@" in self.bucket or "?" in address:
+            raise ConfigError(
+                f"the address of bucket '{self.bucket.rsplit('@', 1)[-1]}' holds credentials or options; leave them "
+                f"out and set them in the environment: {HELP[self.scheme]}"
+            )
+        self._files: Any = self._in_time(lambda: _file_system(self.scheme), address)
+
+    def objects(self, address: str) -> list[RemoteFile]:
+        """The objects below an address, or the one at it, by name.
+
+        Raises:
+            DataError: there is none.
+            StorageError: the bucket refuses, or does not answer.
+        """
+        from pyarrow.fs import FileSelector, FileType
+
+        path = self._path(address)
+
+        def listed() -> list[Any]:
+            at = self._files.get_file_info(path)
+            if at.type == FileType.File:
+                return [at]
+            return list(self._files.get_file_info(FileSelector(path, recursive=True, allow_not_found=True)))
+
+        files = [entry for entry in self._in_time(listed, address) if entry.type == FileType.File]
+        if not files:
+            raise DataError(f"'{address}' does not exist: the bucket has no object of this name and none below it")
+        if len(files) > MOST_OBJECTS:
+            raise DataError(
+                f"'{address}' has {len(files):,} objects; at most {MOST_OBJECTS:,} are listed: give a part of it"
+            )
+        objects = [
+            RemoteFile(f"{self.scheme}://{entry.path}", int(entry.size), int(entry.mtime_ns or 0)) for entry in files
+        ]
+        return sorted(objects, key=lambda file: file.address)
+
+    def read(self, address: str, most: int) -> bytes:
+        """A whole object of at most so many bytes."""
+        return b"".join(self._pieces(address, most))
+
+    def copy(self, file: RemoteFile, target: Path) -> str:
+        """Copy an object to a new file, whole or not at all; the blake2b of what came.
+
+        Raises:
+            DataError: it is not there, or has not the bytes that were announced.
+            StorageError: the bucket refuses or does not answer, or the disk is full.
+        """
+        digest, size = hashlib.blake2b(digest_size=16), 0
+        with replacing(target) as temporary, temporary.open("wb") as stream:
+            for piece in self._pieces(file.address, file.size):
+                digest.update(piece)
+                size += len(piece)
+                stream.write(piece)
+            if size != file.size:
+                raise DataError(
+                    f"'{file.address}' ended after {size:,} of {file.size:,} bytes; it was changed while it was read: "
+                    "try again"
+                )
+        return digest.hexdigest()
+
+    def _pieces(self, address: str, most: int) -> Iterator[bytes]:
+        stream: IO[bytes] = self._in_time(lambda: self._files.open_input_file(self._path(address)), address)
+        size = self._in_time(lambda: int(stream.size()), address)  # type: ignore[attr-defined]
+        if size > most:
+            raise DataError(f"'{address}' has {size:,} bytes, {most:,} were expected; it was changed: list it again")
+        for start in range(0, size, PIECE_BYTES):
+            yield self._in_time(lambda at=start: stream.read_at(PIECE_BYTES, at), address)  # type: ignore[attr-defined, misc]
+
+    def _path(self, address: str) -> str:
+        match = ADDRESS.fullmatch(address)
+        if match is None or match[2] != self.bucket:
+            raise ConfigError(f"'{address}' does not lie in bucket '{self.bucket}'")
+        return f"{self.bucket}/{match[3]}" if match[3] else self.bucket
+
+    def _in_time(self, step: Callable[[], Result], address: str) -> Result:
+        """What a step gives, within `STEP_S`; its errors in words."""
+        results: list[Result] = []
+        errors: list[BaseException] = []
+
+        def work() -> None:
+            try:
+                results.append(step())
+            except BaseException as error:  # handed on below, in the thread that waits
+                errors.append(error)
+
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        thread.join(STEP_S)
+        if results:
+            return results[0]
+        if not errors:
+            raise StorageError(
+                f"'{address}' did not answer within {STEP_S:g} s; see that the server can be reached from here, and "
+                "try again: what was copied stays"
+            )
+        raise self._in_words(errors[0], address) from errors[0]
+
+    def _in_words(self, error: BaseException, address: str) -> BaseException:
+        if isinstance(error, FileNotFoundError):
+            return DataError(f"'{address}' does not exist: the bucket has no object of this name")
+        if not isinstance(error, OSError):
+            return error
+        text = brief(error, 300)
+        if any(word in text.upper().replace(" ", "_") for word in REFUSED):
+            return StorageError(f"'{address}': the bucket refuses to be read ({text}); set {HELP[self.scheme]}")
+        return StorageError(f"'{address}' cannot be read: {text}; see that the server can be reached, and try again")
+
+
+REFUSED = ("ACCESS_DENIED", "FORBIDDEN", "403", "401", "UNAUTHORIZED", "INVALID_ACCESS_KEY", "SIGNATURE", "CREDENTIALS")
+"""What services call a refusal."""
+
+
+def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> Any:
+    """The service of a scheme, by pyarrow, which is imported where a bucket is read and no earlier."""
+    from pyarrow import fs
+
+    if scheme == "s3":
+        endpoint = environment.get("AWS_ENDPOINT_URL_S3") or environment.get("AWS_ENDPOINT_URL")
+        url = urlsplit(endpoint) if endpoint else None
+        server = {"endpoint_override": url.netloc, "scheme": url.scheme} if url else {}
+        region = environment.get("AWS_REGION") or environment.get("AWS_DEFAULT_REGION")
+        return fs.S3FileSystem(
+            connect_timeout=CONNECT_S,
+            request_timeout=ANSWER_S,
+            retry_strategy=fs.AwsStandardS3RetryStrategy(max_attempts=ATTEMPTS),
+            **({"region": region} if region else {}),
+            **server,
+        )
+    if scheme == "gs":
+        host = environment.get("STORAGE_EMULATOR_HOST", "")
+        url = urlsplit(host if "://" in host else f"http://{host}") if host else None
+        server = {"endpoint_override": url.netloc, "scheme": url.scheme} if url else {}
+        return fs.GcsFileSystem(anonymous=url is not None, retry_time_limit=timedelta(seconds=ANSWER_S), **server)
+    account = environment.get("AZURE_STORAGE_ACCOUNT")
+    if not account:
+        raise ConfigError(f"az:// needs the name of the storage account: set {HELP['az']}")
+    return fs.AzureFileSystem(account, account_key=environment.get("AZURE_STORAGE_KEY"))
+
+
+@contextmanager
+def copied(file: RemoteFile) -> Iterator[Path]:
+    """An object as a file of this machine, under its own name, gone afterwards.
+
+    Raises:
+        EdpError: as `BucketReader.copy`.
+    """
+    with TemporaryDirectory(prefix="edp_") as folder:
+        check_room(Path(folder), file.size, file.address)
+        # A key may hold anything: its last part alone names the file, and a folder of our own holds it.
+        target = Path(folder) / (re.sub(r"[^\w.+-]", "_", file.name)[-120:] or "log")
+        BucketReader(file.address).copy(file, target)
+        yield target
+
+
+def cache_folder() -> Path:
+    """Where copies of stores are kept: ``stores`` below EDP_CACHE, or the user's cache folder."""
+    chosen = os.environ.get("EDP_CACHE")
+    base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edp"
+    return make_folder(base / "stores")
+
+
+def check_room(folder: Path, size: int, address: str) -> None:
+    """Refuse a copy that the disk has no room for, before it is begun."""
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        raise StorageError(
+            f"'{address}' has {size / 1e9:,.3g} GB, the disk of '{folder}' {free / 1e9:,.3g} GB left; free space, or "
+            "choose another disk (EDP_CACHE for stores, TMPDIR for logs)"
+        )
