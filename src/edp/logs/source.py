@@ -126,7 +126,7 @@ class DataSource:
             ConfigError: a map or repairs for a store, whose logs were read with their own.
         """
         if self.stored:
-            self.check_store_options()
+            self._check_store_options()
             return read_store(self.store_folder())
         self._refuse_bucket()
         if self.path.suffix != ".toml":
@@ -162,7 +162,7 @@ class DataSource:
             if one is not None:
                 sketches.add(one)
                 sketched.append(i)
-        if len(broken) == len(logs) and broken:
+        if broken and len(broken) == len(logs):
             raise broken[0]
         # Before they are compared: a finding on two recordings must tell which is which.
         names = unique_names([report.name for report in reports], [log.path for log in logs])
@@ -195,7 +195,7 @@ class DataSource:
         return build_store(stored, folder, workers, on_progress)
 
     def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
-        self.check_store_options()
+        self._check_store_options()
         recordings = read_store(self.store_folder())
         reports, sketches = [], Sketches()
         for i, recording in enumerate(recordings):
@@ -213,8 +213,7 @@ class DataSource:
                 "store`, and give this command the store"
             )
 
-    def check_store_options(self) -> None:
-        """Refuse a map or repairs for a store, whose logs were read with their own."""
+    def _check_store_options(self) -> None:
         options = [name for name, value in (("--map", self.signal_map), ("--repair", self.repair)) if value is not None]
         if options:
             raise ConfigError(
@@ -309,8 +308,8 @@ def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> 
         remote = BucketReader(address).objects(address)[0] if address else None
         # An absolute path stands for itself, and so does an address.
         where = Path(address) if address else path.parent / expanded
-        allowed = repair or entry.repair or settings.repair
-        logs.append(Log(where, resolved(entry.map) or shared, allowed, entry.name, entry.rows, entry.machine, remote))
+        chosen, allowed = resolved(entry.map) or shared, repair or entry.repair or settings.repair
+        logs.append(Log(where, chosen, allowed, entry.name, entry.rows, entry.machine, remote))
     return logs
 
 

@@ -87,8 +87,8 @@ class LogsProposal:
         # Where no kind tells which channels command, the coverage of the logs is seen only if they are named.
         commands = self.proposal.of_role("command")
         named = ",".join(guess.channel for guess in commands)
-        plain = not any(guess.kind.kind is not Kind.GENERIC for guess in commands) and named.count(",") < len(commands)
-        inputs = "" if not plain or not commands else f" --inputs {shlex.quote(named)}"
+        plain = all(guess.kind.kind is Kind.GENERIC for guess in commands) and named.count(",") < len(commands)
+        inputs = f" --inputs {shlex.quote(named)}" if plain else ""
         return [
             f"edp inspect {data}{mapped}{inputs}",
             f"edp train {data}{mapped} --config {_quoted(folder / SETTINGS)} --out {run}{repair}",
@@ -135,8 +135,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         MAP: _text(_map_table(proposal.signal_map), _remarks(source, proposal)),
         SETTINGS: _settings(proposal, channels, targets, split),
     }
-    repairs = timing.shared
-    apart = timing.apart
+    repairs, apart = timing.shared, timing.apart
     if others or broken or apart:
         recordings = [
             {"path": _listed(one), "name": name} | ({"repair": repair_table(apart[one])} if one in apart else {})
