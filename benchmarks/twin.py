@@ -11,6 +11,7 @@ and as one that only ever looked 0.1 s ahead.
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 import tomllib
@@ -41,6 +42,7 @@ from edp.training.blas import one_blas_thread
 from edp.training.free_run import FreeRunSampler, FreeRunSpec, fit_free_runs
 from edp.training.grey_fit import fit_grey_box
 from edp.training.residual_fit import fit_residual
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.train_twin import prepare_twin
 
 AHEAD = 10
@@ -62,6 +64,8 @@ SOIL = Path(__file__).parents[1] / "examples" / "scenarios" / "c14_soil.toml"
 SOIL_MINUTES = 20.0
 """Of the logs of a machine in soil that train and choose; the rest tests."""
 QUICK_FIT = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(1, 1), final_rounds=1, ticks=1000, starts=1)
+MANY = 1000
+"""Free runs in which those that diverge are counted."""
 VALIDATION_S = 10.0
 """Length of the free runs by which one of them is chosen: that of the validation in a training."""
 
@@ -73,6 +77,8 @@ def main() -> None:
     arguments_of.add_argument("--only", nargs="+", choices=(*FITTED, RESIDUAL), default=(*FITTED, RESIDUAL))
     arguments_of.add_argument("--minutes", type=float, default=180.0, help="of recordings of 3 min each")
     arguments_of.add_argument("--ticks", type=int, default=GreyFitSpec().ticks, help="of a round of a grey box's fit")
+    arguments_of.add_argument("--many", action="store_true", help=f"only the share of diverged ones of {MANY} runs")
+    arguments_of.add_argument("--kept", type=Path, help="folder of fitted grey boxes: read where there, else written")
     arguments_of.add_argument("--starts", type=int, default=GreyFitSpec().starts, help="of a grey box's fit")
     arguments = arguments_of.parse_args()
     quick, only = arguments.quick, arguments.only
@@ -89,7 +95,7 @@ def main() -> None:
         training = replace(training, lengths_s=(0.1, 0.5, 2.0), updates=(60, 40, 16), validate_every=40)
     models: dict[str, tuple[Twin, float]] = {}
     whole = set(only) == {*FITTED, RESIDUAL}
-    closed = (*experiment.judge.floors, "n4sid") if whole else ("static",)
+    closed = (*experiment.judge.floors, "n4sid") if whole else ("static",) if not arguments.many else ()
     for name in closed:
         # The validation part chose among weights of the others; what needs no choice has it to learn from.
         everything = [*data.train, *data.validation]
@@ -100,7 +106,7 @@ def main() -> None:
     for name, fitted in (("greybox", fitted_grey_box), (LINKED, fitted_linkage)):
         if name in only:
             print(f"fitting: {name}", flush=True)
-            models[name] = fitted(parts, arguments.seed, fit)
+            models[name] = fitted_once(arguments.kept, name, fitted, (parts, arguments.seed, fit))
     if RESIDUAL in only:
         models[BARE], models[TOPPED] = fitted_residual(parts, arguments.seed, quick, LEFT_OUT, fit)
     if arguments.specialist:
@@ -109,6 +115,13 @@ def main() -> None:
         # As many updates, all on runs as long as a look ahead: it is told the commands in between, as the twin is.
         short = replace(training, lengths_s=(AHEAD / channels.rate_hz,), updates=(sum(training.updates),))
         models[AHEAD_ONLY] = trained(experiment, short, (channels, scales, data))
+    if arguments.many:
+        many = {name: diverged_of_many(twin, data.test, 60 if quick else MANY) for name, (twin, _) in models.items()}
+        shares = [
+            verdict(f"diverged of {row['runs']} runs, {name}", row["diverged"], 1e-3, "<= 1", "share", quick)
+            for name, row in many.items()
+        ]
+        return finish("twin_many", shares, arguments.seed, many)
     scores: dict[str, dict[str, Any]] = {}
     for name, (twin, seconds) in models.items():
         taught = name not in closed
@@ -155,6 +168,13 @@ def main() -> None:
     finish("twin" if whole else "twin_part", verdicts, arguments.seed, scores)
 
 
+def diverged_of_many(twin: Twin, test: Any, least: int) -> dict[str, Any]:
+    """Share of diverged runs among at least so many, evenly spread over the recordings; a recording at a time."""
+    starts = -(-least // len(test))
+    gone = np.concatenate([free_runs(twin, [series], 60.0, starts).diverged() for series in test])
+    return {"runs": len(gone), "diverged": float(gone.mean())}
+
+
 def specialist_verdicts(scores: dict[str, Any], quick: bool) -> list[Any]:
     """One set of weights for all modes against one that was made for each."""
     free, special = (scores[name]["velocity_mae"]["mean"] for name in ("recurrent", FREE_ONLY))
@@ -178,6 +198,20 @@ def trained(experiment: TwinExperiment, training: FreeRunSpec, parts: Any) -> tu
         lambda e: print(f"update {e.update}/{e.updates}, {e.length_s:g} s, validation {e.validation:.4f}", flush=True),
     )
     return twin, fitted.seconds
+
+
+def fitted_once(
+    folder: Path | None, name: str, fitted: Callable[..., tuple[GreyTwin, float]], how: tuple[Any, ...]
+) -> tuple[Twin, float]:
+    """A grey box and the processor seconds of its fit; from the folder where an earlier run with it was stopped."""
+    if folder is None:
+        return fitted(*how)
+    home = folder / name.replace(", ", "_").replace(" ", "_")
+    if not (home / "seconds.json").exists():
+        twin, seconds = fitted(*how)
+        save_twin(TwinBundle(twin.spec, twin), home)
+        (home / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
+    return load_twin(home).twin, json.loads((home / "seconds.json").read_text(encoding="utf-8"))
 
 
 def fitted_linkage(parts: Any, seed: int, fit: GreyFitSpec) -> tuple[GreyTwin, float]:

@@ -26,6 +26,9 @@ NO_STOP = 1e9
 """rad. The two stops of a motor stand crossed, the lower one here and the upper one at its negative: no chamber has
 room beyond its own volume then. A cushion that leaves all of the outflow, and a stop without stiffness, do nothing. So
 a motor has the equations of a cylinder, and none of its own."""
+ACTING_LIMIT = 0.2
+"""Of the power of all pumps at full flow and the highest pressure, where the common limit starts: low enough to act in
+many ticks. A limit that never acts has no slope, and a fit that begins there never finds it."""
 START_CURVE = (0.25, 0.75)
 """Linear and quadratic share of the opening that a curve starts from: fine control near closed, as spools are cut."""
 
@@ -184,7 +187,7 @@ def circuit_numbers(highest: float, flow: float) -> list[GreyNumber]:
         ("make_up", "m^3/s/Pa^0.5", 1e-3, 2.0 * flow, 1.0),
         ("port_relief_slope", "m^3/s/Pa", 1e-6, 1e-2, 1.0),
         ("relief_slope", "m^3/s/Pa", 1e-6, 2e-3, 1.0),
-        ("power_limit", "W", MEGA, 0.6 * flow * highest, 0.5),
+        ("power_limit", "W", MEGA, ACTING_LIMIT * flow * highest, 0.5),
         ("play", "1", 1.0, 0.01, 0.7),
         ("demand_start", "1", 1.0, 0.1, 0.3),
         ("demand_span", "1", 1.0, 0.75, 0.2),
