@@ -26,6 +26,7 @@ import closed_loop_models as models_of
 import closed_loop_nmpc as nmpc_of
 import control_step as step_of
 from common import finish, in_folder, kept, parser, table, verdict
+from control_step_rival import Rival
 from controller_cycles import traced_image
 from edp.config.control import ControlExperiment
 from edp.control.controllers import CONTROLLERS
@@ -41,6 +42,8 @@ from edp.workflows.control.export_controller import parts_of
 PLANS = ((2, 3, 4, 6, 10, 15), (3, 7, 10, 20), (4, 12, 24))
 DOUBLE = (2, 16)
 """Cycles that a product or sum, and a division or root, may take more in double precision on a Cortex-M7."""
+RIVAL_TICKS = (30, 60, 90)
+"""Of the loop, at which CasADi solves the same problem."""
 TRACED, SHORT = (2, 3), (2, 4, 6)
 """Ticks of two traces, and the plan that is traced: 3 million instructions of one tick are as many lines."""
 
@@ -55,9 +58,10 @@ def main() -> None:
         models = models_of.Models(folder, models_of.FULL, arguments.seed)
         run = arguments.twin or models.grey(models_of.QUICK_GREY if arguments.quick else models_of.GREY)
         twin, own = load_twin(run), make_folder(folder / "controllers")
-        # What a plan costs is read where a run of this benchmark has left it.
+        # What a run of this benchmark has left here is read.
         found.update(kept(own / "costs.json", lambda: costs(twin, own, arguments.seed, arguments.quick)))
-        found["lines"] = graded(run, twin, own / "lines", arguments.quick)
+        found["rival"] = kept(own / "rival.json", lambda: rivalled(twin, own / "rival", arguments.seed))
+        found["lines"] = kept(own / "lines.json", lambda: graded(run, twin, own / "lines", arguments.quick))
 
     in_folder(arguments.data, measure)
     first = found["plans"][0]
@@ -72,8 +76,11 @@ def main() -> None:
         ("path error in C, mean of the lines in free air", float(np.mean(air["path_rms_mm"])), 3.0, "mm"),
         ("p99 of a tick in C along the lines", air["tick_ms"]["p99"], 2.0, "ms"),
     ]
+    rival = found["rival"]
+    name = "a tick of the controller in C against one iteration of CasADi's sqpmethod"
+    ratio = verdict(name, float(np.median(rival["rival_ms"])), rival["ours_ms"], ">= 10", "ms", arguments.quick)
     verdicts = [verdict(name, ours, goal, "<= 1", unit, arguments.quick) for name, ours, goal, unit in rows]
-    finish("control_step_grey", verdicts, arguments.seed, found)
+    finish("control_step_grey", [ratio, *verdicts], arguments.seed, found)
 
 
 def costs(twin: TwinBundle, folder: Path, seed: int, quick: bool) -> dict[str, Any]:
@@ -178,6 +185,20 @@ def graded(run: Path, twin: TwinBundle, folder: Path, quick: bool) -> dict[str, 
           row["not_of_the_plan"]] for name, row in rows.items()],
     )  # fmt: skip
     return rows
+
+
+def rivalled(twin: TwinBundle, folder: Path, seed: int) -> dict[str, Any]:
+    """Milliseconds of CasADi's `sqpmethod` and of the C on one problem, and how far their steps are apart.
+
+    Forces are not estimated here: the exported form of the twin has none to be told of.
+    """
+    bench = step_of.LoopBench(seed)
+    recorded, parts = bench.exported(twin, PLANS[0], folder / "c", load=0.0)
+    rival = Rival(recorded, parts, folder / "casadi")
+    spent, apart = rival.compare(recorded, RIVAL_TICKS)
+    host = step_of.host_times(folder / "c")
+    print(f"CasADi's sqpmethod: {np.median(spent):.1f} ms an iteration, its step within {apart:.1e} m/s of ours")
+    return {"rival_ms": spent, "apart_m_s": apart, "ours_ms": float(np.median(host[:, 0])) / 1000.0}
 
 
 def as_library(bench: ControlBench, experiment: ControlExperiment, twin: TwinBundle, folder: Path) -> Path:
