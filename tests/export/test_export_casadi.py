@@ -18,7 +18,6 @@ from edp.errors import ExportError
 from edp.export import make_target
 from edp.export.casadi.target import KNOWN, CasadiTarget
 from edp.export.golden import random_inputs, stream, tolerance
-from edp.ir.hydraulics import HydraulicTick
 from edp.ir.layers import BinaryOperation, Elementwise
 from edp.ir.reference import STEPS
 from edp.networks.backbones import LstmSpec
@@ -194,7 +193,7 @@ assert not {"torch", "edp", "onnx"} & set(sys.modules)
 def test_what_is_not_known_is_refused(bundle_of, network_of, tmp_path):
     words = {kind.__name__ for kind in KNOWN - {Elementwise}}
     assert words | {operation.capitalize() for operation in BinaryOperation} == set(runtime.LAYERS)
-    assert set(STEPS) - {HydraulicTick} < KNOWN
+    assert set(STEPS) < KNOWN
     with pytest.raises(ExportError, match="integer arithmetic"):
         make_target("casadi").write(bundle_of("hybrid", True), "predictor", tmp_path)
     with pytest.raises(ExportError, match="--name"):

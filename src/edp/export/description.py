@@ -78,8 +78,13 @@ def shape_of_result(graph: Graph, value: str, targets: int) -> tuple[int, int]:
     return graph.width_of(value) // targets, targets
 
 
-def float_graph(predictor: Predictor, form: str) -> Graph:
+def float_graph(predictor: Predictor, form: str, solves: bool = False) -> Graph:
     """The layers of a network in single precision, for a form that has no other numbers.
+
+    Args:
+        predictor: the network.
+        form: what the form is called.
+        solves: whether it holds the equations of a grey box.
 
     Raises:
         ExportError: the network computes in integer arithmetic, or is a grey box.
@@ -91,12 +96,17 @@ def float_graph(predictor: Predictor, form: str) -> Graph:
             "the run that it was quantised from, or take a form around the C code"
         )
     graph = predictor.graph()
-    if any(isinstance(layer, HydraulicTick) for layer in graph.layers):
+    if not solves and has_equations(graph):
         raise ExportError(
             f"the equations of a grey box are solved by Newton's method, which has no form in {form}; export it to c, "
-            "fmu, simulink or ros2"
+            "fmu, casadi, simulink or ros2"
         )
     return graph
+
+
+def has_equations(graph: Graph) -> bool:
+    """Whether one of the layers is the equations of a grey box."""
+    return any(isinstance(layer, HydraulicTick) for layer in graph.layers)
 
 
 def golden(predictor: Predictor, window: int) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import json
 import math
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +70,13 @@ class Network:
         """The C code beside the data as a shared library.
 
         Raises:
-            RuntimeError: the compiler is missing or says no.
+            RuntimeError: the compiler is missing or says no, or there is no C: a grey box has none here.
         """
         folder, compiled = self.path.parent, self.path.with_name(f"{self.about['name']}_external.so")
         options = flags or ("-O2", "-ffp-contract=off", "-fvisibility=hidden")
         sources = sorted(str(path) for path in folder.glob("*.c"))
+        if not sources:
+            raise RuntimeError(f"{folder} holds no C code to compile; use network.step, the symbolic form")
         command = [compiler, "-std=c99", *options, "-shared", "-fPIC", *sources, "-lm", "-o", str(compiled)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -236,8 +239,7 @@ def _trees(p: _Part, x: Any) -> Any:
 
 
 def _normed(x: Any, epsilon: float) -> Any:
-    count = x.shape[0]
-    middle = x - ca.sum1(x) / count
+    count, middle = x.shape[0], x - ca.sum1(x) / x.shape[0]
     return middle / ca.sqrt(ca.sum1(middle * middle) / count + epsilon)
 
 
@@ -268,8 +270,7 @@ def _starting(p: _Part, x: Any) -> Any:
 def _convolution(p: _Part, x: Any) -> Any:
     weight = p.w["weight"]
     taps = weight.shape[1]
-    full = p.push("ring", x) if taps > 1 else x
-    total = ca.DM(p.w["bias"])
+    full, total = p.push("ring", x) if taps > 1 else x, ca.DM(p.w["bias"])
     for tap in range(taps):
         total = total + weight[:, tap] @ full[:, tap * p.dilation]
     return total
@@ -394,5 +395,6 @@ LAYERS: dict[str, Callable[..., Any]] = {
     "Feedback": lambda p: p.m["last"],
     "Feed": _feed,
     "PrefixCorrection": _prefix,
+    "HydraulicTick": lambda p, *x: import_module("edp_hydraulics").write_tick(p, *x),
 }
 """By kind of layer."""

@@ -17,10 +17,10 @@ from edp.export.c.model import make_model
 from edp.export.c.target import check_name, core_files
 from edp.export.casadi.external import blanks
 from edp.export.casadi.states import places, start
-from edp.export.description import Description, as_json, float_graph, golden
+from edp.export.description import Description, as_json, float_graph, golden, has_equations
 from edp.export.escape import fill
 from edp.export.folder import write_export
-from edp.ir import Graph, Layer, memory
+from edp.ir import Graph, Layer, hydraulics, memory
 from edp.ir import layers as plain
 from edp.training.bundle import Bundle
 
@@ -33,7 +33,7 @@ RULES = {
 }
 KNOWN: frozenset[type[Layer]] = frozenset(
     kind
-    for room in (plain, memory)
+    for room in (plain, memory, hydraulics)
     for kind in vars(room).values()
     if isinstance(kind, type) and issubclass(kind, Layer) and kind is not Layer and not kind.__name__.startswith("_")
 )
@@ -47,28 +47,31 @@ GOLDEN = ("inputs", "stream", "tolerance")
 class CasadiTarget:
     """CasADi, float32 runs: ``edp_casadi.py``, ``NAME.json`` and ``NAME.npz``, and C with ``NAME_casadi.c`` (external).
 
-    ``edp_horizon.py`` runs a horizon of the compiled C.
+    ``edp_horizon.py`` runs a horizon of the compiled C. A grey box has ``edp_hydraulics.py`` in place of all that is C:
+    the C code of its equations has no tangents.
     """
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
         check_name(name)
-        graph = float_graph(bundle.predictor, "CasADi")
+        graph = float_graph(bundle.predictor, "CasADi", solves=True)
         data, described = arrays(graph), content(Description(name, bundle, graph))
         # The recording covers a whole window at least, so that every ring has been round once.
         golden_run = golden(bundle.predictor, graph.window)
-        model = make_model(name, bundle, tangent=True)
         here = resources.files("edp.export.casadi")
         files: dict[str, bytes] = {
             "edp_casadi.py": here.joinpath("runtime.py").read_bytes(),
-            "edp_horizon.py": here.joinpath("horizon.py").read_bytes(),
             f"{name}.json": as_json(described),
             f"{name}.npz": packed(data),
             f"{name}_golden.npz": packed(
                 {key: np.asarray(golden_run[key]) for key in ("inputs", "stream", "tolerance")}
             ),
-            f"{name}_casadi.c": external(graph, name).encode(),
         }
+        if has_equations(graph):
+            return write_export(folder, files | {"edp_hydraulics.py": here.joinpath("hydraulics.py").read_bytes()})
+        files["edp_horizon.py"] = here.joinpath("horizon.py").read_bytes()
+        files[f"{name}_casadi.c"] = external(graph, name).encode()
+        model = make_model(name, bundle, tangent=True)
         files |= {file: text.encode() for file, text in core_files(model).items()}
         return write_export(folder, files)
 

@@ -11,7 +11,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from edp.errors import ExportError
 from edp.export.casadi import CasadiTarget
+from edp.export.description import has_equations
 from edp.workflows.parity.base import FORMS, NAME, Missing, ParityCase, Ran, called, need
 
 PROGRAM = '''
@@ -66,4 +68,6 @@ class CasadiExternal:
 
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""
+        if has_equations(case.bundle.predictor.graph()):
+            raise ExportError("the C code of a grey box's equations has no tangents, so none stands behind CasADi")
         return _run(case, folder, "external", need("cc", "gcc libc6-dev"))
