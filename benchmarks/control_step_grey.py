@@ -40,6 +40,13 @@ from edp.workflows.control import ControlBench, ControlSources
 from edp.workflows.control.export_controller import parts_of
 
 PLANS = ((2, 3, 4, 6, 10, 15), (3, 7, 10, 20), (4, 12, 24))
+GRADED = {
+    "as it was": ("", CONTROLLERS["nmpc"]()),
+    "in loam": (nmpc_of.LOAM, CONTROLLERS["nmpc"]()),
+    "as it was, attitude_m = 2": ("", CONTROLLERS["nmpc"](attitude_m=2.0)),
+    "in loam, attitude_m = 2": (nmpc_of.LOAM, CONTROLLERS["nmpc"](attitude_m=2.0)),
+}
+"""Plants and controllers; the heavier weight of the attitude was chosen on lines that are not judged."""
 DOUBLE = (2, 16)
 """Cycles that a product or sum, and a division or root, may take more in double precision on a Cortex-M7."""
 RIVAL_TICKS = (30, 60, 90)
@@ -154,16 +161,16 @@ class Compiled:
 def graded(run: Path, twin: TwinBundle, folder: Path, quick: bool) -> dict[str, dict[str, Any]]:
     """The lines of `closed_loop.py`, graded by the compiled controller, in free air and in loam."""
     rows: dict[str, dict[str, Any]] = {}
-    for name, material in {"as it was": "", "in loam": nmpc_of.LOAM}.items():
+    for name, (material, spec) in GRADED.items():
         rows[name] = row = {"path_rms_mm": [], "position_rms_mm": [], "attitude_rms_deg": [], "violations": 0}
         compiled: list[Compiled] = []
         for first in nmpc_of.DRAWS[:1] if quick else nmpc_of.DRAWS:
             experiment = ControlExperiment(
-                task=TASKS["grade"](material=material), controller=CONTROLLERS["nmpc"](), machine="M22",
+                task=TASKS["grade"](material=material), controller=spec, machine="M22",
                 loops=1 if quick else nmpc_of.FULL.lines, seed=first,
             )  # fmt: skip
             bench = ControlBench(experiment, ControlSources(twin=run))
-            library = as_library(bench, experiment, twin, folder)
+            library = as_library(bench, experiment, twin, folder / name.replace(" ", "_"))
             for task in bench.tasks:
                 python = experiment.controller.build(bench.plant, task.limits, bench.models)
                 compiled.append(Compiled(library, python))
