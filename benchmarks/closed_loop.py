@@ -10,8 +10,8 @@ inversion, on three draws of six lines, with the same variants, in loam, and on 
 o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
 plant; part o4_other the same for C14 in loam. Part grey asks parts nmpc, but for C14, and o4 of a grey box with a known
 linkage, fitted to 45 min of logs in free air, in place of the network. Part grey_other does so for C14: predictive
-control on a grey box of 20 min of its logs in free air, and gains in loam on grey boxes of 5, 20 and 45. Their models
-are trained where --data has none: 3 h of recordings, some ten processor minutes.
+control on a grey box of 20 min of its logs in free air; o4_grey_other asks gains in loam of grey boxes of 5, 20 and 45
+min. Their models are trained where --data has none: 3 h of recordings, some ten processor minutes.
 
 Results are kept part by part, `closed_loop_PART.json`.
 """
@@ -47,7 +47,7 @@ from edp.workflows.twin import train_twin
 
 MACHINE = "M22"
 LEAD_TICKS = 20
-PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_other")
+PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_other", "o4_grey_other")
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,8 @@ def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
         verdicts += tuning_of.tuning_verdicts(details[part]["o4"], quick)
     elif part == "grey_other":
         details[part], verdicts = grey_other(models, of_loops, quick, seed)
+    elif part == "o4_grey_other":
+        details[part], verdicts = o4_grey_other(models, of_tuning, quick, seed)
     elif part == "o4":
         details[part] = tuning_of.tuning(models, of_tuning, seed)
         verdicts = tuning_of.tuning_verdicts(details[part], quick)
@@ -128,19 +130,25 @@ def predictive(
 
 
 def grey_other(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
-    """C14: predictive control on a grey box of it, and gains in loam on grey boxes of more and fewer minutes."""
-    fit = (models_of.QUICK_GREY if quick else models_of.GREY).fit
-    name, run = nmpc_of.OTHER_NAME, models.other_grey(models.size.other[0], fit)
+    """C14: predictive control on a grey box of minutes of its logs."""
+    name, run = nmpc_of.OTHER_NAME, models.other_grey(models.size.other[0], _grey_fit(quick))
     named = (name, nmpc_of.variants(models.folder)[name])
     rows = {name: nmpc_of.on_variant(models.folder, named, size, seed, CONTROLLERS["nmpc"](), run)}
-    verdicts = nmpc_of.loop_verdicts(rows, quick)
+    return {"loops": rows, "size": asdict(size)}, nmpc_of.loop_verdicts(rows, quick)
+
+
+def o4_grey_other(models: Models, size: tuning_of.TuningSize, quick: bool, seed: int) -> tuple[Any, list[Verdict]]:
+    """C14: gains in loam on grey boxes of more and fewer minutes of its logs in free air."""
     minutes = sorted(models.size.other)
-    on_grey = {f"grey box of {count} min": models.other_grey(count, fit) for count in minutes}
-    of_tuning = tuning_of.QUICK if quick else tuning_of.FULL
-    o4 = tuning_of.tuning_in_soil(on_grey, of_tuning, seed)
-    for name in on_grey:
-        verdicts.extend(tuning_of.tuning_verdicts({"twin": o4[name]}, quick, f", C14 in loam, {name}"))
-    return {"loops": rows, "o4": o4, "size": asdict(size)}, verdicts
+    runs = {f"grey box of {count} min": models.other_grey(count, _grey_fit(quick)) for count in minutes}
+    rows, verdicts = tuning_of.tuning_in_soil(runs, size, seed), list[Verdict]()
+    for name in runs:
+        verdicts += tuning_of.tuning_verdicts({"twin": rows[name]}, quick, f", C14 in loam, {name}")
+    return rows, verdicts
+
+
+def _grey_fit(quick: bool) -> tuple[str, ...]:
+    return (models_of.QUICK_GREY if quick else models_of.GREY).fit
 
 
 def trained(folder: Path, size: Size, seed: int) -> dict[str, Path]:

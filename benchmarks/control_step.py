@@ -159,10 +159,10 @@ class LoopBench:
         self._observed: np.ndarray | None = None
 
     def exported(
-        self, twin: TwinBundle, blocks: tuple[int, ...], folder: Path
+        self, twin: TwinBundle, blocks: tuple[int, ...], folder: Path, **options: float
     ) -> tuple[KeptController, ControllerParts]:
         """A controller on this twin, written as C with the loop of the first one."""
-        spec = PredictiveControl(blocks=blocks)
+        spec = PredictiveControl(blocks=blocks, **options)
         models = ControlModels(self.valves, twin.twin)
         experiment = ControlExperiment(task=self.task, controller=spec)
         if self._observed is None:

@@ -120,10 +120,11 @@ class _Watched:
         verdict = TRUSTED if self._guard is None else verdict_of(self._guard, self.controller.plant, observation)
         if verdict.untrusted or verdict.fall_back:
             log_event(self.warnings, tick, str(verdict))
-        began, before = time.perf_counter(), self.controller.before
+        before = self.controller.before if self._deadline_s else None
+        began = time.perf_counter()
         levers = self.controller.step(observation, tick, verdict)
         spent = time.perf_counter() - began
-        if 0.0 < self._deadline_s < spent:
+        if before is not None and spent > self._deadline_s:
             levers = self.controller.late(before, tick, f"no answer within {1e3 * self._deadline_s:g} ms")
         return levers, spent
 

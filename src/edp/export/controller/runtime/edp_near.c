@@ -5,7 +5,9 @@
 /* On purpose: one unit with the tick of the grey box, whose parts it calls by the thousand. */
 #include "edp_hydraulics.c"
 
-#define NEAR_TOLERANCE 1e-5 /* of the last change of Newton's method: what is left then is about its square */
+/* Of the last change of Newton's method, MPa and m/s: what is left then is about its square. */
+#define NEAR_PRESSURE 1e-3
+#define NEAR_SPEED 1e-5
 #define SAME 1e-4           /* share of full by which a spool may differ and count as the same */
 #define BETWEEN 0.41421356237309503 /* gamma / (1 - gamma): where a first stage lies between two of a tick */
 #define REST_PRESSURE 2.0   /* MPa of a chamber that is not measured */
@@ -48,7 +50,10 @@ void edp_near_open(edp_near *n, const edp_hydraulics *h, const float *low, const
     n->lines = taken(&at, h->pumps);
     n->lags = taken(&at, h->pumps);
     n->keep = taken(&at, 4u * h->valves);
+    n->delays = taken(&at, h->valves);
+    n->kept_s = 0.0;
     n->rate = taken(&at, nodes);
+    n->centre = taken(&at, h->pumps);
     n->room = at;
     n->differs = differs;
 }
@@ -146,19 +151,24 @@ void edp_near_demands(const edp_hydraulics *h, const float *commands, float *dem
 /* Demand of a valve a dead time before tick t, linear between ticks. `demands`: of one run. */
 static double delayed(const edp_near *n, const float *demands, const float *history, uint32_t t, uint32_t j) {
     const uint32_t valves = n->h->valves;
-    const double last = (double)n->h->history - 2.0;
-    double ticks = number(n->h, n->h->valve_at[j * VALVE_PLACES + DELAY]) / (double)n->h->tick_s;
-    ticks = (ticks > last) ? last : ((ticks < 0.0) ? 0.0 : ticks);
+    const double ticks = n->delays[j];
     const uint32_t whole = (uint32_t)ticks;
     const double newer = (double)((whole <= t) ? demands[(t - whole) * valves + j] : history[(whole - t - 1u) * valves + j]);
     const double older = (double)((whole < t) ? demands[(t - whole - 1u) * valves + j] : history[(whole - t) * valves + j]);
     return newer + (ticks - (double)whole) * (older - newer);
 }
 
-/* Shares of their distance that pilots and spools keep over the two stages of a step. */
-static void set_keep(const edp_near *n, double step) {
+/* Dead times in ticks, and shares of their distance that pilots and spools keep over the two stages of a step. */
+static void set_keep(edp_near *n, double step) {
+    const double last = (double)n->h->history - 2.0;
+    if (n->kept_s == step) {
+        return;
+    }
+    n->kept_s = step;
     for (uint32_t j = 0; j < n->h->valves; j++) {
         const uint16_t *const at = n->h->valve_at + j * VALVE_PLACES;
+        const double ticks = number(n->h, at[DELAY]) / (double)n->h->tick_s;
+        n->delays[j] = (ticks > last) ? last : ((ticks < 0.0) ? 0.0 : ticks);
         for (uint32_t which = 0; which < 2u; which++) {
             const double stage = (which == 0u) ? (GAMMA * step) : ((1.0 - GAMMA) * step);
             n->keep[4u * j + 2u * which] = exp(-stage / number(n->h, at[PILOT_LAG]));
@@ -287,9 +297,11 @@ static void displace_all(edp_near *n, const rooms *r, double step) {
 
 /* ---- a stage of the first run ----------------------------------------------------------------------------------------- */
 
-/* LU in place, without pivots, as the diagonal of pressures dominates. */
-static void factorise(const rooms *r) {
+/* Replaces the residual by the Newton step: LU in place, without pivots, as the diagonal of pressures dominates; the
+   factors stay for the columns of the other runs. */
+static void eliminate(const rooms *r) {
     const uint32_t size = r->unknown;
+    double *const b = r->residual;
     for (uint32_t k = 0; k < size; k++) {
         const double *const from = r->by_y + k * size;
         const double inverse = 1.0 / from[k];
@@ -301,12 +313,21 @@ static void factorise(const rooms *r) {
                 for (uint32_t j = k + 1u; j < size; j++) {
                     row[j] -= factor * from[j];
                 }
+                b[i] -= factor * b[k];
             }
         }
     }
+    for (uint32_t i = size; i-- > 0u;) {
+        const double *const row = r->by_y + i * size;
+        double sum = b[i];
+        for (uint32_t k = i + 1u; k < size; k++) {
+            sum -= row[k] * b[k];
+        }
+        b[i] = sum / row[i];
+    }
 }
 
-/* Replaces `count` columns of `stride` by the solutions. */
+/* Replaces `count` columns of `stride` by the solutions, with the factors that `eliminate` has left. */
 static void substitute(const rooms *r, double *columns, uint32_t count, uint32_t stride) {
     const uint32_t size = r->unknown;
     for (uint32_t i = 0; i < size; i++) {
@@ -348,8 +369,7 @@ static void newton_within(edp_near *n, const rooms *r, double step, double reach
     for (uint32_t iteration = 0; (iteration < EDP_MOST_ITERATIONS) && !near_enough; iteration++) {
         uint32_t most = 0u;
         assemble(n->h, r, step, reach);
-        factorise(r);
-        substitute(r, r->residual, 1u, 1u);
+        eliminate(r);
         for (uint32_t k = 1; k < r->unknown; k++) {
             most = (fabs(r->residual[k]) > fabs(r->residual[most])) ? k : most;
         }
@@ -364,7 +384,10 @@ static void newton_within(edp_near *n, const rooms *r, double step, double reach
             move(r, k, share * r->residual[k]);
         }
         n->spent++;
-        near_enough = fabs(largest) < NEAR_TOLERANCE;
+        near_enough = true;
+        for (uint32_t k = 0; k < r->unknown; k++) {
+            near_enough = near_enough && (fabs(r->residual[k]) < ((k < r->nodes) ? NEAR_PRESSURE : NEAR_SPEED));
+        }
         if (n->left > 0u) {
             n->left--;
         } else if (!near_enough) {
@@ -428,10 +451,11 @@ static void set_rates(const edp_near *n, const rooms *r, double step) {
 /* Area of the open centre of a pump with spools at x. */
 static double open_centre(const edp_hydraulics *h, const double *x, uint32_t m) {
     const uint32_t a = h->pump_at[m];
+    const double closed = 1.0 / number(h, a + BYPASS_CLOSED);
     double area = number(h, a + BYPASS);
     for (uint32_t j = 0; j < h->valves; j++) {
         if (h->valve_pump[j] == m) {
-            const double left = 1.0 - fabs(x[j]) / number(h, a + BYPASS_CLOSED);
+            const double left = 1.0 - fabs(x[j]) * closed;
             area *= (left > 0.0) ? (left * left) : 0.0;
         }
     }
@@ -443,6 +467,9 @@ static void add_spools(const edp_near *n, const rooms *r, uint32_t which) {
     const edp_hydraulics *const h = n->h;
     const uint32_t valves = h->valves;
     const double *const base = n->x + which * valves;
+    for (uint32_t m = 0; m < h->pumps; m++) {
+        n->centre[m] = open_centre(h, base, m);
+    }
     double *const alone = r->reached; /* unused until the stage is done */
     for (uint32_t j = 0; j < valves; j++) {
         bool summed = false;
@@ -466,7 +493,7 @@ static void add_spools(const edp_near *n, const rooms *r, uint32_t which) {
                 const uint32_t m = h->valve_pump[j];
                 const uint32_t node = 2u * r->n + m;
                 double slope;
-                const double wider = open_centre(h, x, m) - open_centre(h, base, m);
+                const double wider = open_centre(h, x, m) - n->centre[m];
                 n->d_y[node * n->most + run - 1u] -= n->rate[node] * wider * turbulent(r->p[node] - r->p[r->nodes], &slope);
             }
         }
@@ -493,9 +520,8 @@ static void stage_of_others(const edp_near *n, const rooms *r, uint32_t which, d
         const double v = r->y[r->nodes + i];
         double *const row = n->d_y + (r->nodes + i) * n->most;
         double by_before;
-        double under;
-        double by_v;
-        friction_slopes(h, a, v, r->base_z[i], step, &by_before, &under, &by_v);
+        /* Slopes of the deflections, in vectors that only the freezing of a load needs. */
+        friction_slopes(h, a, v, r->base_z[i], step, &by_before, &r->w[i], &r->u[i]);
         const double reached = r->s[i] + reach * (r->before[i] + v);
         const bool inside = (number(h, a + STOP_LOW) <= reached) && (reached <= number(h, a + STOP_HIGH));
         const double touched = inside ? 0.0 : (step * number(h, a + STOP_STIFFNESS));
@@ -512,13 +538,9 @@ static void stage_of_others(const edp_near *n, const rooms *r, uint32_t which, d
     }
     substitute(r, n->d_y, n->columns, n->most);
     for (uint32_t i = 0; i < r->n; i++) {
-        double by_before;
-        double under;
-        double by_v;
-        friction_slopes(h, h->actuator_at[i], r->y[r->nodes + i], r->base_z[i], step, &by_before, &under, &by_v);
         for (uint32_t k = 0; k < n->columns; k++) {
             const uint32_t at = i * n->most + k;
-            n->d_z[at] = under * n->d_base_z[at] + by_v * n->d_y[(r->nodes + i) * n->most + k];
+            n->d_z[at] = r->w[i] * n->d_base_z[at] + r->u[i] * n->d_y[(r->nodes + i) * n->most + k];
         }
     }
 }

@@ -4,8 +4,8 @@
  * displacements of each are run as they are, dead bands and play among them; pressures, velocities and strokes follow by
  * the tangent of each implicit stage, whose matrix the first run has factorised already.
  *
- * Newton's method ends when it moves by less than 1e-5 (MPa, m/s), or when `left` iterations are spent: then every stage
- * has one more and `solved` is false. So a tick of a controller has a bound.
+ * Newton's method ends when it moves pressures by less than 1 kPa and velocities by less than 0.01 mm/s, or when `left`
+ * iterations are spent: then every stage has one more and `solved` is false. So a tick of a controller has a bound.
  */
 #ifndef EDP_NEAR_H
 #define EDP_NEAR_H
@@ -15,7 +15,7 @@
 /* Doubles that `count` runs beside the first one of `n` actuators, `v` valves and `p` pumps need, beside those of a tick. */
 #define EDP_NEAR_ROOM(n, v, p, count)                                                                                  \
     ((3u * (n) + (p)) * (4u * (count) + 1u) + (n) * (5u * (count) + 1u) + 8u * ((count) + 1u) * (v) +                   \
-     ((count) + 1u) * (p) + (p) * ((count) + 3u) + 4u * (v) + 2u * (n) + (p))
+     ((count) + 1u) * (p) + (p) * ((count) + 5u) + 5u * (v) + 2u * (n))
 
 /* Bounds of a grey box, and where it works. Made anew for each use: its pointers are into the caller's memory. */
 typedef struct {
@@ -38,7 +38,8 @@ typedef struct {
     double *x, *pilots;                             /* (1 + most, 2, valves), (1 + most, valves) */
     double *d;                                      /* displacements (1 + most, pumps) */
     double *flows, *asked, *lines, *lags;           /* (pumps, most), (pumps) each */
-    double *keep, *rate;                            /* (valves, 4), (nodes) */
+    double *keep, *delays, *rate, *centre;          /* (valves, 4), (valves), (nodes), (pumps) */
+    double kept_s;                                  /* the step that `keep` is of */
     uint8_t *differs;                               /* (1 + most, valves) */
 } edp_near;
 
