@@ -55,9 +55,9 @@ static float {own}_spool({name}_state *s, uint32_t spool) {{
     const float moved = {own}_stage(stages, s->{own}_first[spool], near + ({own}_part[spool] * (far - near)));
     const float low = moved - {own}_play[spool];
     const float high = moved + {own}_play[spool];
-    const float limited = (s->{own}_held[spool] < high) ? s->{own}_held[spool] : high;
-    s->{own}_held[spool] = (limited > low) ? limited : low;
-    return {own}_stage(&stages[4], s->{own}_second[spool], s->{own}_held[spool]);
+    const float limited = (s->{own}_played[spool] < high) ? s->{own}_played[spool] : high;
+    s->{own}_played[spool] = (limited > low) ? limited : low;
+    return {own}_stage(&stages[4], s->{own}_second[spool], s->{own}_played[spool]);
 }}
 
 /* As if the first row had been there for long. */
@@ -72,7 +72,7 @@ static void {own}_begin({name}_state *s) {{
         s->{own}_first[spool][1] = demand * (stages[1] - stages[3]);
         s->{own}_second[spool][0] = demand;
         s->{own}_second[spool][1] = demand * (stages[5] - stages[7]);
-        s->{own}_held[spool] = demand;
+        s->{own}_played[spool] = demand;
     }}
     s->{own}_began = true;
 }}
@@ -211,7 +211,7 @@ class FlowCode:
         own, spools, reads = self.own, len(self.part.gain), len(self.part.reads)
         memory = [f"float {own}_in[{reads}];", f"float {own}_past[{self.length}][{reads}];", f"uint32_t {own}_at;"]
         stages = [f"float {own}_{stage}[{spools}][2];" for stage in ("first", "second")]
-        return [*memory, *stages, f"float {own}_held[{spools}];", f"bool {own}_began;"]
+        return [*memory, *stages, f"float {own}_played[{spools}];", f"bool {own}_began;"]
 
     def constants(self, tables: MonitorTables) -> None:
         """See `SourceCode`."""

@@ -234,9 +234,9 @@ class FlowBalancesSpec(ResidualSpec):
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
         material.note("balances of flow")
-        found = fit_chambers(material, self.rows, self.trials, self.least)
-        if found is None:
+        balances = fit_chambers(material, self.rows, self.trials, self.least)
+        if balances is None:
             return None
-        inputs, spools, fitted = found
+        inputs, spools, fitted = balances
         chambers = [ChamberCurves(*one) for one in fitted]
         return FlowBalances(inputs, mean_inputs(material, inputs), spools, chambers, material.rate_hz)

@@ -86,7 +86,7 @@ class SpoolModel:
         """
         demands, ticks = self.demands(rows), rows.shape[1] - self.memory
         out = np.empty((len(rows), ticks, len(self.gain)), np.float32)
-        first, second, held = (part.copy() for part in state)
+        first, second, rest = (part.copy() for part in state)
         for spool in range(len(self.gain)):
             whole = int(np.floor(self.dead[spool]))
             part = np.float32(self.dead[spool] - whole)
@@ -94,9 +94,9 @@ class SpoolModel:
             late, later = demands[:, at : at + ticks, spool], demands[:, at - 1 : at - 1 + ticks, spool]
             moved = late + part * (later - late)
             moved, first[:, spool] = _stage(moved, self.stages[spool, 0], first[:, spool])
-            moved, held[:, spool] = played(moved, self.play[spool], held[:, spool])
+            moved, rest[:, spool] = played(moved, self.play[spool], rest[:, spool])
             out[..., spool], second[:, spool] = _stage(moved, self.stages[spool, 1], second[:, spool])
-        return out, [first, second, held]
+        return out, [first, second, rest]
 
 
 def stage_of(frequency_hz: float, rate_hz: float) -> Singles:

@@ -59,14 +59,14 @@ def fit_chambers(
         return None
     supplies = _supplies_of(material)
     sessions = [session.select(names).astype(np.float32) for session in material.train]
-    held = [session.select(names).astype(np.float32) for session in material.validation] or sessions
+    judging = [session.select(names).astype(np.float32) for session in material.validation] or sessions
     models, places, curves = [], [], []
     for axis in axes:
         own_places = _places(axis, names, supplies, sessions)
         model = _searched(axis, names, own_places, sessions, material.rate_hz, trials)
         for place in own_places:
             fitted = _curves(place, model, sessions, material.rate_hz, rows)
-            if _told(place, model, held, material.rate_hz, fitted) >= least:
+            if _explained(place, model, judging, material.rate_hz, fitted) >= least:
                 models.append(model)
                 places.append(place)
                 curves.append(fitted)
@@ -260,14 +260,14 @@ def _doubts(columns: Array, off: Array) -> Array:
     """How far a balance usually is off, as a sum of what makes it uncertain, none of it negative."""
     usual = max(float(np.median(off)), 1e-12)
     size = np.maximum(columns.max(axis=0), 1e-12)
-    found, _ = nnls(columns / size, off)
-    factors: Array = found / size
+    scaled, _ = nnls(columns / size, off)
+    factors: Array = scaled / size
     # A width of nothing in particular: half of the usual one at least.
     factors[0] = max(factors[0], 0.5 * usual)
     return factors
 
 
-def _told(
+def _explained(
     place: ChamberPlaces,
     model: SpoolModel,
     sessions: Sequence[Singles],
@@ -317,7 +317,7 @@ def _assembled(
     joined = {
         name: np.concatenate([getattr(apart[key], name) for key in own]) for name in ("gain", "dead", "stages", "play")
     }
-    found: list[Fitted] = []
+    moved_chambers: list[Fitted] = []
     for place, model, numbers in zip(places, models, curves, strict=True):
         spools = tuple(first[id(model)] + spool for spool in place.spools)
         columns = {name: moved(getattr(place, name)) for name in ("velocity", "own", "other", "stroke")}
@@ -326,5 +326,5 @@ def _assembled(
             **columns, supplies=supplies, spools=spools, sign=place.sign, end=place.end, far=place.far,
             cushion=place.cushion, tank=place.tank,
         )  # fmt: skip
-        found.append((new, *numbers))
-    return tuple(inputs.names), SpoolModel(extend, retract, **joined), found
+        moved_chambers.append((new, *numbers))
+    return tuple(inputs.names), SpoolModel(extend, retract, **joined), moved_chambers
