@@ -143,7 +143,7 @@ def played(values: Singles, width: np.float32, before: Singles) -> tuple[Singles
 def root(drop: Singles) -> Singles:
     """The root of a pressure difference in MPa, where it is positive: dp / (dp^2 + 0.01)^(1/4)."""
     positive = np.maximum(drop, np.float32(0.0))
-    return positive / np.sqrt(np.sqrt(positive * positive + SMOOTH))
+    return np.asarray(positive / np.sqrt(np.sqrt(positive * positive + SMOOTH)), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
