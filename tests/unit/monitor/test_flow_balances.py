@@ -47,7 +47,7 @@ def rest(source, recording, axis):
 @pytest.mark.parametrize(
     ("fault", "axis"),
     [
-        ("stuck_spool:arm:50%@0s", "CylVels_2"),
+        ("stuck_spool:arm:80%@0s", "CylVels_2"),
         ("dead_band:bucket:16%@0s", "CylVels_3"),
         ("velocity_scale:boom:10%@0s", "CylVels_1"),
         ("internal_leak:bucket:10L/min@0s", "CylVels_3"),

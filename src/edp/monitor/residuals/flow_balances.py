@@ -50,14 +50,14 @@ class ChamberCurves:
     """Numbers of a chamber's balance.
 
     Attributes:
-        place: of its channels.
+        spots: of its channels.
         values: of its curves at the knots, shape (paths, knots).
         slopes: of its curves from each knot on, shape (paths, knots).
         lines: factors of the terms without a spool, shape (LINES,).
         doubts: factors of what makes it uncertain, none negative and the first one positive, shape (DOUBTS,).
     """
 
-    place: ChamberPlaces
+    spots: ChamberPlaces
     values: Singles
     slopes: Singles
     lines: Singles
@@ -88,15 +88,15 @@ class FlowBalances(ResidualSource):
     ) -> None:
         self.inputs, self.middle = tuple(inputs), np.asarray(middle, np.float32)
         self.spools, self.chambers, self.rate_hz = spools, tuple(chambers), rate_hz
-        self.names = tuple(PREFIX + self.inputs[chamber.place.own] for chamber in self.chambers)
-        self.judged = tuple((self.inputs[chamber.place.velocity],) for chamber in self.chambers)
+        self.names = tuple(PREFIX + self.inputs[chamber.spots.own] for chamber in self.chambers)
+        self.judged = tuple((self.inputs[chamber.spots.velocity],) for chamber in self.chambers)
         self.units = ("1",) * len(self.chambers)
-        self.reads = tuple(self._read(chamber.place) for chamber in self.chambers)
+        self.reads = tuple(self._read(chamber.spots) for chamber in self.chambers)
         self.per_tick = np.float32(rate_hz / 6.0)
 
-    def _read(self, place: ChamberPlaces) -> tuple[str, ...]:
-        places = [place.velocity, place.own, place.other, place.stroke, *place.supplies]
-        for spool in place.spools:
+    def _read(self, spots: ChamberPlaces) -> tuple[str, ...]:
+        places = [spots.velocity, spots.own, spots.other, spots.stroke, *spots.supplies]
+        for spool in spots.spools:
             places += [int(self.spools.extend[spool]), int(self.spools.retract[spool])]
         return tuple(dict.fromkeys(self.inputs[i] for i in places if i >= 0))
 
@@ -120,22 +120,22 @@ class FlowBalances(ResidualSource):
 
     @staticmethod
     def _residual(chamber: ChamberCurves, rows: Singles, rates: Singles, spools: Singles) -> Singles:
-        place, flow = chamber.place, np.zeros(rows.shape[:-1], np.float32)
+        spots, flow = chamber.spots, np.zeros(rows.shape[:-1], np.float32)
         through, width = flow, flow
-        paths = paths_of(place, rows, spools)
+        paths = paths_of(spots, rows, spools)
         for (travel, drive), values, slopes in zip(paths, chamber.values, chamber.slopes, strict=True):
             part = opened(travel, values, slopes) * drive
             flow, through = flow + part, through + np.abs(part)
-        for term, factor in zip(lines_of(place, rows, rates), chamber.lines, strict=True):
+        for term, factor in zip(lines_of(spots, rows, rates), chamber.lines, strict=True):
             flow = flow + factor * term
-        for term, factor in zip(doubts_of(place, rows, rates, through), chamber.doubts, strict=True):
+        for term, factor in zip(doubts_of(spots, rows, rates, through), chamber.doubts, strict=True):
             width = width + factor * term
-        residual: Singles = (rows[..., place.velocity] - np.float32(place.sign) * flow) / width
+        residual: Singles = (rows[..., spots.velocity] - np.float32(spots.sign) * flow) / width
         return residual
 
     def parts(self) -> SourceParts:
         """See `ResidualSource.parts`."""
-        places = [asdict(chamber.place) for chamber in self.chambers]
+        places = [asdict(chamber.spots) for chamber in self.chambers]
         plain = {"inputs": list(self.inputs), "rate_hz": self.rate_hz, "chambers": places}
         arrays: dict[str, NDArray[Any]] = {"middle": self.middle}
         arrays |= {f"spools.{one.name}": getattr(self.spools, one.name) for one in fields(self.spools)}
@@ -194,16 +194,16 @@ def _place_of(entry: Any, inputs: int, spools: int) -> ChamberPlaces:
     return ChamberPlaces(**single, **lists, **numbers)
 
 
-def _chamber_of(place: ChamberPlaces, arrays: Any, index: int) -> ChamberCurves:
+def _chamber_of(spots: ChamberPlaces, arrays: Any, index: int) -> ChamberCurves:
     values, slopes, lines, doubts = (np.asarray(arrays[f"{index}.{name}"], np.float32) for name in NUMBERS)
-    curves = (place.paths, len(KNOTS))
+    curves = (spots.paths, len(KNOTS))
     if (values.shape, slopes.shape, lines.shape, doubts.shape) != (curves, curves, (LINES,), (DOUBTS,)):
         raise ValueError("curves of a chamber have other shapes than its header says")
     if not all(np.isfinite(one).all() for one in (values, slopes, lines, doubts)):
         raise ValueError("a number of a chamber is not finite")
     if (doubts < 0.0).any() or doubts[0] <= 0.0:
         raise ValueError("the width of a chamber's balance is not positive")
-    return ChamberCurves(place, values, slopes, lines, doubts)
+    return ChamberCurves(spots, values, slopes, lines, doubts)
 
 
 @RESIDUALS.register("flow_balances")

@@ -182,79 +182,79 @@ class ChamberPlaces:
         return len(self.supplies) * len(self.spools) + 4
 
 
-def paths_of(place: ChamberPlaces, rows: Singles, spools: Singles) -> list[tuple[Singles, Singles]]:
+def paths_of(spots: ChamberPlaces, rows: Singles, spools: Singles) -> list[tuple[Singles, Singles]]:
     """Travel that opens each path, and the root of what drives it: in from the pumps, in from the other chamber, out to
     the tank, out to the other chamber, what a cushion takes from the way to the tank, in by the second spool.
 
     Args:
-        place: of the chamber.
+        spots: of the chamber.
         rows: inputs, shape (..., inputs).
         spools: shape (..., spools).
     """
-    own, other = rows[..., place.own] * MEGA, rows[..., place.other] * MEGA
+    own, other = rows[..., spots.own] * MEGA, rows[..., spots.other] * MEGA
     none = np.float32(0.0)
-    sign = np.float32(place.sign)
-    supplies = [root(rows[..., supply] * MEGA - own) for supply in place.supplies]
-    first = spools[..., place.spools[0]] * sign
+    sign = np.float32(spots.sign)
+    supplies = [root(rows[..., supply] * MEGA - own) for supply in spots.supplies]
+    first = spools[..., spots.spools[0]] * sign
     inward, outward = np.maximum(first, none), np.maximum(-first, none)
-    away = root(own - np.float32(place.tank))
+    away = root(own - np.float32(spots.tank))
     paths = [(inward, drive) for drive in supplies]
     paths += [(inward, root(other - own)), (outward, away), (outward, root(own - other))]
-    paths.append((outward, away * shut_of(place, rows)))
-    for spool in place.spools[1:]:
+    paths.append((outward, away * shut_of(spots, rows)))
+    for spool in spots.spools[1:]:
         travel = np.maximum(spools[..., spool] * sign, none)
         paths += [(travel, drive) for drive in supplies]
     return paths
 
 
-def shut_of(place: ChamberPlaces, rows: Singles) -> Singles:
+def shut_of(spots: ChamberPlaces, rows: Singles) -> Singles:
     """Share of the outflow that a cushion may take, from nothing at its beginning to 1 at the end of the stroke."""
-    near = _near(place, rows, place.end)
+    near = _near(spots, rows, spots.end)
     shut: Singles = np.float32(1.0) - near * near * (np.float32(3.0) - near - near)
     return shut
 
 
-def _near(place: ChamberPlaces, rows: Singles, end: float) -> Singles:
+def _near(spots: ChamberPlaces, rows: Singles, end: float) -> Singles:
     """Distance to an end of the stroke in lengths of the cushion, 1 at most; 1 without a stroke."""
-    if place.stroke < 0:
+    if spots.stroke < 0:
         return np.ones(rows.shape[:-1], np.float32)
-    distance = np.abs(rows[..., place.stroke] - np.float32(end)) * np.float32(1.0 / place.cushion)
+    distance = np.abs(rows[..., spots.stroke] - np.float32(end)) * np.float32(1.0 / spots.cushion)
     near: Singles = np.minimum(distance, np.float32(1.0))
     return near
 
 
-def doubts_of(place: ChamberPlaces, rows: Singles, rates: Singles, through: Singles) -> list[Singles]:
+def doubts_of(spots: ChamberPlaces, rows: Singles, rates: Singles, through: Singles) -> list[Singles]:
     """What makes a balance uncertain, none of it negative: nothing in particular; fast compression, and that of soft
     oil; a chamber that is drawn empty; either end of the stroke; a port relief; and much flow.
 
     Args:
-        place: of the chamber.
+        spots: of the chamber.
         rows: inputs, shape (..., inputs).
         rates: of all inputs, per second, shape (..., inputs).
         through: sizes of the flows of all paths, summed, shape (...).
     """
-    own, rate = rows[..., place.own] * MEGA, np.abs(rates[..., place.own] * MEGA)
+    own, rate = rows[..., spots.own] * MEGA, np.abs(rates[..., spots.own] * MEGA)
     none, whole = np.float32(0.0), np.float32(1.0)
     soft = whole / (np.maximum(own, none) + CAVITY)
     doubts = [np.ones_like(own), rate, rate * soft, np.maximum(EMPTY - own, none)]
-    doubts += [whole - _near(place, rows, place.end), whole - _near(place, rows, place.far)]
+    doubts += [whole - _near(spots, rows, spots.end), whole - _near(spots, rows, spots.far)]
     return [*doubts, np.maximum(own - RELIEFS[1], none), through]
 
 
-def lines_of(place: ChamberPlaces, rows: Singles, rates: Singles) -> list[Singles]:
+def lines_of(spots: ChamberPlaces, rows: Singles, rates: Singles) -> list[Singles]:
     """Terms without a spool: what is constant; what the oil takes up as it is compressed, with the volume and with free
     air in it; what is drawn in from the tank; leaks; and reliefs.
 
     Args:
-        place: of the chamber.
+        spots: of the chamber.
         rows: inputs, shape (..., inputs).
         rates: of all inputs, per second, shape (..., inputs).
     """
-    own, other, rate = rows[..., place.own] * MEGA, rows[..., place.other] * MEGA, rates[..., place.own] * MEGA
+    own, other, rate = rows[..., spots.own] * MEGA, rows[..., spots.other] * MEGA, rates[..., spots.own] * MEGA
     soft = np.float32(1.0) / (np.maximum(own, np.float32(0.0)) + CAVITY)
-    stroke = rows[..., place.stroke] if place.stroke >= 0 else np.zeros_like(own)
+    stroke = rows[..., spots.stroke] if spots.stroke >= 0 else np.zeros_like(own)
     lines = [np.ones_like(own), rate, rate * stroke, rate * soft, rate * soft * soft]
-    lines += [root(np.float32(place.tank) - own), own - other, own, rate * stroke * soft]
+    lines += [root(np.float32(spots.tank) - own), own - other, own, rate * stroke * soft]
     return lines + [np.maximum(own - limit, np.float32(0.0)) for limit in RELIEFS]
 
 

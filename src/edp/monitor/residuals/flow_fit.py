@@ -64,11 +64,11 @@ def fit_chambers(
     for axis in axes:
         own_places = _places(axis, names, supplies, sessions)
         model = _searched(axis, names, own_places, sessions, material.rate_hz, trials)
-        for place in own_places:
-            fitted = _curves(place, model, sessions, material.rate_hz, rows)
-            if _explained(place, model, judging, material.rate_hz, fitted) >= least:
+        for spots in own_places:
+            fitted = _curves(spots, model, sessions, material.rate_hz, rows)
+            if _explained(spots, model, judging, material.rate_hz, fitted) >= least:
                 models.append(model)
-                places.append(place)
+                places.append(spots)
                 curves.append(fitted)
     if not places:
         return None
@@ -158,7 +158,7 @@ def _searched(
 
     def error(numbers: Array) -> float:
         model = _model(axis, names, gains, np.clip(numbers, low, high), rate_hz)
-        return sum(_left(place, model, chosen, rate_hz, stride) for place in places)
+        return sum(_left(spots, model, chosen, rate_hz, stride) for spots in places)
 
     simplex = np.array([start] + [_moved(start, i) for i in range(len(start))])
     options = {"maxfev": trials, "initial_simplex": np.clip(simplex, low, high), "xatol": 1e-4, "fatol": 1e-5}
@@ -187,7 +187,7 @@ Part = tuple[list[tuple[Singles, Singles]], list[Singles], Singles, Singles, Sin
 
 
 def _terms(
-    place: ChamberPlaces, model: SpoolModel, rows: Singles, rate_hz: float, keep: Callable[[Singles], Singles]
+    spots: ChamberPlaces, model: SpoolModel, rows: Singles, rate_hz: float, keep: Callable[[Singles], Singles]
 ) -> Part:
     """What a balance is made of at the ticks of a session that are kept, `BACK` ticks ago."""
     whole = np.concatenate([np.repeat(rows[:1], model.memory, axis=0), rows])[None]
@@ -196,8 +196,8 @@ def _terms(
     pieces = [keep(whole[0, end - ticks - back : end - back]) for back in (BACK, 0, 1, 3, 4)]
     rates = ((pieces[1] - pieces[4]) + (pieces[2] - pieces[3])) * np.float32(rate_hz / 6.0)
     then = pieces[0]
-    lines, velocity = lines_of(place, then, rates), then[:, place.velocity]
-    return paths_of(place, then, keep(spools[0])), lines, velocity, then, rates
+    lines, velocity = lines_of(spots, then, rates), then[:, spots.velocity]
+    return paths_of(spots, then, keep(spools[0])), lines, velocity, then, rates
 
 
 def _columns(part: Part) -> Array:
@@ -207,52 +207,52 @@ def _columns(part: Part) -> Array:
     return np.concatenate([*curves, np.stack(lines, axis=1).astype(np.float64)], axis=1)
 
 
-def _solved(columns: Array, wanted: Array) -> Array:
+def _solved(columns: Array, target: Array) -> Array:
     """Least squares, with a trace of ridge for what never opens, and once more without gross ticks."""
     size = np.sqrt(np.square(columns).mean(axis=0))
     size = np.where(size > 1e-12, size, 1e-12)
-    keep: NDArray[np.bool_] = np.ones(len(wanted), dtype=bool)
+    keep: NDArray[np.bool_] = np.ones(len(target), dtype=bool)
     factors = np.zeros(columns.shape[1])
     for _ in range(2):
-        scaled, goal = columns[keep] / size, wanted[keep]
+        scaled, goal = columns[keep] / size, target[keep]
         normal = scaled.T @ scaled + RIDGE * len(goal) * np.eye(len(size))
         factors = np.linalg.solve(normal, scaled.T @ goal) / size
-        off = np.abs(wanted - columns @ factors)
+        off = np.abs(target - columns @ factors)
         keep = off <= GROSS * max(float(np.median(off)), 1e-12)
     return factors
 
 
-def _left(place: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, stride: int) -> float:
+def _left(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, stride: int) -> float:
     """Mean size of what a balance leaves on the sessions that it is fitted to, over that of the velocity."""
-    parts = [_terms(place, model, rows, rate_hz, lambda v: v[50::stride]) for rows in sessions]
-    columns, wanted = np.concatenate([_columns(part) for part in parts]), np.concatenate([part[2] for part in parts])
-    wanted = place.sign * wanted.astype(np.float64)
-    off = np.abs(wanted - columns @ _solved(columns, wanted))
-    return float(off.mean() / max(float(np.abs(wanted).mean()), 1e-12))
+    parts = [_terms(spots, model, rows, rate_hz, lambda v: v[50::stride]) for rows in sessions]
+    columns, target = np.concatenate([_columns(part) for part in parts]), np.concatenate([part[2] for part in parts])
+    target = spots.sign * target.astype(np.float64)
+    off = np.abs(target - columns @ _solved(columns, target))
+    return float(off.mean() / max(float(np.abs(target).mean()), 1e-12))
 
 
-def _curves(place: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, rows: int) -> Curves:
+def _curves(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, rows: int) -> Curves:
     """Numbers of a chamber by all sessions that train."""
     stride = max(1, sum(map(len, sessions)) // rows)
-    parts = [_terms(place, model, session, rate_hz, lambda v: v[50::stride]) for session in sessions]
-    wanted = np.concatenate([part[2] for part in parts]).astype(np.float64) * place.sign
+    parts = [_terms(spots, model, session, rate_hz, lambda v: v[50::stride]) for session in sessions]
+    target = np.concatenate([part[2] for part in parts]).astype(np.float64) * spots.sign
     columns = np.concatenate([_columns(part) for part in parts])
     then, rates = (np.concatenate([part[index] for part in parts]) for index in (3, 4))
     own = len(KNOTS) - 1
-    width, factors, doubts = np.ones(len(wanted)), np.zeros(0), np.zeros(0)
+    width, factors, doubts = np.ones(len(target)), np.zeros(0), np.zeros(0)
     # The second time by the widths of the first: what is uncertain counts less.
     for _ in range(2):
-        factors = _solved(columns / width[:, None], wanted / width)
-        flows = columns[:, : place.paths * own] * factors[: place.paths * own]
-        through = np.abs(flows.reshape(len(flows), place.paths, own).sum(axis=2)).sum(axis=1).astype(np.float32)
-        terms = np.stack(doubts_of(place, then, rates, through), axis=1).astype(np.float64)
-        doubts = _doubts(terms, np.abs(wanted - columns @ factors))
+        factors = _solved(columns / width[:, None], target / width)
+        flows = columns[:, : spots.paths * own] * factors[: spots.paths * own]
+        through = np.abs(flows.reshape(len(flows), spots.paths, own).sum(axis=2)).sum(axis=1).astype(np.float32)
+        terms = np.stack(doubts_of(spots, then, rates, through), axis=1).astype(np.float64)
+        doubts = _doubts(terms, np.abs(target - columns @ factors))
         width = terms @ doubts
-    heights = factors[: place.paths * own].reshape(place.paths, own)
-    values = np.concatenate([np.zeros((place.paths, 1)), heights], axis=1)
+    heights = factors[: spots.paths * own].reshape(spots.paths, own)
+    values = np.concatenate([np.zeros((spots.paths, 1)), heights], axis=1)
     slopes = np.zeros_like(values)
     slopes[:, :-1] = np.diff(values, axis=1) / np.diff(KNOTS.astype(np.float64))
-    lines = factors[place.paths * own :]
+    lines = factors[spots.paths * own :]
     return values.astype(np.float32), slopes.astype(np.float32), lines.astype(np.float32), doubts.astype(np.float32)
 
 
@@ -268,7 +268,7 @@ def _doubts(columns: Array, off: Array) -> Array:
 
 
 def _explained(
-    place: ChamberPlaces,
+    spots: ChamberPlaces,
     model: SpoolModel,
     sessions: Sequence[Singles],
     rate_hz: float,
@@ -279,9 +279,9 @@ def _explained(
     factors = np.concatenate([values[:, 1:].ravel(), lines]).astype(np.float64)
     off = size = 0.0
     for rows in sessions[:8]:
-        part = _terms(place, model, rows, rate_hz, lambda v: v[50::10])
-        wanted = place.sign * part[2].astype(np.float64)
-        off, size = off + float(np.abs(wanted - _columns(part) @ factors).mean()), size + float(np.abs(wanted).mean())
+        part = _terms(spots, model, rows, rate_hz, lambda v: v[50::10])
+        target = spots.sign * part[2].astype(np.float64)
+        off, size = off + float(np.abs(target - _columns(part) @ factors).mean()), size + float(np.abs(target).mean())
     return 1.0 - off / max(size, 1e-12)
 
 
@@ -289,7 +289,7 @@ def _explained(
 class _Numbered:
     names: list[str]
 
-    def place(self, name: str) -> int:
+    def column(self, name: str) -> int:
         if name not in self.names:
             self.names.append(name)
         return self.names.index(name)
@@ -308,7 +308,7 @@ def _assembled(
         first[key] = sum(len(apart[other].gain) for other in own[: own.index(key)])
 
     def moved(column: int) -> int:
-        return inputs.place(names[column]) if column >= 0 else -1
+        return inputs.column(names[column]) if column >= 0 else -1
 
     extend, retract = (
         np.array([moved(int(c)) for key in own for c in getattr(apart[key], side)], np.int64)
@@ -318,13 +318,13 @@ def _assembled(
         name: np.concatenate([getattr(apart[key], name) for key in own]) for name in ("gain", "dead", "stages", "play")
     }
     moved_chambers: list[Fitted] = []
-    for place, model, numbers in zip(places, models, curves, strict=True):
-        spools = tuple(first[id(model)] + spool for spool in place.spools)
-        columns = {name: moved(getattr(place, name)) for name in ("velocity", "own", "other", "stroke")}
-        supplies = tuple(moved(column) for column in place.supplies)
+    for spots, model, numbers in zip(places, models, curves, strict=True):
+        spools = tuple(first[id(model)] + spool for spool in spots.spools)
+        columns = {name: moved(getattr(spots, name)) for name in ("velocity", "own", "other", "stroke")}
+        supplies = tuple(moved(column) for column in spots.supplies)
         new = ChamberPlaces(
-            **columns, supplies=supplies, spools=spools, sign=place.sign, end=place.end, far=place.far,
-            cushion=place.cushion, tank=place.tank,
+            **columns, supplies=supplies, spools=spools, sign=spots.sign, end=spots.end, far=spots.far,
+            cushion=spots.cushion, tank=spots.tank,
         )  # fmt: skip
         moved_chambers.append((new, *numbers))
     return tuple(inputs.names), SpoolModel(extend, retract, **joined), moved_chambers

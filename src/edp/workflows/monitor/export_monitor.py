@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from edp.export.monitor import (
     DETECTORS,
     BalancePart,
     ChainPart,
-    FlowChamber,
     FlowPart,
     GoldenChain,
     GoldenResiduals,
@@ -38,7 +36,6 @@ from edp.monitor.monitor_file import HEADER, load_monitor
 from edp.monitor.residuals.balances import Balances
 from edp.monitor.residuals.base import ResidualSource
 from edp.monitor.residuals.flow_balances import FlowBalances
-from edp.monitor.residuals.flow_curves import BACK, CAVITY, EMPTY, KNOTS, RELIEFS, SMOOTH
 from edp.monitor.residuals.look_ahead import SMALLEST_WIDTH, LookAhead
 from edp.monitor.residuals.twin_ports import TwinPorts
 from edp.monitor.residuals.virtual_sensors import VirtualSensors
@@ -47,6 +44,7 @@ from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import plant_bundle
+from edp.workflows.monitor.export_flows import flow_part
 
 FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries"), "ros2": ()}
 """Forms of a monitor with their options; they are forms of networks, too."""
@@ -163,7 +161,7 @@ def source_parts(source: ResidualSource, columns: Mapping[str, int]) -> list[Sou
     if isinstance(source, Balances):
         return [_balances(source, columns)]
     if isinstance(source, FlowBalances):
-        return [_flows(source, columns)]
+        return [flow_part(source, columns)]
     raise ExportError(
         f"residuals of kind '{type(source).__name__}' have no form in C; fit the monitor without them, or run it in "
         "Python"
@@ -222,43 +220,6 @@ def _balances(source: Balances, columns: Mapping[str, int]) -> BalancePart:
         rates=tuple(source.pairs[:, 1].tolist()),
         steps=source.gains / source.rate_hz,
         left=1.0 - 1.0 / (source.memories_s * source.rate_hz),
-    )
-
-
-def _flows(source: FlowBalances, columns: Mapping[str, int]) -> FlowPart:
-    spools, chambers = source.spools, []
-    for chamber in source.chambers:
-        place = asdict(chamber.place)
-        per_cushion = float(np.float32(1.0 / place.pop("cushion")))
-        chambers.append(
-            FlowChamber(
-                **place,
-                per_cushion=per_cushion,
-                values=chamber.values,
-                slopes=chamber.slopes,
-                lines=chamber.lines,
-                doubts=chamber.doubts,
-            )
-        )
-    return FlowPart(
-        reads=tuple(columns[name] for name in source.inputs),
-        middle=source.middle,
-        extend=tuple(spools.extend.tolist()),
-        retract=tuple(spools.retract.tolist()),
-        gain=spools.gain,
-        dead=spools.dead,
-        stages=spools.stages,
-        play=spools.play,
-        memory=spools.memory,
-        back=BACK,
-        knots=KNOTS,
-        reliefs=RELIEFS,
-        smooth=float(SMOOTH),
-        cavity=float(CAVITY),
-        empty=float(EMPTY),
-        doubtful=1,
-        per_tick=float(source.per_tick),
-        chambers=tuple(chambers),
     )
 
 
