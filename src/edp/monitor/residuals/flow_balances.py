@@ -130,8 +130,8 @@ class FlowBalances(ResidualSource):
             flow = flow + factor * term
         for term, factor in zip(doubts_of(spots, rows, rates, through), chamber.doubts, strict=True):
             width = width + factor * term
-        residual: Singles = (rows[..., spots.velocity] - np.float32(spots.sign) * flow) / width
-        return residual
+        off = rows[..., spots.velocity] - np.float32(spots.sign) * flow
+        return np.asarray(off / width, np.float32)
 
     def parts(self) -> SourceParts:
         """See `ResidualSource.parts`."""
@@ -191,7 +191,8 @@ def _place_of(entry: Any, inputs: int, spools: int) -> ChamberPlaces:
         raise ValueError("a chamber has a sign or a number of pumps that cannot be")
     if not all(np.isfinite(value) for value in numbers.values()) or numbers["cushion"] <= 0.0:
         raise ValueError("a number of a chamber is not finite, or its cushion has no length")
-    return ChamberPlaces(**single, **lists, **numbers)
+    values: dict[str, Any] = {**single, **lists, **numbers}
+    return ChamberPlaces(**values)
 
 
 def _chamber_of(spots: ChamberPlaces, arrays: Any, index: int) -> ChamberCurves:
