@@ -13,6 +13,7 @@ from edp.monitor.detectors import DETECTORS
 from edp.monitor.fitting import ChainSpec
 from edp.monitor.residuals import RESIDUALS, ResidualSpec
 from edp.monitor.residuals.balances import BalancesSpec
+from edp.monitor.residuals.flow_balances import FlowBalancesSpec
 from edp.monitor.residuals.look_ahead import LookAheadSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
@@ -23,7 +24,7 @@ MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS},
 
 def default_residuals() -> tuple[ResidualSpec, ...]:
     """Sources that need no settings; what a machine does not offer gives none."""
-    return VirtualSensorsSpec(), LookAheadSpec(), BalancesSpec()
+    return VirtualSensorsSpec(), LookAheadSpec(), BalancesSpec(), FlowBalancesSpec()
 
 
 AUTOMATIC, NO_MACHINE = "", "none"

@@ -7,7 +7,16 @@ from typing import Any
 
 from edp.evaluation.controller import BOARD_SLOW, BOARD_TYPICAL, CORES, STACK_BYTES, Budget, Estimate
 from edp.evaluation.footprint import Footprint, footprint
-from edp.export.monitor import BalancePart, MonitorParts, NetworkPart, SourcePart, TwinPart, WatchPart, monitor_files
+from edp.export.monitor import (
+    BalancePart,
+    FlowPart,
+    MonitorParts,
+    NetworkPart,
+    SourcePart,
+    TwinPart,
+    WatchPart,
+    monitor_files,
+)
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
@@ -25,6 +34,10 @@ CORE_COSTS = {
 Of a residual, of a driver of it and of an input at a tick, of a product with its sum in single and in double precision,
 of a summary of a residual at the end of a block, and of a tick besides. Fitted to counted code of chains of several
 sizes (``benchmarks/monitor_cycles.py --fit``)."""
+FLOW_COSTS = {"path": 110.0, "chamber": 450.0, "spool": 160.0}
+"""Cycles of balances of flow at a tick, which are in single precision: of a curve with the root of what drives it (two
+square roots and a division at 14 cycles each, the search of a knot), of a chamber besides, and of a spool. Counted by
+hand from the operations of the code, unlike those above."""
 DETECTOR = {"cusum": 2.0, "ewma": 2.5, "glr": 2.0, "separate_cusums": 2.5}
 """Products in double precision that take as long as a direction in a detector; of the likelihood ratio a length."""
 CENTRE, VERDICT, POINT = 0.5, 0.6, 4.0
@@ -66,11 +79,24 @@ def _watch_doubles(watch: WatchPart) -> float:
 def chain_cycles(parts: MonitorParts) -> ChainCycles:
     """Cycles of the chain of a monitor."""
     work, block = chain_work(parts), parts.chain.block
-    every = sum(CORE_COSTS[name] * work[name] for name in ("residual", "driver", "input", "tick"))
+    flows = flow_cycles(parts)
+    every = flows + sum(CORE_COSTS[name] * work[name] for name in ("residual", "driver", "input", "tick"))
     costs = _slices(parts)
     together = -(-len(costs) // block)
     most = max(sum(costs[first : first + together]) for first in range(0, len(costs), together))
-    return ChainCycles(sum(CORE_COSTS[name] * amount for name, amount in work.items()), every + most)
+    mean = flows + sum(CORE_COSTS[name] * amount for name, amount in work.items())
+    return ChainCycles(mean, every + most)
+
+
+def flow_cycles(parts: MonitorParts) -> float:
+    """Cycles of the balances of flow of a monitor at a tick; they are counted with the chain, since no network runs."""
+    cycles = 0.0
+    for part in parts.sources:
+        if isinstance(part, FlowPart):
+            paths = sum(len(chamber.values) for chamber in part.chambers)
+            cycles += FLOW_COSTS["path"] * paths + FLOW_COSTS["chamber"] * len(part.chambers)
+            cycles += FLOW_COSTS["spool"] * len(part.gain)
+    return cycles
 
 
 def _slices(parts: MonitorParts) -> list[float]:
@@ -197,6 +223,9 @@ def _source_bytes(part: SourcePart) -> int:
     buffers = 4 * len(part.reads)
     if isinstance(part, BalancePart):
         return buffers + 17 * len(part.levels) + 7
+    if isinstance(part, FlowPart):
+        # Rows that are remembered, memories of both stages and the play of each spool, and where it stands.
+        return buffers + 4 * ((part.memory + 1) * len(part.reads) + 5 * len(part.gain)) + 8
     task = part.bundle.task
     # Counters and the last inputs, which the state of every network has beside what its layers remember.
     network = 4 * (8 + len(part.bundle.inputs))

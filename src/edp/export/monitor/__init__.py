@@ -5,6 +5,8 @@ from edp.export.monitor.golden import drawn_rows
 from edp.export.monitor.parts import (
     BalancePart,
     ChainPart,
+    FlowChamber,
+    FlowPart,
     GoldenChain,
     GoldenResiduals,
     MonitorParts,
@@ -20,6 +22,8 @@ __all__ = [
     "DETECTORS",
     "BalancePart",
     "ChainPart",
+    "FlowChamber",
+    "FlowPart",
     "GoldenChain",
     "GoldenResiduals",
     "MonitorParts",

@@ -82,7 +82,91 @@ class TwinPart:
     period: int
 
 
-SourcePart = NetworkPart | BalancePart | TwinPart
+@dataclass(frozen=True, eq=False)
+class FlowChamber:
+    """A chamber's balance of flow.
+
+    Attributes:
+        velocity: place among `FlowPart.reads`, as are the next ones; of `stroke` -1 is none.
+        own: pressure of the chamber.
+        other: pressure of the one on the other side.
+        stroke: see `velocity`.
+        supplies: pressures of the pumps.
+        spools: places of its spools.
+        sign: 1 for a chamber that grows with the velocity, -1 for the other.
+        end: stroke at which its outflow is cushioned, m.
+        far: stroke at the other end, m.
+        per_cushion: one over the length of the cushion, 1/m.
+        tank: pressure of the return line, MPa.
+        values: of its curves at the knots, shape (paths, knots); `slopes` from each knot on.
+        slopes: see `values`.
+        lines: factors of the terms without a spool, shape (9 + reliefs,).
+        doubts: factors of what makes it uncertain, shape (8,).
+    """
+
+    velocity: int
+    own: int
+    other: int
+    stroke: int
+    supplies: Places
+    spools: Places
+    sign: int
+    end: float
+    far: float
+    per_cushion: float
+    tank: float
+    values: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+    lines: NDArray[np.float32]
+    doubts: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class FlowPart:
+    """Balances of flow: `edp.monitor.residuals.flow_balances` as numbers.
+
+    Attributes:
+        reads: inputs of the monitor that are read.
+        middle: what stands in for each of them before it was ever there, shape (reads,).
+        extend: place of the command that extends of each spool among `reads`; `retract` likewise, -1 for none.
+        retract: see `extend`.
+        gain: one over the full command, shape (spools,).
+        dead: dead time in ticks, shape (spools,).
+        stages: b1, b2, a1, a2 of both stages, shape (spools, 2, 4).
+        play: half width, shape (spools,).
+        memory: rows before a tick that are needed for it.
+        back: ticks by which balances lag.
+        knots: shape (knots,).
+        reliefs: MPa, shape (reliefs,).
+        smooth: MPa^2 below which an orifice turns laminar.
+        cavity: MPa that are added where free air makes oil soft.
+        empty: MPa below which a chamber may be drawn empty.
+        doubtful: place of the relief, among `reliefs`, beyond which a balance is uncertain.
+        per_tick: a sixth of the ticks per second.
+        chambers: the balances.
+    """
+
+    reads: Places
+    middle: NDArray[np.float32]
+    extend: Places
+    retract: Places
+    gain: NDArray[np.float32]
+    dead: Array
+    stages: NDArray[np.float32]
+    play: NDArray[np.float32]
+    memory: int
+    back: int
+    knots: NDArray[np.float32]
+    reliefs: NDArray[np.float32]
+    smooth: float
+    cavity: float
+    empty: float
+    doubtful: int
+    per_tick: float
+    chambers: tuple[FlowChamber, ...]
+
+
+SourcePart = NetworkPart | BalancePart | TwinPart | FlowPart
 
 
 @dataclass(frozen=True, eq=False)

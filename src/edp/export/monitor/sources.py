@@ -9,8 +9,9 @@ import numpy as np
 
 from edp.export.c.model import Model, make_model
 from edp.export.c.text import number
+from edp.export.monitor.flows import FlowCode
 from edp.export.monitor.numbers import MonitorTables
-from edp.export.monitor.parts import BalancePart, NetworkPart, SourcePart, TwinPart
+from edp.export.monitor.parts import BalancePart, FlowPart, NetworkPart, SourcePart, TwinPart
 
 HOLD = """\
     for (uint32_t i = 0; i < {count}u; i++) {{
@@ -299,6 +300,8 @@ def source_code(part: SourcePart, index: int, name: str) -> SourceCode:
         return NetworkCode(part, f"n{index}", f"{name}_n{index}")
     if isinstance(part, TwinPart):
         return TwinCode(part, f"t{index}", f"{name}_t{index}")
+    if isinstance(part, FlowPart):
+        return FlowCode(part, f"f{index}", HOLD.format(own=f"f{index}", count=len(part.reads)))
     return BalanceCode(part, f"b{index}")
 
 

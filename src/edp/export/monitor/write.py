@@ -263,7 +263,8 @@ class MonitorFiles:
         for source in self.sources:
             text = source.code(self.name, first)
             code.append(text)
-            calls.append(f"{text.split('static void ')[1].split('(')[0]}(s);")
+            # The last function of a source is the one that fills its residuals.
+            calls.append(f"{text.split('static void ')[-1].split('(')[0]}(s);")
             first += source.residuals
         return {
             "source_fields": indented([line for source in self.sources for line in source.fields()]),

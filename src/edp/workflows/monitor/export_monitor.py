@@ -15,6 +15,7 @@ from edp.export.monitor import (
     DETECTORS,
     BalancePart,
     ChainPart,
+    FlowPart,
     GoldenChain,
     GoldenResiduals,
     MonitorParts,
@@ -34,6 +35,7 @@ from edp.monitor.monitor import IMPOSSIBLE, Monitor
 from edp.monitor.monitor_file import HEADER, load_monitor
 from edp.monitor.residuals.balances import Balances
 from edp.monitor.residuals.base import ResidualSource
+from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.residuals.look_ahead import SMALLEST_WIDTH, LookAhead
 from edp.monitor.residuals.twin_ports import TwinPorts
 from edp.monitor.residuals.virtual_sensors import VirtualSensors
@@ -42,6 +44,7 @@ from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import plant_bundle
+from edp.workflows.monitor.export_flows import flow_part
 
 FORMS: Mapping[str, tuple[str, ...]] = {"c": (), "fmu": ("version", "binaries"), "ros2": ()}
 """Forms of a monitor with their options; they are forms of networks, too."""
@@ -157,6 +160,8 @@ def source_parts(source: ResidualSource, columns: Mapping[str, int]) -> list[Sou
         return [_twin(source, columns)]
     if isinstance(source, Balances):
         return [_balances(source, columns)]
+    if isinstance(source, FlowBalances):
+        return [flow_part(source, columns)]
     raise ExportError(
         f"residuals of kind '{type(source).__name__}' have no form in C; fit the monitor without them, or run it in "
         "Python"
@@ -320,6 +325,8 @@ def _allowed(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
     """How far residuals in C may be off: as far as the network's numbers may be; nothing for sums and integers."""
     if isinstance(part, BalancePart):
         return np.zeros(len(part.levels))
+    if isinstance(part, FlowPart):
+        return np.zeros(len(part.chambers))
     if isinstance(part, TwinPart):
         return _allowed_of_twin(part, rows)
     network, fed, judged = part.bundle.predictor, rows[:, part.reads], rows[:, part.judged]

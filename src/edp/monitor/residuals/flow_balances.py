@@ -1,0 +1,243 @@
+"""Balances of flow: what a cylinder's chamber must take in by its valve, against how fast its piston moves.
+
+A spool follows its command; how far it opens and the pressures on both sides of it tell the flow, whatever load or soil
+pushes. What is wrong with the valve, the seals, the oil, or one of the sensors leaves a rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.monitor.residuals.base import (
+    RESIDUALS,
+    FitMaterial,
+    ResidualSource,
+    ResidualSpec,
+    Rows,
+    SourceParts,
+    mean_inputs,
+    middle_of,
+)
+from edp.monitor.residuals.flow_curves import (
+    BACK,
+    DOUBTS,
+    KNOTS,
+    LINES,
+    ChamberPlaces,
+    Singles,
+    SpoolModel,
+    doubts_of,
+    lines_of,
+    opened,
+    paths_of,
+)
+from edp.monitor.residuals.flow_fit import fit_chambers
+from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
+
+PREFIX = "flow:"
+NUMBERS = ("values", "slopes", "lines", "doubts")
+MOST_CHAMBERS, MOST_DEAD = 64, 1_000
+"""Of a file: chambers, and ticks of dead time."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChamberCurves:
+    """Numbers of a chamber's balance.
+
+    Attributes:
+        spots: of its channels.
+        values: of its curves at the knots, shape (paths, knots).
+        slopes: of its curves from each knot on, shape (paths, knots).
+        lines: factors of the terms without a spool, shape (LINES,).
+        doubts: factors of what makes it uncertain, none negative and the first one positive, shape (DOUBTS,).
+    """
+
+    spots: ChamberPlaces
+    values: Singles
+    slopes: Singles
+    lines: Singles
+    doubts: Singles
+
+
+class FlowBalances(ResidualSource):
+    """Fitted balances, one a chamber: the velocity that is measured less the one that its flows make, over how far that
+    usually is off in such a situation.
+
+    Everything is that of `BACK` ticks ago, since the rate of a pressure needs ticks on either side.
+
+    Args:
+        inputs: raw channels, SI units.
+        middle: mean of each on healthy sessions.
+        spools: by their commands.
+        chambers: the balances.
+        rate_hz: ticks per second.
+    """
+
+    def __init__(
+        self,
+        inputs: Sequence[str],
+        middle: Rows,
+        spools: SpoolModel,
+        chambers: Sequence[ChamberCurves],
+        rate_hz: float,
+    ) -> None:
+        self.inputs, self.middle = tuple(inputs), np.asarray(middle, np.float32)
+        self.spools, self.chambers, self.rate_hz = spools, tuple(chambers), rate_hz
+        self.names = tuple(PREFIX + self.inputs[chamber.spots.own] for chamber in self.chambers)
+        self.judged = tuple((self.inputs[chamber.spots.velocity],) for chamber in self.chambers)
+        self.units = ("1",) * len(self.chambers)
+        self.reads = tuple(self._read(chamber.spots) for chamber in self.chambers)
+        self.per_tick = np.float32(rate_hz / 6.0)
+
+    def _read(self, spots: ChamberPlaces) -> tuple[str, ...]:
+        places = [spots.velocity, spots.own, spots.other, spots.stroke, *spots.supplies]
+        for spool in spots.spools:
+            places += [int(self.spools.extend[spool]), int(self.spools.retract[spool])]
+        return tuple(dict.fromkeys(self.inputs[i] for i in places if i >= 0))
+
+    def _start(self, streams: int) -> Any:
+        return None
+
+    def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
+        memory = self.spools.memory
+        if own is None:
+            # At rest at the first row, as if it had been there for long.
+            before = np.repeat(rows[:, :1], memory, axis=1)
+            own = before, self.spools.start(self.spools.demands(rows[:, 0]))
+        whole = np.concatenate([own[0], rows], axis=1)
+        spools, state = self.spools.run(whole, own[1])
+        end, ticks = whole.shape[1], rows.shape[1]
+        then = whole[:, end - ticks - BACK : end - BACK]
+        steps = [whole[:, end - ticks - back : end - back] for back in (0, 1, 3, 4)]
+        rates = ((steps[0] - steps[3]) + (steps[1] - steps[2])) * self.per_tick
+        out = [self._residual(chamber, then, rates, spools) for chamber in self.chambers]
+        return np.stack(out, axis=-1), (whole[:, end - memory :].copy(), state)
+
+    @staticmethod
+    def _residual(chamber: ChamberCurves, rows: Singles, rates: Singles, spools: Singles) -> Singles:
+        spots, flow = chamber.spots, np.zeros(rows.shape[:-1], np.float32)
+        through, width = flow, flow
+        paths = paths_of(spots, rows, spools)
+        for (travel, drive), values, slopes in zip(paths, chamber.values, chamber.slopes, strict=True):
+            part = opened(travel, values, slopes) * drive
+            flow, through = flow + part, through + np.abs(part)
+        for term, factor in zip(lines_of(spots, rows, rates), chamber.lines, strict=True):
+            flow = flow + factor * term
+        for term, factor in zip(doubts_of(spots, rows, rates, through), chamber.doubts, strict=True):
+            width = width + factor * term
+        off = rows[..., spots.velocity] - np.float32(spots.sign) * flow
+        return np.asarray(off / width, np.float32)
+
+    def parts(self) -> SourceParts:
+        """See `ResidualSource.parts`."""
+        places = [asdict(chamber.spots) for chamber in self.chambers]
+        plain = {"inputs": list(self.inputs), "rate_hz": self.rate_hz, "chambers": places}
+        arrays: dict[str, NDArray[Any]] = {"middle": self.middle}
+        arrays |= {f"spools.{one.name}": getattr(self.spools, one.name) for one in fields(self.spools)}
+        for index, chamber in enumerate(self.chambers):
+            arrays |= {f"{index}.{name}": getattr(chamber, name) for name in NUMBERS}
+        return SourceParts(plain, arrays)
+
+    @classmethod
+    def of_parts(cls, parts: SourceParts) -> FlowBalances:
+        """See `ResidualSource.of_parts`."""
+        (inputs, middle), rate_hz = middle_of(parts), float(parts.plain["rate_hz"])
+        if not 0.0 < rate_hz <= 1e6:
+            raise ValueError("its rate cannot be")
+        spools = _spools_of(parts.arrays, len(inputs))
+        entries = parts.plain["chambers"]
+        if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CHAMBERS:
+            raise ValueError(f"it has no list of 1 to {MOST_CHAMBERS} chambers")
+        chambers = [
+            _chamber_of(_place_of(entry, len(inputs), len(spools.gain)), parts.arrays, index)
+            for index, entry in enumerate(entries)
+        ]
+        return cls(inputs, middle, spools, chambers, rate_hz)
+
+
+def _spools_of(arrays: Any, inputs: int) -> SpoolModel:
+    extend, retract = (np.asarray(arrays[f"spools.{name}"], np.int64) for name in ("extend", "retract"))
+    gain, stages, play = (np.asarray(arrays[f"spools.{name}"], np.float32) for name in ("gain", "stages", "play"))
+    dead = np.asarray(arrays["spools.dead"], np.float64)
+    count = extend.shape
+    if extend.ndim != 1 or any(one.shape != count for one in (retract, gain, dead, play)):
+        raise ValueError("arrays of its spools have other shapes than each other")
+    if stages.shape != (*count, 2, 4):
+        raise ValueError("stages of its spools have another shape")
+    if not all(np.isfinite(one).all() for one in (gain, dead, stages, play)):
+        raise ValueError("a number of its spools is not finite")
+    if ((extend < 0) | (extend >= inputs) | (retract < -1) | (retract >= inputs)).any():
+        raise ValueError("a spool names an input that there is not")
+    if ((dead < 0.0) | (dead > MOST_DEAD)).any() or (play < 0.0).any():
+        raise ValueError("a dead time or a play cannot be")
+    return SpoolModel(extend, retract, gain, dead, stages, play)
+
+
+def _place_of(entry: Any, inputs: int, spools: int) -> ChamberPlaces:
+    single = {name: int(entry[name]) for name in ("velocity", "own", "other", "stroke", "sign")}
+    lists = {name: tuple(int(value) for value in entry[name]) for name in ("supplies", "spools")}
+    numbers = {name: float(entry[name]) for name in ("end", "far", "cushion", "tank")}
+    columns = (single["velocity"], single["own"], single["other"], *lists["supplies"])
+    if not all(0 <= column < inputs for column in columns) or not -1 <= single["stroke"] < inputs:
+        raise ValueError("a chamber names an input that there is not")
+    if not 1 <= len(lists["spools"]) <= 2 or not all(0 <= spool < spools for spool in lists["spools"]):
+        raise ValueError("a chamber names a spool that there is not")
+    if single["sign"] not in (-1, 1) or len(lists["supplies"]) > 8:
+        raise ValueError("a chamber has a sign or a number of pumps that cannot be")
+    if not all(np.isfinite(value) for value in numbers.values()) or numbers["cushion"] <= 0.0:
+        raise ValueError("a number of a chamber is not finite, or its cushion has no length")
+    values: dict[str, Any] = {**single, **lists, **numbers}
+    return ChamberPlaces(**values)
+
+
+def _chamber_of(spots: ChamberPlaces, arrays: Any, index: int) -> ChamberCurves:
+    values, slopes, lines, doubts = (np.asarray(arrays[f"{index}.{name}"], np.float32) for name in NUMBERS)
+    curves = (spots.paths, len(KNOTS))
+    if (values.shape, slopes.shape, lines.shape, doubts.shape) != (curves, curves, (LINES,), (DOUBTS,)):
+        raise ValueError("curves of a chamber have other shapes than its header says")
+    if not all(np.isfinite(one).all() for one in (values, slopes, lines, doubts)):
+        raise ValueError("a number of a chamber is not finite")
+    if (doubts < 0.0).any() or doubts[0] <= 0.0:
+        raise ValueError("the width of a chamber's balance is not positive")
+    return ChamberCurves(spots, values, slopes, lines, doubts)
+
+
+@RESIDUALS.register("flow_balances")
+@dataclass(frozen=True, kw_only=True)
+class FlowBalancesSpec(ResidualSpec):
+    """Balances of flow of every chamber of which command, velocity and both pressures are measured.
+
+    Attributes:
+        rows: ticks that curves are fitted to, at most.
+        trials: of dead times, frequencies and play of an axis' spools.
+        least: share of the mean size of the velocity that a balance must tell on sessions that did not train it; of
+            less it judges nothing.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    source: ClassVar[type[ResidualSource]] = FlowBalances
+    rows: int = 200_000
+    trials: int = 80
+    least: float = 0.6
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "flow_balances", self, rows=integer(1000, MOST_ROWS), trials=integer(1, 10_000), least=span(0.0, 1.0)
+        )
+
+    def fit(self, material: FitMaterial) -> ResidualSource | None:
+        """See `ResidualSpec.fit`."""
+        material.note("balances of flow")
+        balances = fit_chambers(material, self.rows, self.trials, self.least)
+        if balances is None:
+            return None
+        inputs, spools, fitted = balances
+        chambers = [ChamberCurves(*one) for one in fitted]
+        return FlowBalances(inputs, mean_inputs(material, inputs), spools, chambers, material.rate_hz)

@@ -1,0 +1,330 @@
+"""Identifies balances of flow on healthy sessions: dead times, frequencies and play of spools, then curves by lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize, nnls
+
+from edp.data.roles import Axis, roles_of_channels
+from edp.monitor.residuals.base import FitMaterial
+from edp.monitor.residuals.flow_curves import (
+    BACK,
+    KNOTS,
+    Array,
+    ChamberPlaces,
+    Singles,
+    SpoolModel,
+    doubts_of,
+    hats,
+    lines_of,
+    paths_of,
+    stage_of,
+)
+from edp.signals import Kind
+
+Curves = tuple[Singles, Singles, Singles, Singles]
+"""Values, slopes, lines and doubts of a chamber."""
+Fitted = tuple[ChamberPlaces, Singles, Singles, Singles, Singles]
+START = (0.045, 7.0, 0.01)
+"""Dead time in s, Hz and play of a usual electrohydraulic valve, from which the search begins."""
+SECOND_LATER = 0.015
+"""s by which the spool of the second pump begins later in that start."""
+LEAST, MOST = (0.0, 1.0, 0.0), (0.4, 40.0, 0.2)
+"""Bounds of the search; frequencies end at a third of the rate, too."""
+SEARCHED_TICKS, SEARCHED_ROWS = 120_000, 16_000
+"""For the search: twenty minutes at 100 Hz, of which every so many ticks are compared."""
+RIDGE = 1e-6
+GROSS = 8.0
+"""Median sizes beyond which a tick does not count in the second round: at end stops nothing of this holds."""
+CUSHION = 0.06
+"""Length of a cushion as a share of the stroke that was seen."""
+LEAST_TANK = 0.005
+"""Share of all pressures below which that of the return line is taken: a chamber that is drawn empty stands there."""
+
+
+def fit_chambers(
+    material: FitMaterial, rows: int, trials: int, least: float
+) -> tuple[tuple[str, ...], SpoolModel, list[Fitted]] | None:
+    """Balances of all chambers that sensors tell enough about; None without one.
+
+    Returns:
+        Names of the inputs that are read, the spools, and places, values, slopes, lines and doubts of each chamber.
+    """
+    names, axes = material.names, _axes_of(material)
+    if not axes:
+        return None
+    supplies = _supplies_of(material)
+    sessions = [session.select(names).astype(np.float32) for session in material.train]
+    judging = [session.select(names).astype(np.float32) for session in material.validation] or sessions
+    models, places, curves = [], [], []
+    for axis in axes:
+        own_places = _places(axis, names, supplies, sessions)
+        model = _searched(axis, names, own_places, sessions, material.rate_hz, trials)
+        for spots in own_places:
+            fitted = _curves(spots, model, sessions, material.rate_hz, rows)
+            if _explained(spots, model, judging, material.rate_hz, fitted) >= least:
+                models.append(model)
+                places.append(spots)
+                curves.append(fitted)
+    if not places:
+        return None
+    return _assembled(names, models, places, curves)
+
+
+def _axes_of(material: FitMaterial) -> list[Axis]:
+    """Axes with a command, a velocity and both pressures that are watched."""
+    kinds = {channel.name: channel.kind for channel in material.channels}
+    return [
+        axis
+        for axis in roles_of_channels(material.channels).axes
+        if axis.command
+        and len(axis.pressures) == 2
+        and kinds.get(axis.velocity) is Kind.VELOCITY
+        and all(kinds.get(name) is Kind.PRESSURE for name in axis.pressures)
+    ]
+
+
+def _supplies_of(material: FitMaterial) -> tuple[int, ...]:
+    """Places of pressures that belong to no axis: those of pumps."""
+    of_axes = {name for axis in roles_of_channels(material.channels).axes for name in axis.pressures}
+    pumps = [i for i, c in enumerate(material.channels) if c.kind is Kind.PRESSURE and c.name not in of_axes]
+    return tuple(pumps[:4])
+
+
+def _places(
+    axis: Axis, names: Sequence[str], supplies: tuple[int, ...], sessions: Sequence[Singles]
+) -> list[ChamberPlaces]:
+    """Both chambers of an axis, with the spools of its own model: 0, and 1 for that of the second pump."""
+    at = {name: i for i, name in enumerate(names)}
+    head, rod = (at[name] for name in axis.pressures)
+    stroke = at.get(axis.stroke, -1)
+    low, high = 0.0, 1.0
+    if stroke >= 0:
+        low = float(min(rows[:, stroke].min() for rows in sessions))
+        high = float(max(rows[:, stroke].max() for rows in sessions))
+    pressures = np.concatenate([rows[::7, [head, rod]].ravel() for rows in sessions])
+    tank = max(float(np.quantile(pressures, LEAST_TANK)), 0.0) * 1e-6
+    spools = (0, 1) if axis.conflux else (0,)
+    length = max(CUSHION * (high - low), 1e-6)
+    return [
+        ChamberPlaces(at[axis.velocity], own, other, stroke, supplies, spools, sign, end, far, length, tank)
+        for own, other, sign, end, far in ((head, rod, 1, low, high), (rod, head, -1, high, low))
+    ]
+
+
+def _model(axis: Axis, names: Sequence[str], gains: Sequence[float], numbers: Array, rate_hz: float) -> SpoolModel:
+    """Spools of an axis by dead time, frequency and play, and dead time and frequency of the second."""
+    commands = [axis.command, *([axis.conflux] if axis.conflux else [])]
+    timings = [(numbers[0], numbers[1]), (numbers[-2], numbers[-1])][: len(commands)]
+    at = {name: i for i, name in enumerate(names)}
+    stages = np.stack([np.stack([stage_of(frequency, rate_hz)] * 2) for _, frequency in timings])
+    return SpoolModel(
+        extend=np.array([at[command[0]] for command in commands], np.int64),
+        retract=np.array([at[command[1]] if len(command) > 1 else -1 for command in commands], np.int64),
+        gain=np.array(gains, np.float32),
+        dead=np.array([dead * rate_hz for dead, _ in timings]),
+        stages=stages,
+        play=np.full(len(commands), numbers[2], np.float32),
+    )
+
+
+def _searched(
+    axis: Axis,
+    names: Sequence[str],
+    places: Sequence[ChamberPlaces],
+    sessions: Sequence[Singles],
+    rate_hz: float,
+    trials: int,
+) -> SpoolModel:
+    """The spools with which the curves tell the velocity best."""
+    chosen = _stretch(sessions, axis, names)
+    stride = max(1, len(chosen) * len(chosen[0]) // SEARCHED_ROWS)
+    at = {name: i for i, name in enumerate(names)}
+    gains = [
+        1.0 / max(float(max(np.abs(rows[:, [at[n] for n in command]]).max() for rows in chosen)), 1e-30)
+        for command in (axis.command, axis.conflux)
+        if command
+    ]
+    low, high = list(LEAST), [MOST[0], min(MOST[1], rate_hz / 3.0), MOST[2]]
+    start = [*START]
+    if axis.conflux:
+        low, high = [*low, *LEAST[:2]], [*high, *high[:2]]
+        start += [START[0] + SECOND_LATER, START[1]]
+    start = np.clip(start, low, high).tolist()
+
+    def error(numbers: Array) -> float:
+        model = _model(axis, names, gains, np.clip(numbers, low, high), rate_hz)
+        return sum(_left(spots, model, chosen, rate_hz, stride) for spots in places)
+
+    simplex = np.array([start] + [_moved(start, i) for i in range(len(start))])
+    options = {"maxfev": trials, "initial_simplex": np.clip(simplex, low, high), "xatol": 1e-4, "fatol": 1e-5}
+    best = minimize(error, start, method="Nelder-Mead", options=options).x
+    return _model(axis, names, gains, np.clip(best, low, high), rate_hz)
+
+
+def _moved(start: Sequence[float], index: int) -> list[float]:
+    """A corner of the first simplex: two ticks, a fifth of a frequency, half of a play."""
+    moved = list(start)
+    moved[index] += (0.015, 1.5, 0.006, 0.015, 1.5)[index]
+    return moved
+
+
+def _stretch(sessions: Sequence[Singles], axis: Axis, names: Sequence[str]) -> list[Singles]:
+    """Some sessions, of equal length, in which the axis is commanded most."""
+    at = [list(names).index(name) for name in axis.command]
+    usual = min(len(rows) for rows in sessions)
+    count = max(1, min(len(sessions), SEARCHED_TICKS // usual))
+    busy = np.argsort([-float(np.abs(rows[:, at]).mean()) for rows in sessions])[:count]
+    return [sessions[i][: min(usual, SEARCHED_TICKS)] for i in busy]
+
+
+Part = tuple[list[tuple[Singles, Singles]], list[Singles], Singles, Singles, Singles]
+"""Paths, lines, velocity, rows and rates."""
+
+
+def _terms(
+    spots: ChamberPlaces, model: SpoolModel, rows: Singles, rate_hz: float, keep: Callable[[Singles], Singles]
+) -> Part:
+    """What a balance is made of at the ticks of a session that are kept, `BACK` ticks ago."""
+    whole = np.concatenate([np.repeat(rows[:1], model.memory, axis=0), rows])[None]
+    spools, _ = model.run(whole, model.start(model.demands(rows[None, 0])))
+    end, ticks = whole.shape[1], len(rows)
+    pieces = [keep(whole[0, end - ticks - back : end - back]) for back in (BACK, 0, 1, 3, 4)]
+    rates = ((pieces[1] - pieces[4]) + (pieces[2] - pieces[3])) * np.float32(rate_hz / 6.0)
+    then = pieces[0]
+    lines, velocity = lines_of(spots, then, rates), then[:, spots.velocity]
+    return paths_of(spots, then, keep(spools[0])), lines, velocity, then, rates
+
+
+def _columns(part: Part) -> Array:
+    """Columns of the regression, shape (ticks, paths (knots - 1) + LINES)."""
+    paths, lines = part[:2]
+    curves = [hats(travel) * np.asarray(drive, np.float64)[:, None] for travel, drive in paths]
+    return np.concatenate([*curves, np.stack(lines, axis=1).astype(np.float64)], axis=1)
+
+
+def _solved(columns: Array, target: Array) -> Array:
+    """Least squares, with a trace of ridge for what never opens, and once more without gross ticks."""
+    size = np.sqrt(np.square(columns).mean(axis=0))
+    size = np.where(size > 1e-12, size, 1e-12)
+    keep: NDArray[np.bool_] = np.ones(len(target), dtype=bool)
+    factors = np.zeros(columns.shape[1])
+    for _ in range(2):
+        scaled, goal = columns[keep] / size, target[keep]
+        normal = scaled.T @ scaled + RIDGE * len(goal) * np.eye(len(size))
+        factors = np.linalg.solve(normal, scaled.T @ goal) / size
+        off = np.abs(target - columns @ factors)
+        keep = off <= GROSS * max(float(np.median(off)), 1e-12)
+    return factors
+
+
+def _left(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, stride: int) -> float:
+    """Mean size of what a balance leaves on the sessions that it is fitted to, over that of the velocity."""
+    parts = [_terms(spots, model, rows, rate_hz, lambda v: v[50::stride]) for rows in sessions]
+    columns, target = np.concatenate([_columns(part) for part in parts]), np.concatenate([part[2] for part in parts])
+    target = spots.sign * target.astype(np.float64)
+    off = np.abs(target - columns @ _solved(columns, target))
+    return float(off.mean() / max(float(np.abs(target).mean()), 1e-12))
+
+
+def _curves(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, rows: int) -> Curves:
+    """Numbers of a chamber by all sessions that train."""
+    stride = max(1, sum(map(len, sessions)) // rows)
+    parts = [_terms(spots, model, session, rate_hz, lambda v: v[50::stride]) for session in sessions]
+    target = np.concatenate([part[2] for part in parts]).astype(np.float64) * spots.sign
+    columns = np.concatenate([_columns(part) for part in parts])
+    then, rates = (np.concatenate([part[index] for part in parts]) for index in (3, 4))
+    own = len(KNOTS) - 1
+    width, factors, doubts = np.ones(len(target)), np.zeros(0), np.zeros(0)
+    # The second time by the widths of the first: what is uncertain counts less.
+    for _ in range(2):
+        factors = _solved(columns / width[:, None], target / width)
+        flows = columns[:, : spots.paths * own] * factors[: spots.paths * own]
+        through = np.abs(flows.reshape(len(flows), spots.paths, own).sum(axis=2)).sum(axis=1).astype(np.float32)
+        terms = np.stack(doubts_of(spots, then, rates, through), axis=1).astype(np.float64)
+        doubts = _doubts(terms, np.abs(target - columns @ factors))
+        width = terms @ doubts
+    heights = factors[: spots.paths * own].reshape(spots.paths, own)
+    values = np.concatenate([np.zeros((spots.paths, 1)), heights], axis=1)
+    slopes = np.zeros_like(values)
+    slopes[:, :-1] = np.diff(values, axis=1) / np.diff(KNOTS.astype(np.float64))
+    lines = factors[spots.paths * own :]
+    return values.astype(np.float32), slopes.astype(np.float32), lines.astype(np.float32), doubts.astype(np.float32)
+
+
+def _doubts(columns: Array, off: Array) -> Array:
+    """How far a balance usually is off, as a sum of what makes it uncertain, none of it negative."""
+    usual = max(float(np.median(off)), 1e-12)
+    size = np.maximum(columns.max(axis=0), 1e-12)
+    scaled, _ = nnls(columns / size, off)
+    factors: Array = scaled / size
+    # A width of nothing in particular: half of the usual one at least.
+    factors[0] = max(factors[0], 0.5 * usual)
+    return factors
+
+
+def _explained(
+    spots: ChamberPlaces,
+    model: SpoolModel,
+    sessions: Sequence[Singles],
+    rate_hz: float,
+    fitted: Curves,
+) -> float:
+    """Share of the mean size of a velocity that a balance tells."""
+    values, _, lines, _ = fitted
+    factors = np.concatenate([values[:, 1:].ravel(), lines]).astype(np.float64)
+    off = size = 0.0
+    for rows in sessions[:8]:
+        part = _terms(spots, model, rows, rate_hz, lambda v: v[50::10])
+        target = spots.sign * part[2].astype(np.float64)
+        off, size = off + float(np.abs(target - _columns(part) @ factors).mean()), size + float(np.abs(target).mean())
+    return 1.0 - off / max(size, 1e-12)
+
+
+@dataclass
+class _Numbered:
+    names: list[str]
+
+    def column(self, name: str) -> int:
+        if name not in self.names:
+            self.names.append(name)
+        return self.names.index(name)
+
+
+def _assembled(
+    names: Sequence[str],
+    models: Sequence[SpoolModel],
+    places: Sequence[ChamberPlaces],
+    curves: Sequence[Curves],
+) -> tuple[tuple[str, ...], SpoolModel, list[Fitted]]:
+    """All chambers with the inputs that they read, and their spools as one model."""
+    inputs, own, first = _Numbered([]), list(dict.fromkeys(map(id, models))), {}
+    apart = {id(model): model for model in models}
+    for key in own:
+        first[key] = sum(len(apart[other].gain) for other in own[: own.index(key)])
+
+    def moved(column: int) -> int:
+        return inputs.column(names[column]) if column >= 0 else -1
+
+    extend, retract = (
+        np.array([moved(int(c)) for key in own for c in getattr(apart[key], side)], np.int64)
+        for side in ("extend", "retract")
+    )
+    joined = {
+        name: np.concatenate([getattr(apart[key], name) for key in own]) for name in ("gain", "dead", "stages", "play")
+    }
+    moved_chambers: list[Fitted] = []
+    for spots, model, numbers in zip(places, models, curves, strict=True):
+        spools = tuple(first[id(model)] + spool for spool in spots.spools)
+        columns = {name: moved(getattr(spots, name)) for name in ("velocity", "own", "other", "stroke")}
+        supplies = tuple(moved(column) for column in spots.supplies)
+        new = ChamberPlaces(
+            **columns, supplies=supplies, spools=spools, sign=spots.sign, end=spots.end, far=spots.far,
+            cushion=spots.cushion, tank=spots.tank,
+        )  # fmt: skip
+        moved_chambers.append((new, *numbers))
+    return tuple(inputs.names), SpoolModel(extend, retract, **joined), moved_chambers
