@@ -18,13 +18,19 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from safetensors.numpy import load_file
 
 from common import finish, parser, table, verdict
+from edp.data.chunks import ChunkSampler, ChunkSpec
+from edp.data.gathered import stored_columns
+from edp.data.series import Series
+from edp.logs.store import read_store
 from edp.logs.store.index import INDEX
+from edp.signals import TABLE_A1
 from memory import CHANNELS, RATE_HZ, write_logs
 
 GOAL_S_AN_HOUR = 3.0
@@ -104,6 +110,26 @@ def of_hours(store: Path, folder: Path, hours: float, commands: list[str], quick
     return rows
 
 
+def draw_ms(store: Path, in_memory: bool) -> tuple[float, float]:
+    """Processor time to plan an epoch of the preset quick in s, and to draw each of 300 batches of it in ms."""
+    names = tuple(TABLE_A1)
+    targets = [name for name in names if name.startswith("CylVels")]
+    series = []
+    for recording in read_store(store):
+        inputs, outputs = (stored_columns(recording, part, (), 0, None) for part in (names, targets))
+        if in_memory:
+            inputs, outputs = np.array(inputs), np.array(outputs)
+        series.append(Series(recording.name, inputs, outputs))
+    sampler = ChunkSampler(series, [10], ChunkSpec(length=128, batch=8, burn_in=50), 0)
+    began = time.process_time()
+    batches = sampler.epoch(0)
+    next(batches)
+    planned = time.process_time()
+    for _ in islice(batches, 300):
+        pass
+    return planned - began, 1e3 * (time.process_time() - planned) / 300
+
+
 def main() -> None:
     added = parser(__doc__ or "")
     added.add_argument("--hours", type=float, nargs="*", default=[10.0, 100.0, 1000.0], help="of the stores")
@@ -128,10 +154,15 @@ def main() -> None:
             ("train on the logs", base, logs_s, logs_mb, (spent[1] - spent[0]) / (many - few)),
             ("train on the store", base, store_s, store_mb, float("nan")),
         ]
+        drawn = [("in memory", base, *draw_ms(folder / "store", in_memory=True))]
+        for hours in sizes:
+            listed = repeated(folder / "store", folder / f"listed_{hours:g}", max(1, round(hours / base)))
+            drawn.append(("in a store", hours, *draw_ms(listed, in_memory=False)))
         for hours in sizes:
             rows += of_hours(folder / "store", folder, hours, arguments.commands, arguments.quick)
     same = all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0] | weights[1])
     table([f"{CHANNELS} channels, {RATE_HZ:g} Hz", "hours", "processor s", "anonymous MB", "s an update"], rows)
+    table(["batches of 8 x 128 ticks", "hours", "plan of an epoch, s", "a batch, ms"], drawn)
     print(f"weights of both trainings: {'the same bits' if same else 'NOT the same'}")
     conclude(rows, base, sizes[-1], same, arguments.quick, arguments.seed)
 

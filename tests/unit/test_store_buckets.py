@@ -227,7 +227,10 @@ def _put(address, content, attempts=100):
 
     for _ in range(attempts):
         try:
-            urllib.request.urlopen(urllib.request.Request(address, content, method="PUT"), timeout=60).close()
+            request = urllib.request.Request(
+                address, content, {"Content-Type": "application/octet-stream"}, method="PUT"
+            )
+            urllib.request.urlopen(request, timeout=60).close()
             return
         except OSError:
             time.sleep(0.2)  # the server is starting

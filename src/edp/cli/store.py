@@ -29,7 +29,10 @@ app = typer.Typer(
 
 @app.command("build")
 def build(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    data: Annotated[
+        Path,
+        typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or an address: s3://, gs://, az://."),
+    ],
     folder: Annotated[
         Path, typer.Option("--out", help="Folder of the store; an existing one is continued or added to.")
     ],
