@@ -51,7 +51,7 @@ TREE_FOLDS = {5: 0.8, 3: 0.6, 2: 0.4}
 """Parts that trees leave out in turn, each at the cost of a growth; and the share of rows beside the largest."""
 ALIKE_ROWS = 0.8
 """Of the rows that the network's trees are grown on, left-out trees have so many. With two parts of 11,000 rows they
-had half: left-out errors were two to three times those of the trees in use, which got too little weight."""
+had half: left-out errors were up to three times those of the trees in use, which got too little weight."""
 TREE_RATE, MOST_TREE_RATE = 10.0, 0.2
 """The rate of boosting is the first over the rounds, at least scikit-learn's 0.1: fewer trees must each do more."""
 TREE_SECONDS, TREE_CELLS_PER_S = 1.7e-3, 1.2e8
