@@ -29,7 +29,7 @@ from edp.training.warm_start import WarmStart
 from edp.workflows.compression.bench import CompressionRequest
 from edp.workflows.compression.committee import committee_start
 from edp.workflows.compression.distillation import DistillationSpec
-from edp.workflows.compression.imitation import CommitteeImitation, predict_rows
+from edp.workflows.compression.imitation import CommitteeImitation, moved_rows, predict_rows
 from edp.workflows.compression.pruning import check_pruning
 from edp.workflows.compression.qat import RoundingSpec
 
@@ -101,6 +101,18 @@ def test_a_student_learns_on_rows_what_its_committee_says(data, teacher):
     assert begun - taught > 0.7 * (begun - wanted)
     assert [row["best"] for row in fitted.history] == [False] * 9 + [True]
     assert fitted.history[-1]["updates"] == 600
+
+
+def test_moved_rows_combine_what_was_never_recorded_together():
+    """Two places, of which only one moves: a moved row is a place with the motion of the other one."""
+    ticks = torch.arange(400.0)
+    moving = torch.stack([torch.full((400,), 5.0), torch.sin(ticks / 5)], dim=1)
+    rows = torch.cat([moving, torch.zeros(400, 2)])
+    moved = moved_rows(rows, 2000, torch.Generator().manual_seed(0))
+    at_rest = moved[moved[:, 0].abs() < 1e-6]
+    assert moved.shape == (2000, 2)
+    assert at_rest[:, 1].abs().max() > 1.0
+    assert moved[:, 1].abs().max() < 3.0 + 1e-6  # never further than a place and a whole motion
 
 
 def test_a_student_with_an_objective_learns_in_chunks(data, teacher):

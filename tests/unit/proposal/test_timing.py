@@ -131,6 +131,17 @@ def test_a_column_that_repeats_another_one_in_another_unit_is_not_predicted_twic
     assert all(guess.channel for guess in kept.proposal.columns if guess.role != "time")
 
 
+def test_a_copy_that_hardly_moves_in_another_log_is_still_one(tmp_path):
+    logs = tmp_path / "logs"
+    twice(logs / "a.csv")
+    quiet = twice(logs / "b.csv", seed=1)
+    draw = np.random.default_rng(2)
+    place = 4 + draw.normal(0, 0.003, 1000)  # some ten last digits
+    rows = [f"{0.01 * i:.2f},{x:.3f},{13.3 * x - 47:.3f},{draw.normal():.3f}" for i, x in enumerate(place)]
+    save(quiet, rows, "t,volts,millimetres,load\n")
+    assert "millimetres" not in {guess.channel for guess in propose(logs).proposal.columns}
+
+
 def test_a_copy_in_one_log_alone_is_a_channel(tmp_path):
     logs = tmp_path / "logs"
     twice(logs / "a.csv")

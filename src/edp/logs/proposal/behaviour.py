@@ -174,13 +174,20 @@ def _relation(column: LogColumn, other: LogColumn) -> Relation | None:
 
 
 def repeats(column: LogColumn, other: LogColumn) -> bool:
-    """Whether a column says what another one says, in another unit; also where one of them stands still."""
+    """Whether nothing in a log speaks against a column saying what another one does, in another unit."""
     own, theirs = column.pieces[0], other.pieces[0]
-    good = np.isfinite(own) & np.isfinite(theirs) if len(own) == len(theirs) else np.zeros(0, dtype=bool)
-    if good.any() and (_scatter(own[good]) == 0 or _scatter(theirs[good]) == 0):
-        return _scatter(own[good]) == _scatter(theirs[good])
-    relation = _relation(column, other)
-    return relation is not None and relation.how == "copy"
+    if len(own) != len(theirs):
+        return False
+    good = np.isfinite(own) & np.isfinite(theirs)
+    own, theirs = own[good], theirs[good]
+    if _scatter(own) == 0 or _scatter(theirs) == 0:
+        # Both stand still, or one moves by less than the other can show.
+        return min(_scatter(own), _scatter(theirs)) == 0 and max(_levels(own), _levels(theirs)) <= 2
+    return abs(_correlation(own, theirs)) > 1 - 1e-9 or _rounded_apart(own, theirs)
+
+
+def _levels(values: Column) -> int:
+    return len(np.unique(values))
 
 
 def _scatter(values: Column) -> float:
@@ -195,11 +202,15 @@ def _correlation(a: Column, b: Column) -> float:
 
 def _differ_by_rounding(own: Column, theirs: Column) -> bool:
     """Whether a column is a scaled other one but for the last digits with which both were written."""
-    slope, offset = np.polyfit(theirs, own, 1)
-    printed = _last_digit(own) + abs(slope) * _last_digit(theirs)
     # Encoders side by side agree to a count, too: only columns of many counts tell.
     many = min(np.ptp(own) / _last_digit(own), np.ptp(theirs) / _last_digit(theirs)) > _MANY_COUNTS
-    return bool(many and np.abs(own - slope * theirs - offset).max() <= printed)
+    return bool(many) and _rounded_apart(own, theirs)
+
+
+def _rounded_apart(own: Column, theirs: Column) -> bool:
+    slope, offset = np.polyfit(theirs, own, 1)
+    printed = _last_digit(own) + abs(slope) * _last_digit(theirs)
+    return bool(np.abs(own - slope * theirs - offset).max() <= printed)
 
 
 def _last_digit(values: Column) -> float:
