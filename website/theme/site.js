@@ -38,11 +38,11 @@ window.addEventListener("load", () => {
   document.head.append(list);
 })();
 
-// Opened as a file a page may not read the index of the search: say so where somebody looks for it.
-if (location.protocol === "file:") {
-  window.addEventListener("load", () => {
-    document.querySelectorAll(".md-search__button, [for='__search']").forEach((button) => {
-      button.title = "Opened as files these pages cannot be searched; python -m http.server --directory site serves them";
-    });
-  });
+// A page that was opened as a file may not load the worker of the search; search.js holds its text, and the index.
+if (location.protocol === "file:" && window.Worker) {
+  const Native = window.Worker;
+  window.Worker = function (address, options) {
+    const text = (window.edpWorkers || {})[String(address).split("/").pop()];
+    return new Native(text ? URL.createObjectURL(new Blob([text], { type: "text/javascript" })) : address, options);
+  };
 }
