@@ -126,9 +126,9 @@ def _check_options(source: str, options: Mapping[str, Mapping[str, object]]) -> 
         ConfigError: one was given, which would do nothing.
     """
     for of, named in options.items():
-        given = [f"--{name}" for name, value in named.items() if value]
-        if given and source != of:
-            raise ConfigError(f"{given[0]} is of --{of}, and --{source} was given; leave it out, or choose --{of}")
+        unfit = [f"--{name}" for name, value in named.items() if value]
+        if unfit and source != of:
+            raise ConfigError(f"{unfit[0]} is of --{of}, and --{source} was given; leave it out, or choose --{of}")
 
 
 def _source(options: Mapping[str, object]) -> tuple[str, object]:
