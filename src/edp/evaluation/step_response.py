@@ -15,7 +15,7 @@ from edp.signals import KINDS, Channel
 LENGTH_S = 2.0
 """Of a response: a hydraulic axis has settled by then."""
 MOMENTS, MOST_STARTS = 24, 8
-"""Steps that are averaged, and of one recording."""
+"""Steps of which the middle is shown, and of one recording."""
 POINTS, MOST_COMMANDS = 100, 12
 SPAN = (0.05, 0.95)
 """Quantiles of a command between which its range is; half of it is a step."""
@@ -33,7 +33,7 @@ def step_responses(twin: Twin, series: Sequence[Series]) -> dict[str, Any]:
 
     Returns:
         Plain values in units of reports: ``seconds`` since the step, ``moments``, and ``steps``: for each command its
-        ``size`` and for each answer the mean and the ends of the middle 80 %.
+        ``size`` and for each answer the median and the ends of the middle 80 %.
 
     Raises:
         DataError: no stretch is long enough.
@@ -72,7 +72,7 @@ def _plain(command: Channel, size: float, change: Any, answers: Sequence[Channel
         kind = KINDS[channel.kind]
         values = kind.report_factor * change[:, :, column].astype(np.float64)
         ends = np.quantile(values, (0.1, 0.9), axis=0)
-        lines = {"mean": values.mean(axis=0), "low": ends[0], "high": ends[1]}
+        lines = {"median": np.median(values, axis=0), "low": ends[0], "high": ends[1]}
         rounded = {name: [float(f"{value:.4g}") for value in line] for name, line in lines.items()}
         entries.append({"name": channel.name, "unit": kind.report_unit, **rounded})
     return {

@@ -33,12 +33,12 @@ def test_a_response_is_the_difference_between_two_free_runs(content):
         assert step["size"] > 0.0
         assert span > 0.0
         for answer in step["answers"]:
-            mean, low, high = (np.array(answer[key]) for key in ("mean", "low", "high"))
-            assert np.isfinite(mean).all()
+            middle, low, high = (np.array(answer[key]) for key in ("median", "low", "high"))
+            assert np.isfinite(middle).all()
             assert (low <= high + 1e-9).all()
     # A static map of commands answers its own axis at once, and its stroke goes on from there.
     own = found["steps"][0]["answers"]
-    velocity = np.abs(own[0]["mean"])
+    velocity = np.abs(own[0]["median"])
     assert velocity[-1] > 0.0
 
 
@@ -59,7 +59,7 @@ def test_what_is_on_disk_is_drawn_a_choice_for_each_command(content, tmp_path):
     assert [value for value, _ in chart.choices[0].options] == [step["command"] for step in found["steps"]]
     assert len(chart.panels) == min(6, len(found["steps"][0]["answers"]))
     damaged = json.loads(json.dumps(found))
-    damaged["steps"][0]["answers"][0]["mean"].pop()
+    damaged["steps"][0]["answers"][0]["median"].pop()
     (tmp_path / FILE).write_text(json.dumps(damaged), encoding="utf-8")
     with pytest.raises(StorageError, match="other lengths"):
         read_steps(tmp_path)

@@ -16,8 +16,8 @@ from edp.report.common.wording import short_label
 FILE, COMMAND = "step_response.json", "command"
 MOST_PANELS = 6
 ANSWER = KeyedObject(
-    {"name": NAME, "unit": NAME, **dict.fromkeys(("mean", "low", "high"), Listed(REAL))},
-    ("name", "unit", "mean", "low", "high"),
+    {"name": NAME, "unit": NAME, **dict.fromkeys(("median", "low", "high"), Listed(REAL))},
+    ("name", "unit", "median", "low", "high"),
 )
 STEP = KeyedObject(
     {"command": NAME, "size": SIZE, "unit": NAME, "answers": Listed(ANSWER)}, ("command", "size", "unit", "answers")
@@ -39,7 +39,9 @@ def read_steps(folder: Path) -> Mapping[str, Any]:
         return {}
     content: Mapping[str, Any] = read_shaped(path, SHAPE)
     count = len(content["seconds"])
-    lines = [answer[key] for step in content["steps"] for answer in step["answers"] for key in ("mean", "low", "high")]
+    lines = [
+        answer[key] for step in content["steps"] for answer in step["answers"] for key in ("median", "low", "high")
+    ]
     if any(len(line) != count for line in lines):
         raise StorageError(f"'{path}' has lines of other lengths than its times; run edp evaluate again")
     return content
@@ -56,7 +58,7 @@ def steps_chart(steps: Mapping[str, Any]) -> Chart | None:
             answer, when = step["answers"][row], {COMMAND: step["command"]}
             low, high = (np.array(answer[end]) for end in ("low", "high"))
             marks.append(Range(x=seconds, low=low, high=high, name="Middle 80 % of the moments", hover=None, when=when))
-            marks.append(DataSeries(x=seconds, y=answer["mean"], name="Mean", width=1.8, when=when))
+            marks.append(DataSeries(x=seconds, y=answer["median"], name="Median", width=1.8, when=when))
         title = with_unit(short_label(first["name"]), first["unit"])
         panels.append(Panel(tuple(marks), ChartAxis("Time since the step [s]"), title=title))
     options = tuple(
