@@ -46,11 +46,11 @@ demo: $(READY) ## the main job, small: simulate, train, judge, write a report pa
 	$(BIN)/edp demo --out demo
 
 # The builder has an environment of its own: whoever trains models needs none of it.
-docs: $(READY) .venv-docs/.ready ## the documentation site in site/, offline; with the pages of demo/ where `make demo` made them
-	PYTHONPATH=website$(if $(PYTHONPATH),:$(PYTHONPATH)) $(BIN)/python -m edp_site build/docs --demo demo
+docs: $(READY) .venv-docs/.ready ## the documentation site in site/, offline; with VERSION=0.1 beside others in site/0.1; with the pages of demo/ where `make demo` made them
+	PYTHONPATH=website$(if $(PYTHONPATH),:$(PYTHONPATH)) $(BIN)/python -m edp_site build/docs --demo demo $(if $(VERSION),--version '$(VERSION)')
 	cd build/docs && ../../.venv-docs/bin/zensical build --clean --strict --config-file mkdocs.yml
-	rm -rf site && mv build/docs/site site
-	PYTHONPATH=website$(if $(PYTHONPATH),:$(PYTHONPATH)) $(BIN)/python -m edp_site.built site
+	PYTHONPATH=website$(if $(PYTHONPATH),:$(PYTHONPATH)) $(BIN)/python -m edp_site.built build/docs/site
+	$(if $(VERSION),PYTHONPATH=website $(BIN)/python -m edp_site.versions build/docs/site site '$(VERSION)',rm -rf site && mv build/docs/site site)
 
 .venv-docs/.ready: requirements-docs.lock
 	$(PYTHON) -m venv .venv-docs

@@ -16,10 +16,11 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from common import finish, in_folder, parser, table, verdict
+from common import finish, in_folder, kept, parser, table, verdict
 
 MOST_COMMANDS = 5
 WAYS_OUT = {"inspect": (0, 3), "evaluate": (0, 6)}
@@ -195,7 +196,8 @@ def main() -> None:
     def run(folder: Path) -> None:
         for name in there:
             logs = (arguments.shared / name).resolve()
-            results[name] = first_hour(logs, SETS[name], folder / name, arguments.minutes)
+            way = partial(first_hour, logs, SETS[name], folder / name, arguments.minutes)
+            results[name] = kept(folder / f"{name}.json", way)
             facts = {key: value for key, value in results[name].items() if key != "steps"}
             print(f"{name}: {json.dumps(facts)}", flush=True)
 

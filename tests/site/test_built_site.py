@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from browser import chromium, opened
 
 from edp_site import browser, built, notebooks
 from edp_site.stage import stage
@@ -30,6 +31,7 @@ def site(tmp_path_factory) -> Path:
     made = subprocess.run(call, cwd=out, capture_output=True, text=True, timeout=240)
     assert made.returncode == 0, made.stdout + made.stderr
     assert built.seal(out / "site") > 0
+    built.search_from_files(out / "site")
     return out / "site"
 
 
@@ -65,6 +67,19 @@ def test_the_search_finds_a_page_and_loads_nothing_from_elsewhere(site, axe):
     (visit,) = browser.visit(site, ["index.html"], axe, words="feedback port")
     assert any("twin.html" in link for link in visit.words)
     assert visit.elsewhere == []
+
+
+@pytest.mark.slow
+def test_the_search_works_from_files_too(site):
+    executable = chromium()
+    if executable is None:
+        pytest.skip("no Chromium; `make system-packages` installs it")
+    script = browser.SEARCH + "search('feedback port')"
+    with opened(executable) as page:
+        page.open(site / "index.html")
+        assert any("twin.html" in link for link in page.run(script))
+        assert page.complaints() == []
+        assert page.requests() == []
 
 
 @pytest.mark.slow

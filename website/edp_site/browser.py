@@ -26,10 +26,7 @@ _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob:; "
     "worker-src 'self' blob:; report-uri /__outside"
 )
-_SCRIPT = """
-<style>* { transition: none !important; animation: none !important; }</style>
-<script src="/__axe.js"></script>
-<script>
+SEARCH = """
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 const roots = (root) => [root, ...[...root.querySelectorAll("*")].filter((one) => one.shadowRoot)
   .flatMap((one) => roots(one.shadowRoot))];
@@ -48,7 +45,13 @@ const search = async (words) => { // the theme's search lies in a shadow tree, a
   }
   return [];
 };
-window.addEventListener("load", async () => {
+"""
+"""Scripts: ``search(words)`` gives the links that the search of the page finds."""
+_SCRIPT = """
+<style>* { transition: none !important; animation: none !important; }</style>
+<script src="/__axe.js"></script>
+<script>
+@SEARCH@window.addEventListener("load", async () => {
   const job = await (await fetch("/__job")).json();
   if (job.scheme) document.body.setAttribute("data-md-color-scheme", job.scheme);
   await pause(300); // scripts of the page wrap tables and draw icons
@@ -67,7 +70,7 @@ window.addEventListener("load", async () => {
   if (next.page) location.href = next.page;
 });
 </script>
-"""
+""".replace("@SEARCH@", SEARCH)
 
 
 @dataclass

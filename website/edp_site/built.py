@@ -1,11 +1,12 @@
 """Checks of the built site: links and anchors, nothing loaded from elsewhere, and what a page needs for every reader.
 
-``python -m edp_site.built SITE`` takes addresses out of the scripts of the theme, prints what is wrong, and ends with 1
-where something is.
+``python -m edp_site.built SITE`` takes addresses out of the scripts of the theme, makes the search work
+from files, prints what is wrong, and ends with 1 where something is.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from html.parser import HTMLParser
@@ -138,6 +139,23 @@ def seal(site: Path) -> int:
     return replaced
 
 
+def search_from_files(site: Path) -> Path:
+    """Write the script that a page which was opened as a file reads in place of the index and the worker of its search.
+
+    A page of a file may fetch neither; scripts it may load. ``theme/site.js`` hands the worker's text to the browser.
+
+    Raises:
+        FileNotFoundError: the builder wrote no index.
+    """
+    workers = {path.name: path.read_text(encoding="utf-8") for path in sorted((site / "assets").rglob("workers/*.js"))}
+    index = json.loads((site / "search.json").read_text(encoding="utf-8"))
+    script = site / "search.js"
+    script.write_text(
+        f"var __index = {json.dumps(index)};\nwindow.edpWorkers = {json.dumps(workers)};\n", encoding="utf-8"
+    )
+    return script
+
+
 def _broken(path: Path, page: Page, name: str, pages: dict[Path, Page]) -> list[str]:
     found = []
     for link in page.links:
@@ -158,6 +176,7 @@ def main() -> int:
     """Check the site that is named; 1 where something is wrong."""
     site = Path(sys.argv[1])
     seal(site)
+    search_from_files(site)
     problems = problems_of(site)
     size = sum(path.stat().st_size for path in site.rglob("*") if path.is_file())
     print(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -23,13 +24,14 @@ _FOLDERS_SHOWN = ("examples",)
 """Folders whose files get a page each where the folder itself is linked to."""
 
 
-def stage(out: Path, demo: Path | None = None, root: Path = ROOT) -> list[Path]:
+def stage(out: Path, demo: Path | None = None, root: Path = ROOT, version: str | None = None) -> list[Path]:
     """Write the pages of the site and the builder's settings.
 
     Args:
         out: folder that is emptied first; ``pages`` and ``mkdocs.yml`` lie in it then.
         demo: folder of `edp demo`, whose pages go into the gallery; without one the gallery says how to make them.
         root: of the repository.
+        version: that the pages are of; they then have a selector of the versions beside theirs.
 
     Returns:
         The Markdown pages that were written.
@@ -47,6 +49,10 @@ def stage(out: Path, demo: Path | None = None, root: Path = ROOT) -> list[Path]:
         _write(folder / f"{path.stem}.md", notebooks.notebook_page(path, folder / "pictures"))
     shutil.copytree(root / "docs" / "images", pages / "images")
     shutil.copytree(root / "website" / "theme", pages / "theme")
+    if version is not None:
+        script = pages / "theme" / "site.js"
+        text = script.read_text(encoding="utf-8")
+        script.write_text(f"window.edpVersion = {json.dumps(version)};\n{text}", encoding="utf-8")
     _Copier(root, pages).copy()
     (out / "mkdocs.yml").write_text(builder_settings(root / "mkdocs.yml", pages), encoding="utf-8")
     return sorted(pages.rglob("*.md"))

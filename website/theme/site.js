@@ -9,3 +9,40 @@ window.addEventListener("load", () => {
     bar.setAttribute("aria-label", `Code block ${number + 1}`);
   });
 });
+
+// Versions beside this one, where the site was built with them: a script lists them, which files can load, too.
+(() => {
+  const own = window.edpVersion, script = document.currentScript;
+  if (!own || !script) return;
+  const base = new URL("../..", script.src).href, root = new URL("../", script.src).href;
+  const list = document.createElement("script");
+  list.src = `${base}versions.js`;
+  list.addEventListener("load", () => {
+    const label = document.createElement("label"), choice = document.createElement("select"), name = document.createElement("span");
+    label.className = "edp-versions";
+    name.textContent = "Version";
+    (window.edpVersions || [own]).forEach((version) => {
+      const option = document.createElement("option");
+      option.value = option.textContent = version;
+      option.selected = version === own;
+      choice.append(option);
+    });
+    choice.addEventListener("change", () => {
+      // The same page there: one that an older version lacks is the reader's to find from its first page.
+      const page = location.href.startsWith(root) ? location.href.slice(root.length) : "index.html";
+      location.href = `${base}${choice.value}/${page || "index.html"}`;
+    });
+    label.append(name, choice);
+    (document.querySelector(".md-header__title") || document.body).after(label);
+  });
+  document.head.append(list);
+})();
+
+// A page that was opened as a file may not load the worker of the search; search.js holds its text, and the index.
+if (location.protocol === "file:" && window.Worker) {
+  const Native = window.Worker;
+  window.Worker = function (address, options) {
+    const text = (window.edpWorkers || {})[String(address).split("/").pop()];
+    return new Native(text ? URL.createObjectURL(new Blob([text], { type: "text/javascript" })) : address, options);
+  };
+}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, err, out
 from edp.cli.train import MapOption
 from edp.errors import ConfigError
@@ -48,6 +49,13 @@ def live(
     fault: Annotated[list[str], typer.Option("--fault", help="Fault of --sim, as edp simulate takes it.")] = [],  # noqa: B006
     controller: Annotated[str | None, typer.Option(help="Controller of --loop, such as pi.")] = None,
     twin: Annotated[Path | None, typer.Option("--twin", help="Twin that the controller of --loop uses.")] = None,
+    plant: Annotated[
+        Path | None, typer.Option("--plant", help="Twin's run folder, or an FMU (.fmu), that is the plant of --loop.")
+    ] = None,
+    predictor: Annotated[
+        Path | None, typer.Option("--predictor", help="Run folder of edp train that the controller of --loop uses.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Trust the native code of an FMU; do not ask.")] = False,
     udp_bind: Annotated[str, typer.Option("--udp-bind", help="Address that --udp listens on.")] = "127.0.0.1",
     free_s: Annotated[float, typer.Option("--free-s", min=0.1, help="Length (s) of a twin's free runs.")] = 60.0,
     signal_map: MapOption = None,
@@ -63,7 +71,11 @@ def live(
 
     sources = {"log": log, "sim": sim, "loop": loop, "udp": udp, "ros2": "ros2" if ros2 else None}
     name, value = _source(sources)
-    settings = {"excitation": excitation, "faults": fault, "controller": controller, "twin": twin, "bind": udp_bind}
+    of_loop = {"controller": controller, "twin": twin, "plant": plant, "predictor": predictor}
+    of_sim = {"excitation": excitation, "fault": fault}
+    _check_options(name, {"loop": of_loop, "sim": of_sim})
+    ask_for_fmus(yes, plant)
+    settings = {"excitation": excitation, "faults": fault, "bind": udp_bind, **of_loop}
     options = SourceOptions(
         str(value), signal_map, machine, seed, rate, {key: entry for key, entry in settings.items() if entry}
     )
@@ -105,6 +117,18 @@ def live(
             out.print(f"recording: {result.recorded.resolve()}")
 
     emit(as_json, facts, show)
+
+
+def _check_options(source: str, options: Mapping[str, Mapping[str, object]]) -> None:
+    """Refuse options of another source than the one that is shown.
+
+    Raises:
+        ConfigError: one was given, which would do nothing.
+    """
+    for of, named in options.items():
+        unfit = [f"--{name}" for name, value in named.items() if value]
+        if unfit and source != of:
+            raise ConfigError(f"{unfit[0]} is of --{of}, and --{source} was given; leave it out, or choose --{of}")
 
 
 def _source(options: Mapping[str, object]) -> tuple[str, object]:

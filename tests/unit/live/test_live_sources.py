@@ -12,6 +12,7 @@ import pytest
 import torch
 from small_monitors import fitted_monitor
 
+from edp.control.plants import TwinEnvironment
 from edp.errors import ConfigError, DataError
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
@@ -23,10 +24,11 @@ from edp.sim.excitation import EXCITATIONS
 from edp.sim.scenario import Scenario
 from edp.sim.simulate import Simulation
 from edp.sim.view import view_of
+from edp.testing.control import sample_excavator_twin
 from edp.testing.monitor import rig_sessions
 from edp.testing.twins import sample_actuators, sample_twin
 from edp.training.bundle import make_bundle, save_bundle
-from edp.training.twin_bundle import TwinBundle
+from edp.training.twin_bundle import TwinBundle, save_twin
 from edp.workflows.live import SOURCES, LiveOrder, LiveRun, SourceOptions
 from edp.workflows.live.free_run import LiveTwin
 from edp.workflows.live.look_ahead import LiveNetwork, spread
@@ -222,8 +224,14 @@ def test_the_simulator_works_on_and_its_operator_sees_what_the_batch_simulation_
         SimSource("M22", 100.0, settings={"excitation": ground})
 
 
-def test_a_loop_is_shown_with_reference_and_levers():
-    source = SOURCES["loop"].of(SourceOptions("point", settings={"controller": "pi"}), Needs())
+@pytest.mark.parametrize("twin_as_plant", [False, True])
+def test_a_loop_is_shown_with_reference_and_levers(twin_as_plant, tmp_path):
+    settings: dict[str, object] = {"controller": "pi"}
+    if twin_as_plant:
+        bundle = TwinBundle(TWINS["static"](), sample_excavator_twin())
+        settings["plant"] = save_twin(bundle, tmp_path / "twin")
+    source = SOURCES["loop"].of(SourceOptions("point", settings=settings), Needs())
+    assert isinstance(source._env, TwinEnvironment) == twin_as_plant
     live = run_of(source)
     thread = threading.Thread(target=live.play)
     thread.start()

@@ -12,6 +12,9 @@ from edp.report.search import words
 from edp.report.search.facts import StudyFacts
 from edp.report.search.tables import phases_sheet
 
+TERMINAL = 80
+"""Characters of a line that every terminal shows."""
+_GAP = "  "
 _CELL = "padding:2px 10px;text-align:"
 
 
@@ -27,14 +30,50 @@ def html_of(tables: Iterable[TextTable], title: str = "") -> str:
     return f"<div>{''.join(parts)}</div>"
 
 
-def text_of(table: TextTable) -> str:
-    """A table in columns of one width each, for a terminal."""
-    heads = [[_headed(*column) for column in table.columns]] if any(map(any, table.columns)) else []
-    lines = [*heads, *map(list, table.rows)]
-    lines = [[printable(cell) for cell in line] for line in lines]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    texts = [_aligned(line, widths) for line in lines]
-    return "\n".join([*([printable(table.caption)] if table.caption else []), *texts])
+def text_of(table: TextTable, width: int = TERMINAL) -> str:
+    """A table in columns of one width each, for a terminal.
+
+    Headings are broken at spaces; columns that do not fit beside the others follow below, behind the names again.
+
+    Args:
+        table: what is shown.
+        width: characters of a line; only a single column that is wider goes beyond it.
+    """
+    bodies = list(zip(*table.rows, strict=True)) or [()] * len(table.columns)
+    columns = [
+        [[printable(word) for word in _headed(*head).split(" ")], [printable(cell) for cell in cells]]
+        for head, cells in zip(table.columns, bodies, strict=True)
+    ]
+    widths = [max(map(len, [*words, *cells])) for words, cells in columns]
+    groups: list[list[int]] = [[]]
+    for index in range(1, len(columns)):
+        used = widths[0] + sum(widths[i] + len(_GAP) for i in groups[-1])
+        if groups[-1] and used + len(_GAP) + widths[index] > width:
+            groups.append([])
+        groups[-1].append(index)
+    caption = [printable(table.caption)] if table.caption else []
+    return "\n".join([*caption, *(line for group in groups for line in _lines(columns, widths, [0, *group]))])
+
+
+def _lines(columns: Sequence[Sequence[list[str]]], widths: Sequence[int], chosen: Sequence[int]) -> list[str]:
+    """Lines of some columns: headings of several rows, which stand on the first row of cells, then the cells."""
+    heads = [_broken(columns[i][0], widths[i]) for i in chosen]
+    tall = max(map(len, heads)) if any(any(head) for head in heads) else 0
+    rows = [[head[len(head) - tall + row] if len(head) - tall + row >= 0 else "" for head in heads]
+            for row in range(tall)]  # fmt: skip
+    rows += [list(row) for row in zip(*(columns[i][1] for i in chosen), strict=True)]
+    return [_aligned(row, [widths[i] for i in chosen]) for row in rows]
+
+
+def _broken(words: Sequence[str], width: int) -> list[str]:
+    """Words in lines of at most a width, which holds the longest of them."""
+    lines = [words[0]]
+    for word in words[1:]:
+        if len(lines[-1]) + 1 + len(word) <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines
 
 
 def score_tables(facts: Facts) -> list[TextTable]:
@@ -58,7 +97,7 @@ def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
         cell.ljust(width) if column_index == 0 else cell.rjust(width)
         for column_index, (cell, width) in enumerate(zip(cells, widths, strict=True))
     )
-    return "  ".join([first, *others]).rstrip()
+    return _GAP.join([first, *others]).rstrip()
 
 
 def _row(cells: Sequence[str], marked: bool) -> str:

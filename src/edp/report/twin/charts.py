@@ -27,6 +27,7 @@ from edp.report.common.chart import (
 from edp.report.common.picture import write_pictures
 from edp.report.common.wording import short_label
 from edp.report.twin.facts import PARTS, TWIN, FreeRunFacts
+from edp.report.twin.steps import steps_chart
 from edp.signals import KINDS, Kind
 
 RECORDING, MODEL = "recording", "model"
@@ -42,9 +43,10 @@ KINDS_DRAWN = {
 
 
 def twin_charts(facts: FreeRunFacts) -> list[Chart]:
-    """Every figure of the page: ``runs_velocities`` and so on, and ``horizon``."""
+    """Every figure of the page: ``runs_velocities`` and so on, ``horizon``, and ``steps``."""
     runs = [runs_chart(facts, part) for part in PARTS if facts.channels(part) and facts.names]
-    return [*runs, horizon_chart(facts)]
+    steps = steps_chart(facts.steps)
+    return [*runs, horizon_chart(facts), *([] if steps is None else [steps])]
 
 
 def runs_chart(facts: FreeRunFacts, part: str) -> Chart:

@@ -30,6 +30,7 @@ from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import number, percent
 from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
+from edp.report.twin.steps import read_steps
 from edp.storage import read_object
 
 CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
@@ -130,6 +131,7 @@ class FreeRunFacts:
         shown: ``seconds``, ``half_width`` where known, and ``NAME/answers``, ``NAME/truth`` ``(tick, answer)``, SI.
         provenance: of the twin; empty where it is not at hand.
         candidates: formulations that it was chosen among, see `read_candidates`; empty where it was not chosen.
+        steps: responses to steps of its commands, see `read_steps`; empty where they are not at hand.
     """
 
     title: str
@@ -137,6 +139,7 @@ class FreeRunFacts:
     shown: Mapping[str, NDArray[np.float32]]
     provenance: Mapping[str, Any] = field(default_factory=dict)
     candidates: Sequence[Mapping[str, Any]] = ()
+    steps: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def models(self) -> Mapping[str, Mapping[str, Any]]:
@@ -190,7 +193,7 @@ def read_free_runs(folder: str | Path) -> FreeRunFacts:
     header = path / "twin" / "twin.json"
     provenance = read_object(header).get("provenance") if header.is_file() else {}
     origin = provenance if isinstance(provenance, dict) else {}
-    facts = FreeRunFacts(path.resolve().name, content, shown, origin, read_candidates(path))
+    facts = FreeRunFacts(path.resolve().name, content, shown, origin, read_candidates(path), read_steps(path))
     _check_arrays(facts, path / RUNS)
     return facts
 

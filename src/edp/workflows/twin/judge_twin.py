@@ -19,6 +19,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
 from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scores
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
+from edp.evaluation.step_response import step_responses
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor, describe
 from edp.networks.running import stream_predictions
@@ -32,6 +33,7 @@ from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
 
 SCORES = "free_run.json"
 SHOWN = "free_runs.safetensors"
+STEPS = "step_response.json"
 SHOWN_RUNS = 6
 """Free runs on a page: a reader goes through a few."""
 SHOWN_TICKS = 1200
@@ -172,6 +174,7 @@ def evaluate_twin(
         beside = beside_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.judge)
         scores["twin"]["beside"] = beside
     write_scores(target, scores, runs, bundle.intervals)
+    write_json(target / STEPS, step_responses(bundle.twin, data.test))
     return target
 
 

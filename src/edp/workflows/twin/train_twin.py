@@ -13,6 +13,7 @@ from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.data.prepared import Prepared
 from edp.evaluation.free_run import calibrated
+from edp.evaluation.step_response import step_responses
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
@@ -31,7 +32,7 @@ from edp.training.twin_bundle import STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
-from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
+from edp.workflows.twin.judge_twin import SCORES, STEPS, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
 FOLDER = "twin"
@@ -110,6 +111,7 @@ def train_twin(
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
         write_scores(run.path, scores, runs, intervals)
+        write_json(run.path / STEPS, step_responses(bundle.twin, data.test))
         bundle = replace(bundle, scores=scores)
         save_twin(bundle, run.file(FOLDER))
         run.write_status("finished")

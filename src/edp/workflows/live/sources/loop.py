@@ -40,7 +40,8 @@ class LoopSource(LiveSource):
     def of(cls, options: SourceOptions, needs: Needs) -> LoopSource:
         """`SourceOptions.value` is the name of a task, or a file of settings of `edp control` (TOML).
 
-        Settings: ``controller`` (a name) and ``twin`` (a run folder).
+        Settings: ``controller`` (a name), ``twin`` and ``predictor`` (run folders that it uses) and ``plant`` (a
+        twin's run folder, or an FMU whose native code is trusted, in the simulator's place).
         """
         file = Path(options.value)
         is_file = file.suffix == ".toml"
@@ -52,7 +53,8 @@ class LoopSource(LiveSource):
         if options.seed:
             table["seed"] = options.seed
         experiment = load_control_experiment(file if is_file else None, [], table)
-        sources = ControlSources(twin=options.settings.get("twin"))
+        plant, twin, predictor = (options.settings.get(name) for name in ("plant", "twin", "predictor"))
+        sources = ControlSources(plant, twin, predictor, trusted=True)
         return cls(ControlBench(experiment, sources), sources)
 
     def run(self, sink: Sink) -> None:

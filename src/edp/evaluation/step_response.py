@@ -1,0 +1,83 @@
+"""Answers of a twin to a step of one command, while the others stay: what an engineer asks a plant model first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from edp.data.series import Series
+from edp.networks.twin import Twin, even_starts
+from edp.signals import KINDS, Channel
+
+LENGTH_S = 2.0
+"""Of a response: a hydraulic axis has settled by then."""
+MOMENTS, MOST_STARTS = 24, 8
+"""Steps of which the middle is shown, and of one recording."""
+POINTS, MOST_COMMANDS = 100, 12
+SPAN = (0.05, 0.95)
+"""Quantiles of a command between which its range is; half of it is a step."""
+
+
+def step_responses(twin: Twin, series: Sequence[Series]) -> dict[str, Any]:
+    """Differences between free runs with and without a step of a command, from moments of recordings on.
+
+    At each moment all commands are held as they are. Once one of them jumps by half of its range, towards the middle of
+    it, and the difference is counted as that of a jump upwards: the response is what the jump alone does.
+
+    Args:
+        twin: any formulation.
+        series: inputs are commands, targets are what it answers.
+
+    Returns:
+        Plain values in units of reports: ``seconds`` since the step, ``moments``, and ``steps``: for each command its
+        ``size`` and for each answer the median and the ends of the middle 80 %.
+
+    Raises:
+        DataError: no stretch is long enough.
+    """
+    channels, prefix = twin.channels, twin.prefix_ticks
+    starts = even_starts(twin, series, prefix + 1, MOST_STARTS)
+    chosen = np.unique(np.linspace(0, len(starts) - 1, MOMENTS).astype(np.int64))
+    lanes = [starts[i] for i in chosen]
+    before = np.stack([part.inputs[at : at + prefix] for part, at in lanes])
+    measured = np.stack([part.targets[at : at + prefix] for part, at in lanes])
+    ticks = max(2, round(LENGTH_S * channels.rate_hz))
+    constant = np.repeat(before[:, -1:], ticks, axis=1)
+    rows = np.unique(np.linspace(0, ticks - 1, POINTS).astype(np.int64))
+    low, middle, high = np.quantile(np.concatenate([part.inputs for part in series]), (SPAN[0], 0.5, SPAN[1]), axis=0)
+    steps = []
+    with threadpool_limits(limits=1, user_api="blas"):
+        base = twin.rollout(constant, twin.reset(before, measured))[0]
+        for column, command in enumerate(channels.commands[:MOST_COMMANDS]):
+            size = 0.5 * float(high[column] - low[column])
+            if not size > 0.0:
+                continue
+            upwards = np.where(before[:, -1, column] <= middle[column], 1.0, -1.0)
+            stepped = constant.copy()
+            stepped[:, :, column] += (size * upwards)[:, None].astype(stepped.dtype)
+            answers = twin.rollout(stepped, twin.reset(before, measured))[0]
+            change = (answers - base)[:, rows] * upwards[:, None, None]
+            steps.append(_plain(command, size, change, channels.answers))
+    seconds = ((rows + 1) / channels.rate_hz).tolist()
+    return {"schema": 1, "seconds": seconds, "moments": len(lanes), "steps": steps}
+
+
+def _plain(command: Channel, size: float, change: Any, answers: Sequence[Channel]) -> dict[str, Any]:
+    facts = KINDS[command.kind]
+    entries = []
+    for column, channel in enumerate(answers):
+        kind = KINDS[channel.kind]
+        values = kind.report_factor * change[:, :, column].astype(np.float64)
+        ends = np.quantile(values, (0.1, 0.9), axis=0)
+        lines = {"median": np.median(values, axis=0), "low": ends[0], "high": ends[1]}
+        rounded = {name: [float(f"{value:.4g}") for value in line] for name, line in lines.items()}
+        entries.append({"name": channel.name, "unit": kind.report_unit, **rounded})
+    return {
+        "command": command.description or command.name,
+        "size": float(f"{facts.report_factor * size:.3g}"),
+        "unit": facts.report_unit,
+        "answers": entries,
+    }
