@@ -1,8 +1,10 @@
-"""What a fine-tuning changed in a network, in kilobytes: matrices as products of two narrow ones, the rest as it is.
+"""What a fine-tuning changed in a network, in kilobytes: matrices in 8 bits, whole or as products of two narrow ones.
 
 A change ``W' - W`` of a matrix is cut to its largest singular values (Eckart and Young 1936); which ones of all
-matrices are kept is decided by energy a byte, until the bytes are used up. Vectors are kept whole. So any fine-tuning
-becomes a delta, whatever method it was done by, and a fleet is one network and a small file a machine.
+matrices are kept is decided by energy a byte, until the bytes are used up. Numbers of matrices and of their factors
+have 8 bits and a scale a row or column; where the factors would take more than the whole change, it is kept whole.
+Vectors are in single precision. So any fine-tuning becomes a delta, whatever method it was done by, and a fleet is one
+network and a small file a machine.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +39,31 @@ HEAD_BYTES = 4096
 """Kept free for the header and for names, shapes and places of the arrays."""
 EACH_BYTES = 160
 """Of the name, shape and place of an array in the file, about."""
-Half = NDArray[np.float16]
+Eighths = NDArray[np.int8]
+Cut = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+STEPS = 127
+"""Of a number of 8 bits on either side of zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A matrix of 8-bit numbers with a scale a row."""
+
+    numbers: Eighths
+    scales: NDArray[np.float32]
+
+    @staticmethod
+    def of(matrix: NDArray[np.float64]) -> Scaled:
+        """The nearest one to a matrix."""
+        scales = (np.abs(matrix).max(axis=1) / STEPS).astype(np.float32)
+        # A row of zeros has a scale of zero; dividing by one leaves its zeros.
+        divided = matrix / np.where(scales > 0, scales, 1.0)[:, None]
+        return Scaled(np.clip(np.rint(divided), -STEPS, STEPS).astype(np.int8), scales)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """In double precision."""
+        return self.numbers * self.scales.astype(np.float64)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,26 +73,31 @@ class Delta:
     Attributes:
         base: content address of the weights that it is a change of.
         facts: plain values, such as the machine's name, logs and errors.
-        whole: changes by the name of a parameter, float32.
-        narrow: by the name of a parameter, ``(rows, rank)`` and ``(rank, columns)`` whose product is its change, with
-            all axes but the first as columns.
+        vectors: changes by the name of a parameter, float32.
+        whole: changes of matrices, with all axes but the first as columns.
+        narrow: of others, two matrices ``(rank, rows)`` and ``(rank, columns)``; the transposed first one times the
+            second is the change.
     """
 
     base: str
     facts: Mapping[str, Any]
-    whole: Mapping[str, NDArray[np.float32]]
-    narrow: Mapping[str, tuple[Half, Half]]
+    vectors: Mapping[str, NDArray[np.float32]]
+    whole: Mapping[str, Scaled]
+    narrow: Mapping[str, tuple[Scaled, Scaled]]
 
     @property
     def rank(self) -> int:
-        """The largest rank of a matrix."""
-        return max((left.shape[1] for left, _ in self.narrow.values()), default=0)
+        """The largest rank of a matrix that is not whole."""
+        return max((len(left.scales) for left, _ in self.narrow.values()), default=0)
 
     def to_bytes(self) -> bytes:
         """The file: safetensors with a header."""
-        arrays: dict[str, NDArray[Any]] = {f"w:{name}": values for name, values in self.whole.items()}
-        for name, (left, right) in self.narrow.items():
-            arrays |= {f"l:{name}": np.ascontiguousarray(left), f"r:{name}": np.ascontiguousarray(right)}
+        arrays: dict[str, NDArray[Any]] = {f"v:{name}": values for name, values in self.vectors.items()}
+        parts = [("w", name, part) for name, part in self.whole.items()]
+        for name, pair in self.narrow.items():
+            parts += [("l", name, pair[0]), ("r", name, pair[1])]
+        for kind, name, part in parts:
+            arrays |= {f"{kind}:{name}": np.ascontiguousarray(part.numbers), f"{kind}s:{name}": part.scales}
         head = {"schema": SCHEMA, "base": self.base, "facts": dict(self.facts), "hash": _hash(arrays)}
         text = json.dumps(head, allow_nan=False, sort_keys=True)
         return bytes(save({**arrays, HEADER: np.frombuffer(text.encode(), np.uint8)}))
@@ -89,44 +120,57 @@ def delta_of(
     before, after = base.state_dict(), tuned.state_dict()
     if {name: value.shape for name, value in before.items()} != {name: value.shape for name, value in after.items()}:
         raise BundleError("a delta needs two networks of the same parts; give a network and what it was tuned to")
-    whole: dict[str, NDArray[np.float32]] = {}
-    cut: dict[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = {}
+    vectors: dict[str, NDArray[np.float32]] = {}
+    matrices: dict[str, NDArray[np.float64]] = {}
     left = most_bytes - HEAD_BYTES - len(json.dumps(dict(facts or {})))
     for name, old in before.items():
         change = (after[name].detach().double() - old.detach().double()).cpu().numpy()
         if not change.any():
             continue
         if change.ndim < 2:
-            whole[name] = change.astype(np.float32)
+            vectors[name] = change.astype(np.float32)
             left -= 4 * change.size + EACH_BYTES
         else:
-            cut[name] = np.linalg.svd(change.reshape(len(change), -1), full_matrices=False)
+            matrices[name] = change.reshape(len(change), -1)
     if left < 0:
         raise BundleError(f"{most_bytes:,} bytes do not hold the changed vectors of this network; allow more")
-    return Delta(weights_digest(base), dict(facts or {}), whole, dict(_narrow(cut, left)))
+    ranks = _ranks(matrices, left)
+    whole = {name: Scaled.of(matrices[name]) for name, rank in ranks.items() if rank is None}
+    narrow = {name: _factors(matrices[name], rank) for name, rank in ranks.items() if rank is not None}
+    return Delta(weights_digest(base), dict(facts or {}), vectors, whole, narrow)
 
 
-def _narrow(
-    cut: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]], left: int
-) -> Iterator[tuple[str, tuple[Half, Half]]]:
-    """The singular values with the most energy a byte that fit into `left` bytes, as products of narrow matrices."""
+def _ranks(matrices: Mapping[str, NDArray[np.float64]], left: int) -> dict[str, int | None]:
+    """How many singular values of each matrix fit into `left` bytes, most energy a byte first; None for all of it."""
+    sizes = {
+        name: (matrix.shape[0] + matrix.shape[1] + 8, matrix.size + 4 * len(matrix))
+        for name, matrix in matrices.items()
+    }
     entries = []
-    for name, (u, values, v) in cut.items():
-        size = 2 * (len(u) + v.shape[1])
-        entries += [(value**2 / size, size, name) for value in values if value > 0]
-    ranks: dict[str, int] = {}
-    for _, size, name in sorted(entries, reverse=True):
-        # The names and shapes of both factors come with the first of a matrix.
-        needed = size + (0 if name in ranks else 2 * EACH_BYTES)
-        if needed > left:
+    for name, matrix in matrices.items():
+        values = np.linalg.svd(matrix, compute_uv=False)
+        entries += [(value**2 / sizes[name][0], name) for value in values if value > 0]
+    ranks: dict[str, int | None] = {}
+    for _, name in sorted(entries, reverse=True):
+        rank, (each, all_of_it) = ranks.get(name, 0), sizes[name]
+        if rank is None:
             continue
-        left -= needed
-        ranks[name] = ranks.get(name, 0) + 1
-    for name, rank in ranks.items():
-        u, values, v = cut[name]
-        # The root on both sides keeps each well within the range of half precision.
-        root = np.sqrt(values[:rank])
-        yield name, ((u[:, :rank] * root).astype(np.float16), (root[:, None] * v[:rank]).astype(np.float16))
+        spent = rank * each + (4 * EACH_BYTES if rank else 0)
+        after = (rank + 1) * each + 4 * EACH_BYTES
+        # Names and shapes of both factors come with the first singular value.
+        wholly = all_of_it + 2 * EACH_BYTES <= after
+        needed = (all_of_it + 2 * EACH_BYTES if wholly else after) - spent
+        if needed <= left:
+            left -= needed
+            ranks[name] = None if wholly else rank + 1
+    return ranks
+
+
+def _factors(matrix: NDArray[np.float64], rank: int) -> tuple[Scaled, Scaled]:
+    u, values, v = np.linalg.svd(matrix, full_matrices=False)
+    # The root on both sides: both factors are then as exact as each other.
+    root = np.sqrt(values[:rank])[:, None]
+    return Scaled.of(root * u[:, :rank].T), Scaled.of(root * v[:rank])
 
 
 def with_delta(base: Predictor, delta: Delta) -> Predictor:
@@ -142,9 +186,9 @@ def with_delta(base: Predictor, delta: Delta) -> Predictor:
         )
     network = copy.deepcopy(base)
     state = network.state_dict()
-    changes: dict[str, NDArray[Any]] = dict(delta.whole)
+    changes: dict[str, NDArray[Any]] = {**delta.vectors, **{name: part.matrix for name, part in delta.whole.items()}}
     for name, (left, right) in delta.narrow.items():
-        changes[name] = left.astype(np.float64) @ right.astype(np.float64)
+        changes[name] = left.matrix.T @ right.matrix
     with torch.no_grad():
         for name, change in changes.items():
             if name not in state or state[name].numel() != change.size:
@@ -186,15 +230,29 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     object_with(head, ("base", "facts", "hash"), where, BundleError)
     if head["hash"] != _hash(arrays) or not isinstance(head["facts"], dict):
         raise BundleError(f"{where} is damaged: its numbers do not have the hash in its header; copy it again")
-    whole = {name[2:]: values for name, values in arrays.items() if name.startswith("w:")}
-    lefts = {name[2:]: values for name, values in arrays.items() if name.startswith("l:")}
-    rights = {name[2:]: values for name, values in arrays.items() if name.startswith("r:")}
+    parts = {kind: _scaled(arrays, kind, where) for kind in ("w", "l", "r")}
+    vectors = {name[2:]: values for name, values in arrays.items() if name.startswith("v:")}
+    lefts, rights = parts["l"], parts["r"]
     fitting = lefts.keys() == rights.keys() and all(
-        left.ndim == rights[name].ndim == 2 and left.shape[1] == len(rights[name]) for name, left in lefts.items()
+        len(left.scales) == len(rights[name].scales) for name, left in lefts.items()
     )
     if not fitting or not all(np.isfinite(values).all() for values in arrays.values()):
         raise BundleError(f"{where} is damaged: factors that do not fit together, or numbers that are not finite")
-    return Delta(str(head["base"]), head["facts"], whole, {name: (lefts[name], rights[name]) for name in lefts})
+    narrow = {name: (lefts[name], rights[name]) for name in lefts}
+    return Delta(str(head["base"]), head["facts"], vectors, parts["w"], narrow)
+
+
+def _scaled(arrays: Mapping[str, NDArray[Any]], kind: str, where: str) -> dict[str, Scaled]:
+    """Matrices of a kind by name, their shapes and types checked."""
+    matrices = {}
+    for name, numbers in arrays.items():
+        if name.startswith(f"{kind}:"):
+            scales = arrays.get(f"{kind}s:{name[2:]}")
+            typed = scales is not None and numbers.dtype == np.int8 and scales.dtype == np.float32
+            if scales is None or not typed or numbers.ndim != 2 or scales.shape != (len(numbers),):
+                raise BundleError(f"{where} is damaged: '{name}' has another shape or type than its scales")
+            matrices[name[2:]] = Scaled(numbers, scales)
+    return matrices
 
 
 def _hash(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -60,6 +60,7 @@ def test_more_bytes_bring_it_nearer(networks):
 def test_what_did_not_change_takes_no_room(networks):
     base, _ = networks
     delta = delta_of(base, copy.deepcopy(base))
+    assert not delta.vectors
     assert not delta.whole
     assert not delta.narrow
     assert weights_digest(with_delta(base, delta)) == weights_digest(base)
@@ -85,7 +86,7 @@ def test_damage_is_one_message(networks, tmp_path):
     with pytest.raises(BundleError):
         read_delta(tmp_path / "absent.delta")
     hostile = delta_of(*networks)
-    name = next(iter(hostile.whole))
-    hostile.whole[name][0] = np.inf
+    name = next(iter(hostile.vectors))
+    hostile.vectors[name][0] = np.inf
     with pytest.raises(BundleError, match="not finite"):
         delta_from_bytes(hostile.to_bytes(), "hostile")
