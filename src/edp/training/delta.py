@@ -1,10 +1,9 @@
-"""What a fine-tuning changed in a network, in kilobytes: matrices in 8 bits, whole or as products of two narrow ones.
+"""What a fine-tuning changed in a network, in kilobytes: matrices in few bits, whole or as products of two narrow ones.
 
-A change ``W' - W`` of a matrix is cut to its largest singular values (Eckart and Young 1936); which ones of all
-matrices are kept is decided by energy a byte, until the bytes are used up. Numbers of matrices and of their factors
-have 8 bits and a scale a row or column; where the factors would take more than the whole change, it is kept whole.
-Vectors are in single precision. So any fine-tuning becomes a delta, whatever method it was done by, and a fleet is one
-network and a small file a machine.
+The change ``W' - W`` of each matrix is kept whole, in as many bits a number (8 to 4, with a scale a row) as there is
+room for. Where 4 are too many it is cut to its largest singular values (Eckart and Young 1936), in 8 bits; which ones
+of all matrices are kept is decided by energy a byte. Vectors are in single precision. So any fine-tuning becomes a
+delta, whatever method it was done by, and a fleet is one network and a small file a machine.
 """
 
 from __future__ import annotations
@@ -37,28 +36,44 @@ MOST_BYTES = 64 * 2**20
 HEADER = "header"
 HEAD_BYTES = 4096
 """Kept free for the header and for names, shapes and places of the arrays."""
-EACH_BYTES = 160
+EACH_BYTES = 200
 """Of the name, shape and place of an array in the file, about."""
 Eighths = NDArray[np.int8]
 Cut = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-STEPS = 127
-"""Of a number of 8 bits on either side of zero."""
+MOST_BITS, LEAST_BITS = 8, 4
+"""Of a number of a whole matrix; with fewer than the least, its largest singular values alone say more."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A matrix of 8-bit numbers with a scale a row."""
+    """A matrix of numbers of few bits with a scale a row."""
 
     numbers: Eighths
     scales: NDArray[np.float32]
+    bits: int = MOST_BITS
 
     @staticmethod
-    def of(matrix: NDArray[np.float64]) -> Scaled:
+    def of(matrix: NDArray[np.float64], bits: int = MOST_BITS) -> Scaled:
         """The nearest one to a matrix."""
-        scales = (np.abs(matrix).max(axis=1) / STEPS).astype(np.float32)
+        steps = 2 ** (bits - 1) - 1
+        scales = (np.abs(matrix).max(axis=1) / steps).astype(np.float32)
         # A row of zeros has a scale of zero; dividing by one leaves its zeros.
         divided = matrix / np.where(scales > 0, scales, 1.0)[:, None]
-        return Scaled(np.clip(np.rint(divided), -STEPS, STEPS).astype(np.int8), scales)
+        return Scaled(np.clip(np.rint(divided), -steps, steps).astype(np.int8), scales, bits)
+
+    def packed(self) -> NDArray[np.uint8]:
+        """The numbers without the bits that they do not need."""
+        raised = (self.numbers.astype(np.int16) + 2 ** (self.bits - 1)).astype(np.uint8)
+        planes = np.unpackbits(raised.reshape(-1, 1), axis=1)[:, MOST_BITS - self.bits :]
+        return np.packbits(planes)
+
+    @staticmethod
+    def unpacked(data: NDArray[np.uint8], scales: NDArray[np.float32], columns: int, bits: int) -> Scaled:
+        """What `packed` made bytes of."""
+        count = len(scales) * columns
+        planes = np.unpackbits(data, count=count * bits).reshape(count, bits)
+        raised = np.packbits(np.pad(planes, ((0, 0), (MOST_BITS - bits, 0))), axis=1)[:, 0].astype(np.int16)
+        return Scaled((raised - 2 ** (bits - 1)).astype(np.int8).reshape(len(scales), columns), scales, bits)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -96,9 +111,11 @@ class Delta:
         parts = [("w", name, part) for name, part in self.whole.items()]
         for name, pair in self.narrow.items():
             parts += [("l", name, pair[0]), ("r", name, pair[1])]
+        shapes: dict[str, list[int]] = {}
         for kind, name, part in parts:
-            arrays |= {f"{kind}:{name}": np.ascontiguousarray(part.numbers), f"{kind}s:{name}": part.scales}
-        head = {"schema": SCHEMA, "base": self.base, "facts": dict(self.facts), "hash": _hash(arrays)}
+            arrays |= {f"{kind}:{name}": part.packed(), f"{kind}s:{name}": part.scales}
+            shapes[f"{kind}:{name}"] = [part.numbers.shape[1], part.bits]
+        head = {"schema": SCHEMA, "base": self.base, "facts": dict(self.facts), "shapes": shapes, "hash": _hash(arrays)}
         text = json.dumps(head, allow_nan=False, sort_keys=True)
         return bytes(save({**arrays, HEADER: np.frombuffer(text.encode(), np.uint8)}))
 
@@ -134,6 +151,11 @@ def delta_of(
             matrices[name] = change.reshape(len(change), -1)
     if left < 0:
         raise BundleError(f"{most_bytes:,} bytes do not hold the changed vectors of this network; allow more")
+    for bits in range(MOST_BITS, LEAST_BITS - 1, -1):
+        needed = sum(-(-matrix.size * bits // 8) + 4 * len(matrix) + 2 * EACH_BYTES for matrix in matrices.values())
+        if needed <= left:
+            coarse = {name: Scaled.of(matrix, bits) for name, matrix in matrices.items()}
+            return Delta(weights_digest(base), dict(facts or {}), vectors, coarse, {})
     ranks = _ranks(matrices, left)
     whole = {name: Scaled.of(matrices[name]) for name, rank in ranks.items() if rank is None}
     narrow = {name: _factors(matrices[name], rank) for name, rank in ranks.items() if rank is not None}
@@ -227,10 +249,10 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     head = object_with(parse_json(text, where, BundleError), ("schema",), where, BundleError)
     if head["schema"] != SCHEMA:
         raise BundleError(f"{where} is a delta of schema {head['schema']}, {SCHEMA} is read here: update EDP")
-    object_with(head, ("base", "facts", "hash"), where, BundleError)
-    if head["hash"] != _hash(arrays) or not isinstance(head["facts"], dict):
+    object_with(head, ("base", "facts", "shapes", "hash"), where, BundleError)
+    if head["hash"] != _hash(arrays) or not isinstance(head["facts"], dict) or not isinstance(head["shapes"], dict):
         raise BundleError(f"{where} is damaged: its numbers do not have the hash in its header; copy it again")
-    parts = {kind: _scaled(arrays, kind, where) for kind in ("w", "l", "r")}
+    parts = {kind: _scaled(arrays, head["shapes"], kind, where) for kind in ("w", "l", "r")}
     vectors = {name[2:]: values for name, values in arrays.items() if name.startswith("v:")}
     lefts, rights = parts["l"], parts["r"]
     fitting = lefts.keys() == rights.keys() and all(
@@ -242,16 +264,21 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     return Delta(str(head["base"]), head["facts"], vectors, parts["w"], narrow)
 
 
-def _scaled(arrays: Mapping[str, NDArray[Any]], kind: str, where: str) -> dict[str, Scaled]:
+def _scaled(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Any], kind: str, where: str) -> dict[str, Scaled]:
     """Matrices of a kind by name, their shapes and types checked."""
     matrices = {}
-    for name, numbers in arrays.items():
-        if name.startswith(f"{kind}:"):
-            scales = arrays.get(f"{kind}s:{name[2:]}")
-            typed = scales is not None and numbers.dtype == np.int8 and scales.dtype == np.float32
-            if scales is None or not typed or numbers.ndim != 2 or scales.shape != (len(numbers),):
-                raise BundleError(f"{where} is damaged: '{name}' has another shape or type than its scales")
-            matrices[name[2:]] = Scaled(numbers, scales)
+    for name, data in arrays.items():
+        if not name.startswith(f"{kind}:"):
+            continue
+        scales, shape = arrays.get(f"{kind}s:{name[2:]}"), shapes.get(name)
+        whole_numbers = isinstance(shape, list) and len(shape) == 2 and all(type(one) is int for one in shape)
+        if scales is None or scales.dtype != np.float32 or scales.ndim != 1 or not whole_numbers:
+            raise BundleError(f"{where} is damaged: '{name}' lacks its scales or its shape")
+        columns, bits = shape
+        fits = 0 < columns <= MOST_BYTES and LEAST_BITS <= bits <= MOST_BITS
+        if data.dtype != np.uint8 or not fits or data.size != -(-len(scales) * columns * bits // 8):
+            raise BundleError(f"{where} is damaged: '{name}' has another size than its shape says")
+        matrices[name[2:]] = Scaled.unpacked(data.reshape(-1), scales, columns, bits)
     return matrices
 
 
