@@ -210,6 +210,9 @@ def with_delta(base: Predictor, delta: Delta) -> Predictor:
     state = network.state_dict()
     changes: dict[str, NDArray[Any]] = {**delta.vectors, **{name: part.matrix for name, part in delta.whole.items()}}
     for name, (left, right) in delta.narrow.items():
+        # Before they are multiplied: a file of two long rows must not ask for the memory of their product.
+        if name not in state or state[name].numel() != left.numbers.shape[1] * right.numbers.shape[1]:
+            raise BundleError(f"the delta changes '{name}', which this network lacks or has in another shape")
         changes[name] = left.matrix.T @ right.matrix
     with torch.no_grad():
         for name, change in changes.items():
@@ -271,9 +274,10 @@ def _scaled(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Any], kind:
         if not name.startswith(f"{kind}:"):
             continue
         scales, shape = arrays.get(f"{kind}s:{name[2:]}"), shapes.get(name)
-        whole_numbers = isinstance(shape, list) and len(shape) == 2 and all(type(one) is int for one in shape)
-        if scales is None or scales.dtype != np.float32 or scales.ndim != 1 or not whole_numbers:
-            raise BundleError(f"{where} is damaged: '{name}' lacks its scales or its shape")
+        if scales is None or scales.dtype != np.float32 or scales.ndim != 1:
+            raise BundleError(f"{where} is damaged: '{name}' lacks its scales")
+        if not isinstance(shape, list) or len(shape) != 2 or not all(type(one) is int for one in shape):
+            raise BundleError(f"{where} is damaged: '{name}' lacks its shape")
         columns, bits = shape
         fits = 0 < columns <= MOST_BYTES and LEAST_BITS <= bits <= MOST_BITS
         if data.dtype != np.uint8 or not fits or data.size != -(-len(scales) * columns * bits // 8):
