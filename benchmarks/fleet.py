@@ -96,15 +96,17 @@ class Meter:
 
     begun: dict[int, float] = field(default_factory=lambda: tree_s(os.getpid()))
     seen: dict[int, dict[int, float]] = field(default_factory=dict)
+    workers: set[int] = field(default_factory=set)
     done: threading.Event = field(default_factory=threading.Event)
 
     def look(self) -> None:
         own = os.getpid()
         for child in children(own):
-            # A worker looks like this process until it runs its own program.
+            # A worker looks like this process until it runs its own program, and like nothing once it was ended.
             if is_worker(child):
+                self.workers.add(child)
                 self.seen.setdefault(own, {}).pop(child, None)
-            place = self.seen.setdefault(child if is_worker(child) else own, {})
+            place = self.seen.setdefault(child if child in self.workers else own, {})
             for process, spent in tree_s(child).items():
                 place[process] = max(place.get(process, 0.0), spent)
         self.seen.setdefault(own, {})[own] = spent_s(own)
@@ -154,7 +156,7 @@ class Size:
 
 SIZES = {
     True: Size(1.0, 4, 3, 3.0, 20, (2.0, 4.0)),
-    False: Size(12.0, 8, 24, 48.0, 450, (10.0, 40.0, 160.0)),
+    False: Size(120.0, 40, 24, 48.0, 450, (10.0, 40.0, 160.0)),
 }
 
 

@@ -1,8 +1,9 @@
-"""What a fine-tuning changed in a network, in kilobytes: matrices as products of two narrow ones, the rest as it is.
+"""What a fine-tuning changed in a network, in kilobytes: matrices in few bits, whole or as products of two narrow ones.
 
-A change ``W' - W`` of a matrix is cut to its largest singular values (Eckart and Young 1936); which ones of all
-matrices are kept is decided by energy a byte, until the bytes are used up. Vectors are kept whole. So any fine-tuning
-becomes a delta, whatever method it was done by, and a fleet is one network and a small file a machine.
+The change ``W' - W`` of each matrix is kept whole, in as many bits a number (8 to 4, with a scale a row) as there is
+room for. Where 4 are too many it is cut to its largest singular values (Eckart and Young 1936), in 8 bits; which ones
+of all matrices are kept is decided by energy a byte. Vectors are in single precision. So any fine-tuning becomes a
+delta, whatever method it was done by, and a fleet is one network and a small file a machine.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,49 @@ MOST_BYTES = 64 * 2**20
 HEADER = "header"
 HEAD_BYTES = 4096
 """Kept free for the header and for names, shapes and places of the arrays."""
-EACH_BYTES = 160
+EACH_BYTES = 200
 """Of the name, shape and place of an array in the file, about."""
-Half = NDArray[np.float16]
+Eighths = NDArray[np.int8]
+Cut = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+MOST_BITS, LEAST_BITS = 8, 4
+"""Of a number of a whole matrix; with fewer than the least, its largest singular values alone say more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A matrix of numbers of few bits with a scale a row."""
+
+    numbers: Eighths
+    scales: NDArray[np.float32]
+    bits: int = MOST_BITS
+
+    @staticmethod
+    def of(matrix: NDArray[np.float64], bits: int = MOST_BITS) -> Scaled:
+        """The nearest one to a matrix."""
+        steps = 2 ** (bits - 1) - 1
+        scales = (np.abs(matrix).max(axis=1) / steps).astype(np.float32)
+        # A row of zeros has a scale of zero; dividing by one leaves its zeros.
+        divided = matrix / np.where(scales > 0, scales, 1.0)[:, None]
+        return Scaled(np.clip(np.rint(divided), -steps, steps).astype(np.int8), scales, bits)
+
+    def packed(self) -> NDArray[np.uint8]:
+        """The numbers without the bits that they do not need."""
+        raised = (self.numbers.astype(np.int16) + 2 ** (self.bits - 1)).astype(np.uint8)
+        planes = np.unpackbits(raised.reshape(-1, 1), axis=1)[:, MOST_BITS - self.bits :]
+        return np.packbits(planes)
+
+    @staticmethod
+    def unpacked(data: NDArray[np.uint8], scales: NDArray[np.float32], columns: int, bits: int) -> Scaled:
+        """What `packed` made bytes of."""
+        count = len(scales) * columns
+        planes = np.unpackbits(data, count=count * bits).reshape(count, bits)
+        raised = np.packbits(np.pad(planes, ((0, 0), (MOST_BITS - bits, 0))), axis=1)[:, 0].astype(np.int16)
+        return Scaled((raised - 2 ** (bits - 1)).astype(np.int8).reshape(len(scales), columns), scales, bits)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """In double precision."""
+        return self.numbers * self.scales.astype(np.float64)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,27 +88,34 @@ class Delta:
     Attributes:
         base: content address of the weights that it is a change of.
         facts: plain values, such as the machine's name, logs and errors.
-        whole: changes by the name of a parameter, float32.
-        narrow: by the name of a parameter, ``(rows, rank)`` and ``(rank, columns)`` whose product is its change, with
-            all axes but the first as columns.
+        vectors: changes by the name of a parameter, float32.
+        whole: changes of matrices, with all axes but the first as columns.
+        narrow: of others, two matrices ``(rank, rows)`` and ``(rank, columns)``; the transposed first one times the
+            second is the change.
     """
 
     base: str
     facts: Mapping[str, Any]
-    whole: Mapping[str, NDArray[np.float32]]
-    narrow: Mapping[str, tuple[Half, Half]]
+    vectors: Mapping[str, NDArray[np.float32]]
+    whole: Mapping[str, Scaled]
+    narrow: Mapping[str, tuple[Scaled, Scaled]]
 
     @property
     def rank(self) -> int:
-        """The largest rank of a matrix."""
-        return max((left.shape[1] for left, _ in self.narrow.values()), default=0)
+        """The largest rank of a matrix that is not whole."""
+        return max((len(left.scales) for left, _ in self.narrow.values()), default=0)
 
     def to_bytes(self) -> bytes:
         """The file: safetensors with a header."""
-        arrays: dict[str, NDArray[Any]] = {f"w:{name}": values for name, values in self.whole.items()}
-        for name, (left, right) in self.narrow.items():
-            arrays |= {f"l:{name}": np.ascontiguousarray(left), f"r:{name}": np.ascontiguousarray(right)}
-        head = {"schema": SCHEMA, "base": self.base, "facts": dict(self.facts), "hash": _hash(arrays)}
+        arrays: dict[str, NDArray[Any]] = {f"v:{name}": values for name, values in self.vectors.items()}
+        parts = [("w", name, part) for name, part in self.whole.items()]
+        for name, pair in self.narrow.items():
+            parts += [("l", name, pair[0]), ("r", name, pair[1])]
+        shapes: dict[str, list[int]] = {}
+        for kind, name, part in parts:
+            arrays |= {f"{kind}:{name}": part.packed(), f"{kind}s:{name}": part.scales}
+            shapes[f"{kind}:{name}"] = [part.numbers.shape[1], part.bits]
+        head = {"schema": SCHEMA, "base": self.base, "facts": dict(self.facts), "shapes": shapes, "hash": _hash(arrays)}
         text = json.dumps(head, allow_nan=False, sort_keys=True)
         return bytes(save({**arrays, HEADER: np.frombuffer(text.encode(), np.uint8)}))
 
@@ -89,44 +137,62 @@ def delta_of(
     before, after = base.state_dict(), tuned.state_dict()
     if {name: value.shape for name, value in before.items()} != {name: value.shape for name, value in after.items()}:
         raise BundleError("a delta needs two networks of the same parts; give a network and what it was tuned to")
-    whole: dict[str, NDArray[np.float32]] = {}
-    cut: dict[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = {}
+    vectors: dict[str, NDArray[np.float32]] = {}
+    matrices: dict[str, NDArray[np.float64]] = {}
     left = most_bytes - HEAD_BYTES - len(json.dumps(dict(facts or {})))
     for name, old in before.items():
         change = (after[name].detach().double() - old.detach().double()).cpu().numpy()
         if not change.any():
             continue
         if change.ndim < 2:
-            whole[name] = change.astype(np.float32)
+            vectors[name] = change.astype(np.float32)
             left -= 4 * change.size + EACH_BYTES
         else:
-            cut[name] = np.linalg.svd(change.reshape(len(change), -1), full_matrices=False)
+            matrices[name] = change.reshape(len(change), -1)
     if left < 0:
         raise BundleError(f"{most_bytes:,} bytes do not hold the changed vectors of this network; allow more")
-    return Delta(weights_digest(base), dict(facts or {}), whole, dict(_narrow(cut, left)))
+    for bits in range(MOST_BITS, LEAST_BITS - 1, -1):
+        needed = sum(-(-matrix.size * bits // 8) + 4 * len(matrix) + 2 * EACH_BYTES for matrix in matrices.values())
+        if needed <= left:
+            coarse = {name: Scaled.of(matrix, bits) for name, matrix in matrices.items()}
+            return Delta(weights_digest(base), dict(facts or {}), vectors, coarse, {})
+    ranks = _ranks(matrices, left)
+    whole = {name: Scaled.of(matrices[name]) for name, rank in ranks.items() if rank is None}
+    narrow = {name: _factors(matrices[name], rank) for name, rank in ranks.items() if rank is not None}
+    return Delta(weights_digest(base), dict(facts or {}), vectors, whole, narrow)
 
 
-def _narrow(
-    cut: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]], left: int
-) -> Iterator[tuple[str, tuple[Half, Half]]]:
-    """The singular values with the most energy a byte that fit into `left` bytes, as products of narrow matrices."""
+def _ranks(matrices: Mapping[str, NDArray[np.float64]], left: int) -> dict[str, int | None]:
+    """How many singular values of each matrix fit into `left` bytes, most energy a byte first; None for all of it."""
+    sizes = {
+        name: (matrix.shape[0] + matrix.shape[1] + 8, matrix.size + 4 * len(matrix))
+        for name, matrix in matrices.items()
+    }
     entries = []
-    for name, (u, values, v) in cut.items():
-        size = 2 * (len(u) + v.shape[1])
-        entries += [(value**2 / size, size, name) for value in values if value > 0]
-    ranks: dict[str, int] = {}
-    for _, size, name in sorted(entries, reverse=True):
-        # The names and shapes of both factors come with the first of a matrix.
-        needed = size + (0 if name in ranks else 2 * EACH_BYTES)
-        if needed > left:
+    for name, matrix in matrices.items():
+        values = np.linalg.svd(matrix, compute_uv=False)
+        entries += [(value**2 / sizes[name][0], name) for value in values if value > 0]
+    ranks: dict[str, int | None] = {}
+    for _, name in sorted(entries, reverse=True):
+        rank, (each, all_of_it) = ranks.get(name, 0), sizes[name]
+        if rank is None:
             continue
-        left -= needed
-        ranks[name] = ranks.get(name, 0) + 1
-    for name, rank in ranks.items():
-        u, values, v = cut[name]
-        # The root on both sides keeps each well within the range of half precision.
-        root = np.sqrt(values[:rank])
-        yield name, ((u[:, :rank] * root).astype(np.float16), (root[:, None] * v[:rank]).astype(np.float16))
+        spent = rank * each + (4 * EACH_BYTES if rank else 0)
+        after = (rank + 1) * each + 4 * EACH_BYTES
+        # Names and shapes of both factors come with the first singular value.
+        wholly = all_of_it + 2 * EACH_BYTES <= after
+        needed = (all_of_it + 2 * EACH_BYTES if wholly else after) - spent
+        if needed <= left:
+            left -= needed
+            ranks[name] = None if wholly else rank + 1
+    return ranks
+
+
+def _factors(matrix: NDArray[np.float64], rank: int) -> tuple[Scaled, Scaled]:
+    u, values, v = np.linalg.svd(matrix, full_matrices=False)
+    # The root on both sides: both factors are then as exact as each other.
+    root = np.sqrt(values[:rank])[:, None]
+    return Scaled.of(root * u[:, :rank].T), Scaled.of(root * v[:rank])
 
 
 def with_delta(base: Predictor, delta: Delta) -> Predictor:
@@ -142,9 +208,12 @@ def with_delta(base: Predictor, delta: Delta) -> Predictor:
         )
     network = copy.deepcopy(base)
     state = network.state_dict()
-    changes: dict[str, NDArray[Any]] = dict(delta.whole)
+    changes: dict[str, NDArray[Any]] = {**delta.vectors, **{name: part.matrix for name, part in delta.whole.items()}}
     for name, (left, right) in delta.narrow.items():
-        changes[name] = left.astype(np.float64) @ right.astype(np.float64)
+        # Before they are multiplied: a file of two long rows must not ask for the memory of their product.
+        if name not in state or state[name].numel() != left.numbers.shape[1] * right.numbers.shape[1]:
+            raise BundleError(f"the delta changes '{name}', which this network lacks or has in another shape")
+        changes[name] = left.matrix.T @ right.matrix
     with torch.no_grad():
         for name, change in changes.items():
             if name not in state or state[name].numel() != change.size:
@@ -183,18 +252,38 @@ def delta_from_bytes(data: bytes, where: str) -> Delta:
     head = object_with(parse_json(text, where, BundleError), ("schema",), where, BundleError)
     if head["schema"] != SCHEMA:
         raise BundleError(f"{where} is a delta of schema {head['schema']}, {SCHEMA} is read here: update EDP")
-    object_with(head, ("base", "facts", "hash"), where, BundleError)
-    if head["hash"] != _hash(arrays) or not isinstance(head["facts"], dict):
+    object_with(head, ("base", "facts", "shapes", "hash"), where, BundleError)
+    if head["hash"] != _hash(arrays) or not isinstance(head["facts"], dict) or not isinstance(head["shapes"], dict):
         raise BundleError(f"{where} is damaged: its numbers do not have the hash in its header; copy it again")
-    whole = {name[2:]: values for name, values in arrays.items() if name.startswith("w:")}
-    lefts = {name[2:]: values for name, values in arrays.items() if name.startswith("l:")}
-    rights = {name[2:]: values for name, values in arrays.items() if name.startswith("r:")}
+    parts = {kind: _scaled(arrays, head["shapes"], kind, where) for kind in ("w", "l", "r")}
+    vectors = {name[2:]: values for name, values in arrays.items() if name.startswith("v:")}
+    lefts, rights = parts["l"], parts["r"]
     fitting = lefts.keys() == rights.keys() and all(
-        left.ndim == rights[name].ndim == 2 and left.shape[1] == len(rights[name]) for name, left in lefts.items()
+        len(left.scales) == len(rights[name].scales) for name, left in lefts.items()
     )
     if not fitting or not all(np.isfinite(values).all() for values in arrays.values()):
         raise BundleError(f"{where} is damaged: factors that do not fit together, or numbers that are not finite")
-    return Delta(str(head["base"]), head["facts"], whole, {name: (lefts[name], rights[name]) for name in lefts})
+    narrow = {name: (lefts[name], rights[name]) for name in lefts}
+    return Delta(str(head["base"]), head["facts"], vectors, parts["w"], narrow)
+
+
+def _scaled(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Any], kind: str, where: str) -> dict[str, Scaled]:
+    """Matrices of a kind by name, their shapes and types checked."""
+    matrices = {}
+    for name, data in arrays.items():
+        if not name.startswith(f"{kind}:"):
+            continue
+        scales, shape = arrays.get(f"{kind}s:{name[2:]}"), shapes.get(name)
+        if scales is None or scales.dtype != np.float32 or scales.ndim != 1:
+            raise BundleError(f"{where} is damaged: '{name}' lacks its scales")
+        if not isinstance(shape, list) or len(shape) != 2 or not all(type(one) is int for one in shape):
+            raise BundleError(f"{where} is damaged: '{name}' lacks its shape")
+        columns, bits = shape
+        fits = 0 < columns <= MOST_BYTES and LEAST_BITS <= bits <= MOST_BITS
+        if data.dtype != np.uint8 or not fits or data.size != -(-len(scales) * columns * bits // 8):
+            raise BundleError(f"{where} is damaged: '{name}' has another size than its shape says")
+        matrices[name[2:]] = Scaled.unpacked(data.reshape(-1), scales, columns, bits)
+    return matrices
 
 
 def _hash(arrays: Mapping[str, NDArray[Any]]) -> str:

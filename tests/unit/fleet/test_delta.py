@@ -1,6 +1,7 @@
 """A delta: what a fine-tuning changed, within its bytes, bound to its base, and nothing from damaged files."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from edp.networks.backbones import LstmSpec
 from edp.networks.predictor import ModelSpec
 from edp.testing.networks import small_network, small_task
 from edp.training.bundle import weights_digest
-from edp.training.delta import delta_from_bytes, delta_of, read_delta, with_delta, write_delta
+from edp.training.delta import Scaled, delta_from_bytes, delta_of, read_delta, with_delta, write_delta
 
 MODEL, OTHER = (ModelSpec(backbone=LstmSpec(units=units)) for units in (24, 8))
 
@@ -60,6 +61,7 @@ def test_more_bytes_bring_it_nearer(networks):
 def test_what_did_not_change_takes_no_room(networks):
     base, _ = networks
     delta = delta_of(base, copy.deepcopy(base))
+    assert not delta.vectors
     assert not delta.whole
     assert not delta.narrow
     assert weights_digest(with_delta(base, delta)) == weights_digest(base)
@@ -85,7 +87,17 @@ def test_damage_is_one_message(networks, tmp_path):
     with pytest.raises(BundleError):
         read_delta(tmp_path / "absent.delta")
     hostile = delta_of(*networks)
-    name = next(iter(hostile.whole))
-    hostile.whole[name][0] = np.inf
+    name = next(iter(hostile.vectors))
+    hostile.vectors[name][0] = np.inf
     with pytest.raises(BundleError, match="not finite"):
         delta_from_bytes(hostile.to_bytes(), "hostile")
+
+
+def test_factors_of_a_product_beyond_the_network_are_refused_before_they_are_multiplied(networks):
+    base, tuned = networks
+    delta = delta_of(base, tuned, {}, 9_000)
+    name = next(iter(delta.narrow))
+    long = Scaled.of(np.ones((1, 1_000_000)))
+    hostile = replace(delta, narrow={name: (long, long)})
+    with pytest.raises(BundleError, match="in another shape"):
+        with_delta(base, delta_from_bytes(hostile.to_bytes(), "hostile"))
