@@ -126,7 +126,7 @@ class DataSource:
             ConfigError: a map or repairs for a store, whose logs were read with their own.
         """
         if self.stored:
-            self._check_store_options()
+            self.check_store_options()
             return read_store(self.store_folder())
         self._refuse_bucket()
         if self.path.suffix != ".toml":
@@ -195,7 +195,7 @@ class DataSource:
         return build_store(stored, folder, workers, on_progress)
 
     def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
-        self._check_store_options()
+        self.check_store_options()
         recordings = read_store(self.store_folder())
         reports, sketches = [], Sketches()
         for i, recording in enumerate(recordings):
@@ -213,7 +213,12 @@ class DataSource:
                 "store`, and give this command the store"
             )
 
-    def _check_store_options(self) -> None:
+    def check_store_options(self) -> None:
+        """Refuse a map or repairs for a store, whose logs were read with their own.
+
+        Raises:
+            ConfigError: one came.
+        """
         options = [name for name, value in (("--map", self.signal_map), ("--repair", self.repair)) if value is not None]
         if options:
             raise ConfigError(
