@@ -222,7 +222,8 @@ def copied(file: RemoteFile) -> Iterator[Path]:
     with TemporaryDirectory(prefix="edp_") as folder:
         check_room(Path(folder), file.size, file.address)
         # A key may hold anything: its last part alone names the file, and a folder of our own holds it.
-        target = Path(folder) / (re.sub(r"[^\w.+-]", "_", file.name)[-120:] or "log")
+        # Without leading dots: '..' is a key like any other, and no name of a file.
+        target = Path(folder) / (re.sub(r"[^\w.+-]", "_", file.name)[-120:].lstrip(".") or "log")
         BucketReader(file.address).copy(file, target)
         yield target
 
