@@ -70,7 +70,8 @@ _GAP = 2
 PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
-        *("budget", "config", "data", "features", "further", "limit", "map", "on", "out", "page", "scenario", "start"),
+        *("base", "budget", "config", "data", "deltas", "features", "fleet", "further", "limit", "map", "on", "out"),
+        *("page", "scenario", "start"),
         *(
             "log",
             "mdf",

@@ -19,7 +19,7 @@ COMMANDS = [command.name for command in app.registered_commands]
 EXPECTED = [
     *("demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "distil", "compress", "footprint"),
     *("quantise", "export", "parity", "pretrain", "finetune", "adapt", "replay", "report", "twin", "rollout"),
-    *("identify", "control", "tune", "init", "runs", "doctor", "compare", "live"),
+    *("identify", "control", "tune", "init", "runs", "doctor", "compare", "live", "forecast"),
 ]
 
 
