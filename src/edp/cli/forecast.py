@@ -71,6 +71,6 @@ def forecast(
             table(title, ["", "unit", "twin", "present value held"], errors)
         out.print(f"gain of the observer: {result.gain:g}")
         out.print(f"{len(result.files)} logs in {folder}, each with {', '.join(result.channels)}")
-        out.print(f"next: edp train {folder} --preset standard --set task.features=all --out runs/ahead")
+        out.print(f"next: edp train {folder} --set task.features=all --out runs/ahead")
 
     emit(as_json, facts, show)
