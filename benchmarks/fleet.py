@@ -17,13 +17,11 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-import os
 import shutil
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,96 +42,20 @@ from edp.workflows.fleet.simulating import simulate_with
 from edp.workflows.fleet.storing import store_with
 from edp.workflows.train_evaluate import train
 from edp.workflows.transfer import FinetuneSpec
+from fleet_meter import metered
 
 SPEEDUP, SHARE, NEAR = 1.8, 0.03, 1.05
 UNITS = 1_000
 PARTS = ("before", "full", "delta")
-WORKER = b"edp.workflows.executors.worker"
-TICK_S = 0.1
-CLOCK = os.sysconf("SC_CLK_TCK")
+LEAST_S = 1.0
+"""Processor time of one process, below which two are not compared with it: the system counts in hundredths, and the
+start of a worker differs by tenths."""
 HOURS, CORES = 10_000.0, 100
 NETWORK = (
     'model.backbone={kind="hybrid",channels=[64],kernel=4,units=64}',
     "task.horizons=[10]",
     "model.window=50",
 )
-
-
-def spent_s(process: int) -> float:
-    """Processor time of a process so far, in s; 0 once it is gone."""
-    with contextlib.suppress(OSError, IndexError):
-        fields = Path(f"/proc/{process}/stat").read_bytes().rpartition(b")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / CLOCK
-    return 0.0
-
-
-def children(process: int) -> list[int]:
-    """Processes that a process started, in any thread."""
-    found = []
-    with contextlib.suppress(OSError):
-        for thread in Path(f"/proc/{process}/task").iterdir():
-            found += [int(word) for word in (thread / "children").read_text().split()]
-    return found
-
-
-def tree_s(process: int) -> dict[int, float]:
-    """Processor time of a process and of all below it, by process."""
-    spent = {process: spent_s(process)}
-    for child in children(process):
-        spent |= tree_s(child)
-    return spent
-
-
-def is_worker(process: int) -> bool:
-    with contextlib.suppress(OSError):
-        return WORKER in Path(f"/proc/{process}/cmdline").read_bytes()
-    return False
-
-
-@dataclass
-class Meter:
-    """Processor time of this process with its readers, and of each worker with its own, looked at now and then."""
-
-    begun: dict[int, float] = field(default_factory=lambda: tree_s(os.getpid()))
-    seen: dict[int, dict[int, float]] = field(default_factory=dict)
-    workers: set[int] = field(default_factory=set)
-    done: threading.Event = field(default_factory=threading.Event)
-
-    def look(self) -> None:
-        own = os.getpid()
-        for child in children(own):
-            # A worker looks like this process until it runs its own program, and like nothing once it was ended.
-            if is_worker(child):
-                self.workers.add(child)
-                self.seen.setdefault(own, {}).pop(child, None)
-            place = self.seen.setdefault(child if child in self.workers else own, {})
-            for process, spent in tree_s(child).items():
-                place[process] = max(place.get(process, 0.0), spent)
-        self.seen.setdefault(own, {})[own] = spent_s(own)
-
-    def watch(self) -> None:
-        while not self.done.wait(TICK_S):
-            self.look()
-
-    def here(self) -> float:
-        """Of this process and what is no worker, since the meter began."""
-        return sum(spent - self.begun.get(p, 0.0) for p, spent in self.seen.get(os.getpid(), {}).items())
-
-    def busiest(self) -> float:
-        """Of the worker that took most."""
-        workers = [sum(spent.values()) for process, spent in self.seen.items() if process != os.getpid()]
-        return max(workers, default=0.0)
-
-
-@contextlib.contextmanager
-def metered() -> Iterator[Meter]:
-    meter = Meter()
-    looking = threading.Thread(target=meter.watch, daemon=True)
-    looking.start()
-    yield meter
-    meter.look()
-    meter.done.set()
-    looking.join()
 
 
 def rest(identity: Any, where: Any) -> dict[str, Any]:
@@ -242,7 +164,7 @@ def two_against_one(bench: Bench) -> list[dict[str, Any]]:
         two = max(0.0, here - started_here) + max(0.0, there - started_there)
         rows.append({
             "command": name, "one process, s": alone, "two: coordinator, s": here, "two: busier worker, s": there,
-            "of which starting, s": started_there, "times": alone / max(two, 1e-9),
+            "of which starting, s": started_there, "times": alone / two if two > 0.0 and alone >= LEAST_S else None,
         })  # fmt: skip
         print(rows[-1], flush=True)
     return rows
@@ -403,7 +325,11 @@ def main() -> None:
     with contextlib.ExitStack() as stack:
         work = arguments.work or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         found = measure(Bench(work, arguments.seed, quick), arguments.curve)
-    table(list(found["commands"][0]), [list(row.values()) for row in found["commands"]])
+    short = "too short to compare"
+    table(
+        list(found["commands"][0]),
+        [[short if value is None else value for value in row.values()] for row in found["commands"]],
+    )
     cost_of, coordinator = found["cost"], found["coordinator"]
     share = coordinator["ms_a_unit"] / 1e3 * 2 / cost_of["unit_mean_s"]
     print(f"coordinator: {coordinator['ms_a_unit']:.2f} ms a unit")
@@ -412,6 +338,7 @@ def main() -> None:
     verdicts = [
         verdict(f"{row['command']}: two workers against one", row["times"], 1.0, f">= {SPEEDUP}", "times", quick)
         for row in found["commands"]
+        if row["times"] is not None
     ]
     verdicts += [
         verdict("coordinator's share of a core, of 3 %", share, SHARE, "<= 1", "core", quick),

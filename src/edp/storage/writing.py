@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,31 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`; on success it is renamed to `path`, else removed with what is in it.
+
+    Args:
+        path: not there yet, or an empty folder.
+
+    Raises:
+        StorageError: the disk is full, the parent is read-only, or something is in the way.
+    """
+    target = Path(path).absolute()
+    make_folder(target.parent)
+    temporary = target.parent / f".{target.name[:80]}.{secrets.token_hex(6)}.tmp"
+    try:
+        temporary.mkdir()
+        yield temporary
+        if os.name == "nt" and target.is_dir():
+            target.rmdir()  # Windows renames onto nothing that is there
+        temporary.rename(target)
+    except OSError as error:
+        raise storage_error(target, error, "write") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def remove_unfinished(folder: Path) -> None:

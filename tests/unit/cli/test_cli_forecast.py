@@ -108,3 +108,26 @@ def test_a_name_that_is_a_path_stays_in_the_folder(edp, run, logs, tmp_path):
     written = sorted(path.name for path in tmp_path.rglob("*.parquet") if path.parent != inner)
     assert len(written) == 3
     assert {path.parent for path in tmp_path.rglob("*.parquet")} == {inner, tmp_path / "ahead"}
+
+
+def test_logs_are_there_all_together_or_not_at_all(edp, run, logs, tmp_path):
+    inner = tmp_path / "logs"
+    inner.mkdir()
+    recording = read_recording(logs / "log_0.parquet")
+    write_recording(replace(recording, name="first"), inner / "0.parquet")
+    write_recording(replace(recording, name="second", values=recording.values[:10]), inner / "1.parquet")
+    ended = edp("forecast", run, inner, "--out", tmp_path / "ahead")
+    assert ended.code == 1
+    assert "recording 'second': a prefix of 10 ticks came" in " ".join(ended.err.split())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["logs"]
+    (tmp_path / "ahead").mkdir()  # an empty folder is no folder in use
+    assert edp("forecast", run, inner / "0.parquet", "--out", tmp_path / "ahead").code == 0
+    assert [path.name for path in (tmp_path / "ahead").iterdir()] == ["0001_first.parquet"]
+
+
+@pytest.mark.parametrize(("option", "value"), [("--ahead", "0"), ("--ahead", "1000000000000"), ("--gain", "2")])
+def test_numbers_that_cannot_be_are_refused_before_logs_are_read(edp, run, tmp_path, option, value):
+    ended = edp("forecast", run, tmp_path / "missing", "--out", tmp_path / "ahead", option, value)
+    assert ended.code == 1
+    assert option in ended.err
+    assert not (tmp_path / "ahead").exists()

@@ -85,7 +85,32 @@ def test_a_missing_sensor_leaves_its_port_free(machine):
     assert np.isfinite(values[twin.prefix_ticks :]).all()
 
 
-@pytest.mark.parametrize("horizons", [(), (0,), (3, 3), (1.5,), (True,)])
+def test_a_start_beyond_an_end_stop_waits_for_one_within(machine):
+    twin, commands, measured = machine
+    far = measured.copy()
+    far[:20, 2] += 2.0  # metres: no stroke of the machine
+    values = forecast(twin, commands, far, AHEAD)
+    settled = 20 + twin.prefix_ticks
+    assert np.isnan(values[:settled]).all()
+    np.testing.assert_array_equal(
+        values[settled:], forecast(twin, commands[20:], measured[20:], AHEAD)[twin.prefix_ticks :]
+    )
+    far[:, 2] = 9.0
+    with pytest.raises(DataError, match="beyond an end stop"):
+        forecast(twin, commands, far, AHEAD)
+
+
+def test_far_horizons_take_no_more_memory(machine, monkeypatch):
+    twin, commands, measured = machine
+    blocks = []
+    rollout = twin.rollout
+    monkeypatch.setattr(twin, "rollout", lambda held, *rest: (blocks.append(held.shape), rollout(held, *rest))[1])
+    monkeypatch.setattr("edp.networks.twin.forecast.BLOCK_NUMBERS", 10_000)
+    forecast(twin, commands[:80], measured[:80], (1000,))
+    assert max(moments * ticks for moments, ticks, _ in blocks if ticks == 1000) * 8 <= 10_000
+
+
+@pytest.mark.parametrize("horizons", [(), (0,), (3, 3), (1.5,), (True,), (1001,), (10**12,)])
 def test_horizons_that_cannot_be_are_refused(machine, horizons):
     with pytest.raises(ConfigError, match="--ahead"):
         forecast(*machine, horizons)

@@ -34,6 +34,8 @@ def machine():
     twin = SPEC.start(channels, fit_scales(channels, levers), levers, 0)
     numbers = twin.table.nominal
     numbers[twin.table.inertia_at], numbers[twin.table.potential_at] = 0.07, 0.01
+    # Far above what acts, unlike where a fit starts: limited all the time, faults of a valve would hardly show.
+    numbers[[number.name for number in twin.table.numbers].index("power_limit")] *= 10.0
     twin = twin.with_numbers(numbers)
     start = np.tile(np.array([0.0, 0.5, 5e6, 5e6, 5e6], np.float32), (len(levers), 1))
     commands = np.stack([series.inputs for series in levers])
@@ -126,17 +128,17 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
         lame[names.index(name)] *= 2.0
     start = twin.with_numbers(lame).without_network()
     # Long enough for velocities and strokes, which choose the weights together.
-    spec = replace(SPEC, updates=(400,))
+    spec = replace(SPEC, updates=(200,))
     fit = fit_residual(start, spec, runs[:2], runs[2:3], FreeRunSpec(validation_s=2.0))
     assert fit.helps
     # What is fitted; how much of it is velocities differs with the rounding of the machine.
-    assert fit.error < 0.9 * fit.grey_error
+    assert fit.error < 0.8 * fit.grey_error
     judge = FreeRunJudgeSpec(at_s=(2.0,))
     with_network, alone = (
         free_run_scores(free_runs(one, runs[2:3], 2.0, 32), judge)["velocity_mae"]["mean"]
         for one in (fit.twin, fit.twin.without_network())
     )
-    assert with_network < 0.95 * alone
+    assert with_network < 0.9 * alone
     assert fit.error == min(row["validation"] for row in fit.history)
     np.testing.assert_array_equal(fit.twin.numbers, start.numbers)
 

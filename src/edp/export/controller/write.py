@@ -15,7 +15,7 @@ from edp.export.c.text import number
 from edp.export.controller.lanes import LaneModel, lane_model
 from edp.export.controller.near import NearModel, near_model
 from edp.export.controller.numbers import ConstantTables, constants_of_controller, golden_rows
-from edp.export.controller.parts import AXES, ControllerParts, PlanParts
+from edp.export.controller.parts import AXES, ControllerParts, GoldenLoop, PlanParts
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.folder import write_export
 from edp.export.sizes import check_sizes
@@ -111,7 +111,7 @@ class ControllerFiles:
         if self.model is not None:
             texts |= {file: _own(file) for file in (*SOLVER_FILES, LICENCE)}
         if self.parts.golden is not None:
-            texts[f"{name}_control_golden.h"] = self._golden()
+            texts[f"{name}_control_golden.h"] = self._golden(self.parts.golden)
             texts["host_test.c"] = self._filled("host_test.c.in")
         texts["example_task.c"] = self._filled("example_task.c.in")
         texts["CMakeLists.txt"] = self._filled("CMakeLists.txt.in")
@@ -149,8 +149,11 @@ class ControllerFiles:
             "sources": Code(" ".join(self.sources)),
             "solver": Code(" ".join(SOLVER)) if plan is not None else Code(""),
         }
-        values |= self._pi_texts() if plan is None else self._plan_texts(plan, places)
-        part = "pi.c.in" if plan is None else "plan.c.in"
+        if plan is None or self.model is None:
+            part, texts = "pi.c.in", self._pi_texts()
+        else:
+            part, texts = "plan.c.in", self._plan_texts(plan, self.model, places)
+        values |= texts
         return values | {"parts": fill(_own(f"templates/{part}"), values)}
 
     def _pi_texts(self) -> dict[str, object]:
@@ -167,8 +170,8 @@ class ControllerFiles:
             "recall": Code(RECALL_SUMS.format(at=AXES)),
         }
 
-    def _plan_texts(self, plan: PlanParts, places: dict[str, str]) -> dict[str, object]:
-        name, upper, model = self.name, self.name.upper(), self._plan_model
+    def _plan_texts(self, plan: PlanParts, model: PlanModel, places: dict[str, str]) -> dict[str, object]:
+        name, upper = self.name, self.name.upper()
         sizes = {
             "BLOCKS": len(plan.blocks),
             "VARIABLES": plan.variables,
@@ -205,15 +208,10 @@ class ControllerFiles:
             "loop_levers": Code(LOOP_LEVERS if plan.fallback else ""),
             "without_plan": Code(spare),
             "test_limit": Code(LIMIT_TEST.format(name=name, spare=spare)),
-            "recall": self._recall(plan),
+            "recall": self._recall(plan, model),
         }
 
-    @property
-    def _plan_model(self) -> PlanModel:
-        assert self.model is not None  # noqa: S101  for the type checker: a plan has a model
-        return self.model
-
-    def _recall(self, plan: PlanParts) -> Code:
+    def _recall(self, plan: PlanParts, model: PlanModel) -> Code:
         """Statements of the self-test that set what is remembered."""
         at = AXES
         lines = ""
@@ -221,7 +219,7 @@ class ControllerFiles:
             lines += f"    (void)memcpy(control.{field}, before + {at}, {size}u * sizeof(float));\n"
             at += size
         rest = f"    (void)memcpy(control.disturbance, before + {at + AXES}, EDP_AXES * sizeof(float));\n"
-        rest += self._plan_model.recalled.format(plant=f"{self.name}_plant", at=at + 2 * AXES)
+        rest += model.recalled.format(plant=f"{self.name}_plant", at=at + 2 * AXES)
         return Code(lines + RECALL_SUMS.format(at=at) + rest)
 
     def _input_enum(self) -> Code:
@@ -234,9 +232,7 @@ class ControllerFiles:
             )
         )
 
-    def _golden(self) -> Code:
-        golden = self.parts.golden
-        assert golden is not None  # noqa: S101  for the type checker: asked for where there is one
+    def _golden(self, golden: GoldenLoop) -> Code:
         arrays = {
             "golden_measured": golden.measured,
             "golden_before": golden.before,

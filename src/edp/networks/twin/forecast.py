@@ -19,7 +19,7 @@ from edp.data.series import Series
 from edp.errors import ConfigError, DataError
 from edp.networks.twin.base import Twin, TwinState
 from edp.networks.twin.scales import Array
-from edp.settings.bounds import MOST_TICKS, integer, span
+from edp.settings.bounds import integer, span
 
 GAINS = (1.0, 0.3, 0.1)
 """Of an observer, as shares of the way to the measurement in a tick: measured mode, and two that smooth noise.
@@ -28,8 +28,10 @@ A grey box of a simulated M22 forecasts ten ticks ahead with 0.78, 0.72 and 0.71
 own past answers as measurements."""
 CHOICE_LOGS, CHOICE_TICKS = 3, 1500
 """Stretches and ticks of each on which a gain is chosen: thousands of moments settle errors to a few per cent."""
-BLOCK = 4096
-"""Moments that look ahead at a time: their states are a few MB."""
+BLOCK, BLOCK_NUMBERS = 4096, 4_000_000
+"""Moments that look ahead at a time, and numbers of their runs: states of a few MB, runs of some tens of MB."""
+MOST_AHEAD = 1000
+"""Ticks: with the commands held nothing of a machine can be foretold for as long; each tick of a log runs so far."""
 
 
 def check_horizons(horizons: Sequence[int]) -> None:
@@ -38,7 +40,7 @@ def check_horizons(horizons: Sequence[int]) -> None:
     Raises:
         ConfigError: the one that cannot be.
     """
-    allowed = integer(1, MOST_TICKS)
+    allowed = integer(1, MOST_AHEAD)
     wrong = [k for k in horizons if not allowed.holds(k)]
     if not horizons or wrong or len(set(horizons)) < len(horizons):
         came = f"{wrong[0]}" if wrong else ", ".join(map(str, horizons)) or "none"
@@ -89,12 +91,13 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
     Args:
         twin: any formulation.
         commands: ``(tick, command)``, finite.
-        measured: ``(tick, answer)``, NaN where a sensor is missing, but not at the first tick.
+        measured: ``(tick, answer)``, NaN where a sensor is missing.
         horizons: how many ticks ahead.
         gain: of the observer; see `choose_gain`.
 
     Returns:
-        ``(tick, horizon, answer)``, SI units; NaN in the ticks before `Twin.prefix_ticks`, when the observer settles.
+        ``(tick, horizon, answer)``, SI units; NaN in the ticks before the observer has settled: `Twin.prefix_ticks`
+        from the first tick on at which the twin can start.
 
     Raises:
         ConfigError: a horizon or a gain that cannot be.
@@ -102,14 +105,16 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
     """
     check_horizons(horizons)
     check_gain(gain)
-    prefix, ticks = twin.prefix_ticks, len(commands)
+    begin, ticks = _begin(twin, measured), len(commands)
+    settled = begin + twin.prefix_ticks
     answers = np.full((ticks, len(horizons), measured.shape[1]), np.nan, np.float32)
-    state = twin.reset(commands[None, :prefix], measured[None, :prefix])
+    state = twin.reset(commands[None, begin:settled], measured[None, begin:settled])
     _refuse_gaps(twin, commands)
     runner = twin.runner()
     places = np.asarray(horizons) - 1
-    for first in range(prefix, ticks, BLOCK):
-        block = slice(first, min(first + BLOCK, ticks))
+    moments = max(1, min(BLOCK, BLOCK_NUMBERS // (max(horizons) * (commands.shape[1] + measured.shape[1]))))
+    for first in range(settled, ticks, moments):
+        block = slice(first, min(first + moments, ticks))
         states, ports = [], np.empty((block.stop - first, measured.shape[1]), np.float32)
         for row, t in enumerate(range(first, block.stop)):
             own = state["answer"][0]
@@ -119,6 +124,14 @@ def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[in
             state = runner.step(commands[t], state, ports[row])
         answers[block] = _ahead(twin, commands[block], _stacked(states), ports, max(horizons))[:, places]
     return answers
+
+
+def _begin(twin: Twin, measured: Array) -> int:
+    """First tick at which the twin can start: all measured, no stroke far beyond an end stop; the first without one."""
+    there = np.isfinite(measured).all(axis=1)
+    possible = np.flatnonzero(there & twin.within_stops(np.where(there[:, None], measured, np.float32(0.0))))
+    # Where there is none, the reset at the first tick says what is wrong there.
+    return int(possible[0]) if len(possible) and len(measured) - possible[0] >= twin.prefix_ticks else 0
 
 
 def _ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: int) -> Array:

@@ -37,6 +37,7 @@ from edp.workflows.fleet.personal import FLEET, read_fleet
 ENTRIES, FILES, LOCK = "entries", "files", ".lock"
 SCHEMA = 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+IDENTIFIER = re.compile(r"[0-9a-f]{32}")
 SCORES = "scores.json"
 NETWORK, FLEET_KIND = "network", "fleet"
 
@@ -260,6 +261,11 @@ def read_entry(registry: str | Path, digest: str) -> RegistryEntry:
     texts = ("id", "kind", "name", "label", "base", "added", "edp")
     if content["id"] != digest or not all(isinstance(content[name], str) for name in texts):
         raise StorageError(f"'{file}' is damaged: it is no entry of '{digest}'; restore it")
+    # A base names the next file that is read; a path in its place would lead out of the registry.
+    if not IDENTIFIER.fullmatch(digest) or not (content["base"] == "" or IDENTIFIER.fullmatch(content["base"])):
+        raise StorageError(f"'{file}' is damaged: what it calls an identifier is none; restore it")
+    if content["kind"] not in (NETWORK, FLEET_KIND):
+        raise StorageError(f"'{file}' is damaged: there is no kind '{content['kind'][:40]}' of entries; restore it")
     if not isinstance(content["data"], dict) or not isinstance(content["judge"], dict):
         raise StorageError(f"'{file}' is damaged: data and judge must be tables; restore it")
     return RegistryEntry(**{name: content[name] for name in names})

@@ -19,7 +19,7 @@ from edp.networks.twin.forecast import CHOICE_LOGS, check_gain, check_horizons, 
 from edp.recording import Recording
 from edp.report.common.picture import file_name
 from edp.signals import Channel
-from edp.storage import make_folder
+from edp.storage import replacing_folder
 from edp.training.twin_bundle import TwinBundle, load_twin
 
 AHEAD = "_in_"
@@ -55,13 +55,14 @@ def forecast_logs(
 ) -> ForecastLogs:
     """Write logs anew with a channel for each forecast of a twin: ``CylVels_1_in_10`` is CylVels_1 in ten ticks.
 
-    In the first ticks of a log, before the twin's prefix, a forecast is the present value.
+    In the first ticks of a log, before the observer has settled, a forecast is the present value.
 
     Args:
         run: run folder of a twin.
         source: the logs.
         horizons: ticks ahead.
-        out: folder of the new logs (Parquet); it must not hold anything yet.
+        out: folder of the new logs (Parquet), which are there all together or not at all; it must not hold anything
+            yet.
         answers: what is forecast; empty: the velocities.
         gain: of the observer; None: chosen on logs from which the twin learned, where these are among them, else on
             the first ones.
@@ -76,22 +77,25 @@ def forecast_logs(
     bundle = load_twin(run)
     twin = bundle.twin
     columns = _columns(twin, answers)
-    folder = _empty(Path(out))
+    _refuse_used(Path(out))
     recordings = source.read()
     if gain is None:
         gain = _chosen_gain(bundle, recordings, horizons)
-    files, errors = [], []
-    for number, logged in enumerate(recordings, start=1):
-        if on_log is not None:
-            on_log(logged.name, number, len(recordings))
-        recording = _checked(twin, logged)
-        values, measured = _forecasts(twin, recording, horizons, columns, gain)
-        errors.append(_errors(values, measured, horizons, twin.prefix_ticks))
-        extended = _extended(twin, recording, values, horizons, columns)
-        # The name comes from a file: as it is, it could be a path out of the folder, or that of another log.
-        files.append(write_recording(extended, folder / f"{number:04d}_{file_name(recording.name)}.parquet"))
-    names = tuple(channel.name for channel in _channels(twin, horizons, columns))
-    return ForecastLogs(tuple(files), names, gain, _scores(twin, errors, horizons, columns))
+    names, errors = [], []
+    with replacing_folder(out) as folder:
+        for number, logged in enumerate(recordings, start=1):
+            if on_log is not None:
+                on_log(logged.name, number, len(recordings))
+            recording = _checked(twin, logged)
+            values, measured, settled = _forecasts(twin, recording, horizons, columns, gain)
+            errors.append(_errors(values, measured, horizons, settled))
+            extended = _extended(twin, recording, values, horizons, columns)
+            # The name comes from a file: as it is, it could be a path out of the folder, or that of another log.
+            names.append(f"{number:04d}_{file_name(recording.name)}.parquet")
+            write_recording(extended, folder / names[-1])
+    channels = tuple(channel.name for channel in _channels(twin, horizons, columns))
+    files = tuple(Path(out) / name for name in names)
+    return ForecastLogs(files, channels, gain, _scores(twin, errors, horizons, columns))
 
 
 def _chosen_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
@@ -113,11 +117,10 @@ def _columns(twin: Twin, answers: Sequence[str]) -> list[int]:
     return [names.index(name) for name in dict.fromkeys(answers or velocities)]
 
 
-def _empty(folder: Path) -> Path:
-    """A folder in which nothing can be lost."""
+def _refuse_used(folder: Path) -> None:
+    """See before the work that nothing will be lost."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"--out '{folder}' holds something already; name a folder that is new or empty")
-    return make_folder(folder)
 
 
 def _checked(twin: Twin, logged: Recording) -> Recording:
@@ -131,8 +134,8 @@ def _checked(twin: Twin, logged: Recording) -> Recording:
 
 def _forecasts(
     twin: Twin, recording: Recording, horizons: Sequence[int], columns: list[int], gain: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Forecasts ``(tick, horizon, column)`` and what was measured ``(tick, column)``."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Forecasts ``(tick, horizon, column)``, what was measured ``(tick, column)``, and the first tick of a forecast."""
     commands, measured = (
         np.ascontiguousarray(recording.select([channel.name for channel in part]))
         for part in (twin.channels.commands, twin.channels.answers)
@@ -143,9 +146,10 @@ def _forecasts(
         raise DataError(f"recording '{recording.name}': {error}") from error
     present = measured[:, columns]
     # A network that trains on the log reads a number at every tick; nothing better than the present value is known.
-    early = np.arange(len(values)) < twin.prefix_ticks
-    values[early] = present[early, None]
-    return values, present
+    unsettled = np.isnan(values[:, 0, 0])
+    settled = len(values) if unsettled.all() else int(np.argmin(unsettled))
+    values[:settled] = present[:settled, None]
+    return values, present, settled
 
 
 def _channels(twin: Twin, horizons: Sequence[int], columns: list[int]) -> list[Channel]:
@@ -174,14 +178,14 @@ def _extended(
 
 
 def _errors(
-    values: np.ndarray, measured: np.ndarray, horizons: Sequence[int], prefix: int
+    values: np.ndarray, measured: np.ndarray, horizons: Sequence[int], settled: int
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """For each horizon, sums of absolute errors of forecast and present value ``(column,)``, and how many count."""
     sums = []
     for at, k in enumerate(horizons):
-        truth = measured[prefix + k :]
-        pair = np.stack([values[prefix : len(values) - k, at], measured[prefix : len(measured) - k]])
-        apart = np.abs(pair[:, : len(truth)] - truth).astype(np.float64)
+        last = max(settled, len(values) - k)
+        pair = np.stack([values[settled:last, at], measured[settled:last]])
+        apart = np.abs(pair - measured[settled + k :]).astype(np.float64)
         finite = np.isfinite(apart).all(axis=0)
         ours, present = np.where(finite, apart, 0.0).sum(axis=1)
         sums.append((ours, present, finite.sum(axis=0)))

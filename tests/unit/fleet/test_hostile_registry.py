@@ -1,0 +1,65 @@
+"""Entries of a registry that somebody else wrote: no path in them leads out of it, and no value breaks the list."""
+
+import json
+
+import pytest
+
+from edp.errors import StorageError
+from edp.workflows.fleet.registry import ENTRIES, find_entry, lineage, list_registry, read_entry
+
+GOOD, OTHER = "a" * 32, "b" * 32
+ENTRY = {
+    "schema": 1,
+    "id": GOOD,
+    "kind": "network",
+    "name": "net",
+    "label": "hybrid",
+    "base": "",
+    "data": {},
+    "judge": {},
+    "added": "2026-01-01",
+    "edp": "0.1.0",
+}
+
+
+@pytest.fixture
+def registry(tmp_path):
+    """A registry below a folder with an entry that does not belong to it."""
+    top = tmp_path / "registry"
+    (top / ENTRIES).mkdir(parents=True)
+    (tmp_path / "secret.json").write_text(json.dumps({**ENTRY, "id": "../../secret"}))
+    return top
+
+
+def write(registry, file, **changes):
+    (registry / ENTRIES / f"{file}.json").write_text(json.dumps(ENTRY | changes))
+
+
+@pytest.mark.parametrize("base", ["../../secret", "/etc/passwd", "a" * 31, "A" * 32, "x\n"])
+def test_a_base_that_is_no_identifier_is_damage(registry, base):
+    write(registry, GOOD)
+    write(registry, OTHER, id=OTHER, base=base)
+    entries, damaged = list_registry(registry)
+    assert [entry.id for entry in entries] == [GOOD]
+    assert len(damaged) == 1
+    assert "identifier is none" in damaged[0]
+
+
+def test_an_identifier_that_is_a_path_is_refused(registry):
+    with pytest.raises(StorageError, match="identifier is none"):
+        read_entry(registry, "../../secret")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"kind": "program"}, {"kind": 5}, {"name": None}, {"data": []}, {"judge": "x"}, {"schema": 2}]
+)
+def test_other_values_are_damage(registry, changes):
+    write(registry, GOOD, **changes)
+    assert (list_registry(registry)[0], len(list_registry(registry)[1])) == ([], 1)
+
+
+def test_a_circle_of_bases_ends(registry):
+    write(registry, GOOD, base=OTHER)
+    write(registry, OTHER, id=OTHER, name="other", base=GOOD)
+    steps = lineage(registry, find_entry(registry, "net"))
+    assert [step if isinstance(step, str) else step.id for step in steps] == [OTHER, GOOD]
