@@ -161,7 +161,7 @@ class Compiled:
 def graded(run: Path, twin: TwinBundle, folder: Path, quick: bool) -> dict[str, dict[str, Any]]:
     """The lines of `closed_loop.py`, graded by the compiled controller, in free air and in loam."""
     rows: dict[str, dict[str, Any]] = {}
-    for name, (material, spec) in GRADED.items():
+    for name, (material, spec) in list(GRADED.items())[: 1 if quick else None]:
         rows[name] = row = {"path_rms_mm": [], "position_rms_mm": [], "attitude_rms_deg": [], "violations": 0}
         compiled: list[Compiled] = []
         for first in nmpc_of.DRAWS[:1] if quick else nmpc_of.DRAWS:

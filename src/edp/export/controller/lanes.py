@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from edp.errors import ExportError
 from edp.export.c.calls import Calls, constant, describe, slot
 from edp.export.c.model import Model, crc, make_model, remembered
 from edp.export.c.text import call, filled, identifier, indented, number
+from edp.export.controller.files import model_files, own_file
 from edp.export.controller.parts import PlanParts
 from edp.export.escape import Code, c_comment, fill
 from edp.export.hashes import model_hash, scale_hash
@@ -91,13 +91,7 @@ class LaneModel:
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
-        texts: dict[str, str] = {f"{self.name}.{end}": self._filled(f"plant.{end}.in") for end in ("h", "c")}
-        texts[f"{self.name}_weights.h"] = self.model.weights()
-        for file in self.model.runtime:
-            texts[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
-        for file in RUNTIME:
-            texts[file] = resources.files("edp.export.controller").joinpath(f"runtime/{file}").read_text()
-        return texts
+        return model_files(self.name, self._filled, "plant", self.model, RUNTIME)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -105,7 +99,7 @@ class LaneModel:
         return (f"{self.name}.c", *(name for name in (*self.model.runtime, *RUNTIME) if name.endswith(".c")))
 
     def _filled(self, template: str) -> Code:
-        text = resources.files("edp.export.controller").joinpath(f"templates/{template}").read_text()
+        text = own_file(f"templates/{template}")
         graph, twin = self.model.graph, self.plant.twin
         fields, cleared = remembered(graph)
         low, high = input_limits(self.plant)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from edp import __version__
 from edp.errors import ExportError
 from edp.export.c.model import Model, crc, make_model
 from edp.export.c.text import filled, identifier, number
+from edp.export.controller.files import model_files, own_file
 from edp.export.controller.parts import PlanParts
 from edp.export.escape import Code, c_comment, fill
 from edp.export.hashes import model_hash, scale_hash
@@ -103,13 +103,7 @@ class NearModel:
 
     def files(self) -> dict[str, str]:
         """Model and runtime by file name."""
-        texts: dict[str, str] = {f"{self.name}.{end}": self._filled(f"plant_near.{end}.in") for end in ("h", "c")}
-        texts[f"{self.name}_weights.h"] = self.model.weights()
-        for file in self.model.runtime:
-            texts[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
-        for file in RUNTIME:
-            texts[file] = resources.files("edp.export.controller").joinpath(f"runtime/{file}").read_text()
-        return texts
+        return model_files(self.name, self._filled, "plant_near", self.model, RUNTIME)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -118,7 +112,7 @@ class NearModel:
         return (f"{self.name}.c", *(name for name in runtime if name.endswith(".c") and name != WITHIN))
 
     def _filled(self, template: str) -> Code:
-        text = resources.files("edp.export.controller").joinpath(f"templates/{template}").read_text()
+        text = own_file(f"templates/{template}")
         graph, twin, machine = self.model.graph, self.twin, self.machine
         actuators, valves, pumps = machine.sizes
         values = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 
 from edp import __version__
@@ -12,6 +11,7 @@ from edp.errors import ExportError
 from edp.export.c.model import RUNTIME
 from edp.export.c.target import check_name
 from edp.export.c.text import number
+from edp.export.controller.files import c_runtime, own_file
 from edp.export.controller.lanes import LaneModel, lane_model
 from edp.export.controller.near import NearModel, near_model
 from edp.export.controller.numbers import ConstantTables, constants_of_controller, golden_rows
@@ -107,9 +107,9 @@ class ControllerFiles:
         }
         texts |= self._runtime() if self.model is None else self.model.files()
         for file in OWN if self.model is None else (*OWN, *PROGRAM):
-            texts[file] = _own(f"runtime/{file}")
+            texts[file] = own_file(f"runtime/{file}")
         if self.model is not None:
-            texts |= {file: _own(file) for file in (*SOLVER_FILES, LICENCE)}
+            texts |= {file: own_file(file) for file in (*SOLVER_FILES, LICENCE)}
         if self.parts.golden is not None:
             texts[f"{name}_control_golden.h"] = self._golden(self.parts.golden)
             texts["host_test.c"] = self._filled("host_test.c.in")
@@ -118,14 +118,14 @@ class ControllerFiles:
         return texts
 
     def _runtime(self) -> dict[str, str]:
-        return {file: resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text() for file in RUNTIME}
+        return {file: c_runtime(file) for file in RUNTIME}
 
     def _numbers(self) -> Code:
         head = f"/* Constants of {self.name}_control. Written by EDP {__version__}; do not edit. */\n"
         return Code(head + self.tables.finished())
 
     def _filled(self, template: str) -> Code:
-        return fill(_own(f"templates/{template}"), self._values())
+        return fill(own_file(f"templates/{template}"), self._values())
 
     def _values(self) -> dict[str, object]:
         parts, plan, name = self.parts, self.parts.plan, self.name
@@ -154,7 +154,7 @@ class ControllerFiles:
         else:
             part, texts = "plan.c.in", self._plan_texts(plan, self.model, places)
         values |= texts
-        return values | {"parts": fill(_own(f"templates/{part}"), values)}
+        return values | {"parts": fill(own_file(f"templates/{part}"), values)}
 
     def _pi_texts(self) -> dict[str, object]:
         return {
@@ -202,7 +202,7 @@ class ControllerFiles:
             "private_fields": Code(PRIVATE.format(**places, model=model.private.format(**places))),
             "check_plant": Code(f" && {name}_plant_check()"),
             **{
-                key: fill(_own(f"templates/{model.fragment}{part}.c.in"), values)
+                key: fill(own_file(f"templates/{model.fragment}{part}.c.in"), values)
                 for key, part in {"model": "", "slopes": "_slopes", "predict": "_predict"}.items()
             },
             "loop_levers": Code(LOOP_LEVERS if plan.fallback else ""),
@@ -285,10 +285,6 @@ def write_controller(parts: ControllerParts, name: str, folder: Path) -> list[Pa
         model = near_model(own, parts.plan) or lane_model(own, parts.plan.plant)
     files = ControllerFiles(name, parts, model, constants_of_controller(parts, isinstance(model, NearModel)))
     return write_export(folder, {file: text.encode() for file, text in files.texts().items()})
-
-
-def _own(path: str) -> str:
-    return resources.files("edp.export.controller").joinpath(path).read_text(encoding="utf-8")
 
 
 __all__ = ["AXES", "ControllerFiles", "write_controller"]

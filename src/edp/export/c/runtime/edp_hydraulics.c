@@ -513,29 +513,40 @@ static void move(const rooms *r, uint32_t k, double change) {
     r->y[k] = (r->y[k] - held > least) ? (r->y[k] - held) : least;
 }
 
+/* What an iteration of Newton's method leaves to the next one: the share of its step, and the largest part of it. */
+typedef struct {
+    double share;
+    double largest;
+    uint32_t at;
+} damping;
+
+/* Move by a share of the step that stands in the residual. */
+static void damped_step(damping *last, const rooms *r) {
+    uint32_t most = 0u;
+    for (uint32_t k = 1; k < r->unknown; k++) {
+        most = (fabs(r->residual[k]) > fabs(r->residual[most])) ? k : most;
+    }
+    const double largest = r->residual[most];
+    /* Where a check or a relief toggles, whole steps would go to and fro for ever. */
+    const bool to_and_fro =
+        (most == last->at) && (largest * last->largest < 0.0) && (fabs(largest) > 0.5 * fabs(last->largest));
+    last->share *= to_and_fro ? 0.5 : 2.0;
+    last->share = (last->share > 1.0) ? 1.0 : ((last->share < 0.125) ? 0.125 : last->share);
+    last->largest = largest;
+    last->at = most;
+    for (uint32_t k = 0; k < r->unknown; k++) {
+        move(r, k, last->share * r->residual[k]);
+    }
+}
+
 /* Solve a stage, from a guess in y. */
 static void newton(const edp_hydraulics *h, const rooms *r, double step, double reach) {
-    double share = 1.0;
-    double before = 0.0;
-    uint32_t at_before = r->unknown;
+    damping last = {1.0, 0.0, r->unknown};
     for (uint32_t iteration = 0; iteration < EDP_MOST_ITERATIONS; iteration++) {
         assemble(h, r, step, reach);
         solve(r);
-        uint32_t most = 0u;
-        for (uint32_t k = 1; k < r->unknown; k++) {
-            most = (fabs(r->residual[k]) > fabs(r->residual[most])) ? k : most;
-        }
-        const double largest = r->residual[most];
-        /* Where a check or a relief toggles, whole steps would go to and fro for ever. */
-        const bool to_and_fro = (most == at_before) && (largest * before < 0.0) && (fabs(largest) > 0.5 * fabs(before));
-        share *= to_and_fro ? 0.5 : 2.0;
-        share = (share > 1.0) ? 1.0 : ((share < 0.125) ? 0.125 : share);
-        before = largest;
-        at_before = most;
-        for (uint32_t k = 0; k < r->unknown; k++) {
-            move(r, k, share * r->residual[k]);
-        }
-        if (fabs(largest) < TOLERANCE) {
+        damped_step(&last, r);
+        if (fabs(last.largest) < TOLERANCE) {
             return;
         }
     }

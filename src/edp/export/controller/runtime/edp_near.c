@@ -362,27 +362,12 @@ static void substitute(const rooms *r, double *columns, uint32_t count, uint32_t
 
 /* As `newton`, within what is left of the iterations; the matrix stays factorised. */
 static void newton_within(edp_near *n, const rooms *r, double step, double reach) {
-    double share = 1.0;
-    double before = 0.0;
-    uint32_t at_before = r->unknown;
+    damping last = {1.0, 0.0, r->unknown};
     bool near_enough = false;
     for (uint32_t iteration = 0; (iteration < EDP_MOST_ITERATIONS) && !near_enough; iteration++) {
-        uint32_t most = 0u;
         assemble(n->h, r, step, reach);
         eliminate(r);
-        for (uint32_t k = 1; k < r->unknown; k++) {
-            most = (fabs(r->residual[k]) > fabs(r->residual[most])) ? k : most;
-        }
-        const double largest = r->residual[most];
-        /* Where a check or a relief toggles, whole steps would go to and fro for ever. */
-        const bool to_and_fro = (most == at_before) && (largest * before < 0.0) && (fabs(largest) > 0.5 * fabs(before));
-        share *= to_and_fro ? 0.5 : 2.0;
-        share = (share > 1.0) ? 1.0 : ((share < 0.125) ? 0.125 : share);
-        before = largest;
-        at_before = most;
-        for (uint32_t k = 0; k < r->unknown; k++) {
-            move(r, k, share * r->residual[k]);
-        }
+        damped_step(&last, r);
         n->spent++;
         near_enough = true;
         for (uint32_t k = 0; k < r->unknown; k++) {
