@@ -9,7 +9,7 @@ SIDE_BY_SIDE = -n $(WORKERS) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 READY := .venv/.ready
 INSTALL := pip install --quiet --no-deps
-BENCHMARKS = $(filter-out benchmarks/common.py benchmarks/closed_loop_models.py benchmarks/closed_loop_nmpc.py benchmarks/closed_loop_tuning.py benchmarks/control_step_rival.py benchmarks/decoys.py benchmarks/m22_truth.py benchmarks/onnx_rivals.py benchmarks/score_worlds.py,$(wildcard benchmarks/*.py))
+BENCHMARKS = $(shell grep -l '__main__' benchmarks/*.py)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup lock demo docs check test test-slow lint bench system-packages clean

@@ -326,6 +326,8 @@ def main() -> None:
         "--models", nargs=3, metavar=("LOG", "RUN", "MONITOR"), help="only a log with a network and a monitor beside it"
     )
     arguments = made.parse_args()
+    if chromium() is None:
+        made.exit(message="live_view.py looks at the page in Chromium, which is not here: make system-packages\n")
     quick = arguments.quick
     seconds = 10.0 if quick else arguments.seconds
     if arguments.models:

@@ -63,6 +63,7 @@ class LogsProposal:
         columns: the columns with what they are taken for.
         files: the texts to write, by name.
         targets: channels to predict.
+        inputs: channels that command, where no kind tells it; `edp inspect` sees their coverage only if they are named.
         repairs: what training would refuse unless it is repaired, as ``--repair`` takes it.
         notes: what else a person should know.
     """
@@ -74,6 +75,7 @@ class LogsProposal:
     proposal: MapProposal
     files: dict[str, str]
     targets: tuple[str, ...]
+    inputs: tuple[str, ...]
     repairs: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -84,17 +86,21 @@ class LogsProposal:
             data, mapped = _quoted(folder / DATA), ""
         repair = "".join(f" --repair {one}" for one in self.repairs)
         run = _quoted(folder / "runs" / "first")
-        # Where no kind tells which channels command, the coverage of the logs is seen only if they are named.
-        commands = self.proposal.of_role("command")
-        named = ",".join(guess.channel for guess in commands)
-        plain = all(guess.kind.kind is Kind.GENERIC for guess in commands) and named.count(",") < len(commands)
-        inputs = f" --inputs {shlex.quote(named)}" if plain else ""
+        inputs = f" --inputs {shlex.quote(','.join(self.inputs))}" if self.inputs else ""
         return [
             f"edp inspect {data}{mapped}{inputs}",
             f"edp train {data}{mapped} --config {_quoted(folder / SETTINGS)} --out {run}{repair}",
             f"edp evaluate {run}",
             f"edp report {run}",
         ]
+
+
+def _untold_inputs(proposal: MapProposal) -> tuple[str, ...]:
+    """Channels that command, where all are generic; none where a name has the comma that stands between names."""
+    commands = proposal.of_role("command")
+    names = tuple(guess.channel for guess in commands)
+    plain = all(guess.kind.kind is Kind.GENERIC for guess in commands) and not any("," in name for name in names)
+    return names if plain else ()
 
 
 def _quoted(path: Path) -> str:
@@ -144,7 +150,8 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         files[DATA] = _data_set(recordings, MAP, repair_table(repairs) if apart else {})
     _check(files)
     repairs = () if apart else repairs
-    return LogsProposal(source, group, others, broken, proposal, files, targets, repairs, tuple(notes))
+    inputs = _untold_inputs(proposal)
+    return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
 
 
 def _timed(group: LogGroup, proposal: MapProposal) -> tuple[MapProposal, Timing]:
@@ -397,4 +404,5 @@ def _of_pairs(
     _check(files)
     notes += _notes(group, others, broken, proposal)
     notes.append(f"two experiments stand side by side: columns of '{train}' train, those of '{test}' test")
-    return LogsProposal(source, group, others, broken, proposal, files, targets, repairs, tuple(notes))
+    inputs = _untold_inputs(renamed_proposal)
+    return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))

@@ -91,6 +91,23 @@ def test_files_are_read_by_the_next_commands(cylinder, tmp_path):
     assert set(task.features.channels) <= set(recording.channel_names)
 
 
+def test_commands_name_the_channels_of_experiments_that_stand_side_by_side(tmp_path):
+    draw, columns = np.random.default_rng(3), {}
+    for ending in ("Est", "Val"):
+        lever = np.repeat(draw.uniform(-1.0, 1.0, 40), 25)
+        level = np.convolve(lever, np.full(30, 1 / 30))[: len(lever)] + draw.normal(0.0, 0.01, len(lever))
+        columns |= {f"u{ending}": lever, f"y{ending}": level}
+    times = {"t": np.arange(1000) / 10.0}
+    proposal = propose(write(tmp_path / "both.csv", times | dict(sorted(columns.items()))))
+    write_proposal(proposal, tmp_path / "out")
+    recordings = DataSource.of(tmp_path / "out" / DATA).read()
+    assert [recording.name for recording in recordings] == ["both_est", "both_val"]
+    assert proposal.inputs == ("u",)
+    assert proposal.targets == ("y",)
+    assert all({"u", "y"} == set(recording.channel_names) for recording in recordings)
+    assert proposal.commands(tmp_path / "out")[0].endswith(" --inputs u")
+
+
 def test_nothing_is_replaced_silently(cylinder, tmp_path):
     proposal = propose(cylinder)
     (tmp_path / SETTINGS).write_text("mine = 1\n")
