@@ -79,7 +79,7 @@ def _ticks_of(axis: SeenAxis, series: Series, horizon: int, ticks: int) -> dict[
     then = series.targets[horizon : horizon + ticks, axis.target].astype(np.float64)
     slow = AT_REST * axis.fastest
     still, still_then = np.abs(now) < slow, np.abs(then) < slow
-    found: dict[str, Ticks] = {
+    masks: dict[str, Ticks] = {
         "rest": still & still_then,
         "starting": still & ~still_then,
         "stopping": ~still & still_then,
@@ -89,14 +89,14 @@ def _ticks_of(axis: SeenAxis, series: Series, horizon: int, ticks: int) -> dict[
     if axis.command:
         asked = _signed(series, axis.command, ticks)
         # A lever at neutral says nothing of an axis that stands: `rest` has those ticks.
-        found["dead_band"] = (np.abs(asked) <= axis.dead_band) & ~found["rest"]
+        masks["dead_band"] = (np.abs(asked) <= axis.dead_band) & ~masks["rest"]
     if axis.stroke is not None:
         column, low, high = axis.stroke
         place = series.inputs[:ticks, column].astype(np.float64)
         near = NEAR_STOP * (high - low)
-        found["end_stop"] = (place < low + near) | (place > high - near)
-    found["other"] = ~np.logical_or.reduce(list(found.values()))
-    return found
+        masks["end_stop"] = (place < low + near) | (place > high - near)
+    masks["other"] = ~np.logical_or.reduce(list(masks.values()))
+    return masks
 
 
 def _signed(series: Series, columns: Sequence[int], ticks: int) -> Values:
@@ -108,7 +108,7 @@ def _seen_axes(data: Prepared) -> tuple[SeenAxis, ...]:
     names, roles = [channel.name for channel in data.inputs], roles_of_channels(data.inputs)
     parts = [part for part in (*data.train, *data.validation, *data.test) if part.samples]
     by_velocity: dict[str, Axis] = {axis.velocity: axis for axis in roles.axes if axis.velocity}
-    found = []
+    axes = []
     for number, (name, kind) in enumerate(zip(data.task.targets, data.target_kinds, strict=True)):
         fastest = _fastest(data.test, number) if kind in INTEGRAL else 0.0
         if not fastest:
@@ -118,8 +118,8 @@ def _seen_axes(data: Prepared) -> tuple[SeenAxis, ...]:
         largest = max(
             (float(np.abs(_signed(part, command, part.samples)).max()) for part in parts if command), default=0.0
         )
-        found.append(SeenAxis(number, fastest, _range(data, axis.stroke, kind, parts), command, DEAD_BAND * largest))
-    return tuple(found)
+        axes.append(SeenAxis(number, fastest, _range(data, axis.stroke, kind, parts), command, DEAD_BAND * largest))
+    return tuple(axes)
 
 
 def _fastest(parts: Sequence[Series], column: int) -> float:
@@ -152,15 +152,15 @@ class SituationTally:
         self.ticks, self.errors = np.zeros(shape, dtype=np.int64), np.zeros(shape)
         self.seen, self.scored, self.total = np.zeros(shape, dtype=bool), np.zeros(shape[1]), np.zeros(shape[1])
 
-    def update(self, size: Values, scored: Ticks, found: Sequence[tuple[int, Mapping[str, Ticks]]]) -> None:
+    def update(self, size: Values, scored: Ticks, by_axis: Sequence[tuple[int, Mapping[str, Ticks]]]) -> None:
         """Take in a recording.
 
         Args:
             size: absolute errors in report units ``(tick, target)``.
             scored: ticks that count.
-            found: what `Situations.of` says of the same ticks.
+            by_axis: what `Situations.of` says of the same ticks.
         """
-        for target, ticks_of in found:
+        for target, ticks_of in by_axis:
             self.scored[target] += scored.sum()
             self.total[target] += size[scored, target].sum()
             for name, ticks in ticks_of.items():

@@ -86,7 +86,7 @@ class Ruler:
     def measure(self, predictions: Numbered) -> dict[str, Any]:
         """Scores of one model: overall, by recording with spread, by speed and situation, and of running integrals."""
         tallies = [Tally(self.task.targets) for _ in self.task.horizons]
-        found = [SituationTally(self.task.targets) for _ in self.task.horizons]
+        by_situation = [SituationTally(self.task.targets) for _ in self.task.horizons]
         speeds = [_Speeds(self.edges) for _ in self.task.horizons]
         integrals = {target: np.zeros(2) for target in self.task.integrate}
         by_number: dict[int, dict[str, Any]] = {}
@@ -97,7 +97,7 @@ class Ruler:
                 p, t = self._ticks(predicted[:, h], truth[:, h])
                 tallies[h].update(p, t)
                 speeds[h].update(p, t)
-                self._by_situation(found[h], number, horizon, predicted[:, h], truth[:, h])
+                self._by_situation(by_situation[h], number, horizon, predicted[:, h], truth[:, h])
                 if len(t):
                     by_number.setdefault(number, {})[str(horizon)] = self._of_recording(p, t)
             for target, sums in integrals.items():
@@ -115,7 +115,7 @@ class Ruler:
             "by_speed": {name: speed.rows() for name, speed in zip(names, speeds, strict=True)},
         }
         if self.situations.axes:
-            scores["by_situation"] = {name: tally.rows() for name, tally in zip(names, found, strict=True)}
+            scores["by_situation"] = {name: tally.rows() for name, tally in zip(names, by_situation, strict=True)}
         roots = {target: {"rmse": float(np.sqrt(sums[1] / sums[0]))} for target, sums in integrals.items()}
         return scores | ({"integrated": roots} if roots else {})
 

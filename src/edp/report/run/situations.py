@@ -58,13 +58,13 @@ def situation_sheet(scores: Mapping[str, Any], horizon: int) -> Sheet | None:
 def _best_baseline(models: Mapping[str, Any], horizon: int, targets: list[str]) -> str:
     """The baseline with the least sum of errors, each in those of the network; empty where there is none."""
     ours = models[NETWORK]["overall"].get(str(horizon), {})
-    found: dict[str, float] = {}
+    sums: dict[str, float] = {}
     for name, model in models.items():
         theirs = model["overall"].get(str(horizon), {})
         pairs = [(theirs.get(t, {}).get("mae"), ours.get(t, {}).get("mae")) for t in targets]
         if name != NETWORK and model.get("by_situation") and all(a is not None and b for a, b in pairs):
-            found[name] = sum(a / b for a, b in pairs)
-    return min(found, key=lambda name: found[name], default="")
+            sums[name] = sum(a / b for a, b in pairs)
+    return min(sums, key=lambda name: sums[name], default="")
 
 
 def _ratio(ours: list[float | None], theirs: list[float | None]) -> float | None:
