@@ -92,9 +92,9 @@ def _ticks_of(axis: SeenAxis, series: Series, horizon: int, ticks: int) -> dict[
         masks["dead_band"] = (np.abs(asked) <= axis.dead_band) & ~masks["rest"]
     if axis.stroke is not None:
         column, low, high = axis.stroke
-        place = series.inputs[:ticks, column].astype(np.float64)
+        position = series.inputs[:ticks, column].astype(np.float64)
         near = NEAR_STOP * (high - low)
-        masks["end_stop"] = (place < low + near) | (place > high - near)
+        masks["end_stop"] = (position < low + near) | (position > high - near)
     masks["other"] = ~np.logical_or.reduce(list(masks.values()))
     return masks
 
