@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from edp.sim import EXCITATIONS, Scenario, Simulation, load_machine
 from edp.sim.excitation.levers import dead_lever, speed_table
@@ -22,7 +23,16 @@ def run(family, seconds, seed=1):
 
 
 def test_the_families_of_the_design_are_there():
-    assert set(EXCITATIONS) >= {"isolated", "combined", "aprbs", "reversals", "end_stops", "grading", "dig"}
+    assert set(EXCITATIONS) >= {
+        "isolated",
+        "combined",
+        "aprbs",
+        "reversals",
+        "end_stops",
+        "grading",
+        "dig",
+        "broadband",
+    }
 
 
 def test_inverse_kinematics_undo_forward_kinematics():
@@ -68,6 +78,31 @@ def test_steps_take_nine_levels_around_the_dead_band_and_chirps_reach_5_hz():
     assert np.sum(np.abs(steps) < dead[0].min()) == 3
     turns = np.abs(np.diff(np.sign(np.diff(levers, axis=0)), axis=0)) > 1
     assert max(turns[k : k + 100].sum(axis=0).max() for k in range(0, len(turns), 50)) >= 8
+
+
+def test_broadband_commands_are_flat_to_4_hz_and_of_different_courses():
+    """Within 10 dB from 0.1 to 4 Hz on every axis, by demands as logs have them; axes are not the same signal."""
+    simulation = run("broadband", 120.0, seed=3)
+    demand = simulation.log[:, at.LOG_DEMAND : at.LOG_DEMAND + 3]
+    frequency, density = signal.welch(demand, fs=100.0, nperseg=1000, axis=0)
+    used = density[(frequency >= 0.1) & (frequency <= 4.0)]
+    drop = 10.0 * np.log10(used.max(axis=0) / used.min(axis=0))
+    assert (drop < 10.0).all(), drop
+    beyond = density[frequency > 8.0].max(axis=0)
+    assert (10.0 * np.log10(used.min(axis=0) / beyond) > 10.0).all(), "no power is wasted where no valve follows"
+    assert np.abs(np.corrcoef(demand.T) - np.eye(3)).max() < 0.2
+    courses = simulation.targets[: 12 * 1000].reshape(12, 1000, 3)
+    assert np.abs(np.corrcoef(courses[0, :, 0], courses[1, :, 0])[0, 1]) < 0.3
+
+
+def test_broadband_holds_at_low_rates():
+    """At 5 Hz no sine is faster than what the rate shows; the levers still move and stay on the lever."""
+    operator = EXCITATIONS["broadband"](np.random.default_rng(0), 5.0, MACHINE)
+    view = view_of(Simulation(Scenario()).plant)
+    levers = np.concatenate([operator.block(view) for _ in range(120)])
+    assert len(levers) == 120
+    assert np.abs(levers).max() <= 1.0
+    assert levers.std(axis=0).min() > 0.05
 
 
 def test_grading_draws_straight_lines_at_constant_attitude():

@@ -89,6 +89,7 @@ def evaluate(
         if lost:
             out.print(lost, style="bold red")
         score_table(scores)
+        by_situation_table(scores)
         for line in (promise, beyond, judged):
             if line:
                 out.print(line)
@@ -231,6 +232,17 @@ def score_table(scores: dict[str, Any]) -> None:
     for name, model in scores["models"].items():
         for target, integral_scores in model.get("integrated", {}).items():
             out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g} {unit} s")
+
+
+def by_situation_table(scores: dict[str, Any]) -> None:
+    """Print where the network's error is by what the axes did, at its furthest horizon, where the scores tell."""
+    from edp.report.run.situations import situation_sheet
+
+    horizon = max(scores["task"]["horizons"])
+    sheet = situation_sheet(scores, horizon)
+    if sheet is not None:
+        heads = [f"{column.heading}{f', {column.unit}' if column.unit else ''}" for column in sheet.columns]
+        table(f"{sheet.caption}, k = {horizon}", heads, [list(row) for row in sheet.texts()])
 
 
 def _tables_by_output(scores: dict[str, Any], rate: float) -> None:

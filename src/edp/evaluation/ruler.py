@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from edp.data.prepared import Prepared
 from edp.errors import DataError
+from edp.evaluation.by_situation import Situations, SituationTally
 from edp.evaluation.tally import Tally, Values, named_scores
 from edp.signals import KINDS
 from edp.stats.metrics import interval_scores, score, spread
@@ -44,6 +45,7 @@ class Ruler:
                 f"no tick of the test recordings can be scored: the longest has {max(ticks)} ticks "
                 f"before the horizon, the first {skip} are start-up; give longer recordings"
             )
+        self.situations = Situations(data)
         speeds, first = QuantileSketch(), self.task.horizons[0]
         for series, count in zip(data.test, ticks, strict=True):
             if count > skip:
@@ -82,8 +84,9 @@ class Ruler:
         }
 
     def measure(self, predictions: Numbered) -> dict[str, Any]:
-        """Scores of one model: overall, by recording with spread, by speed, and of running integrals."""
+        """Scores of one model: overall, by recording with spread, by speed and situation, and of running integrals."""
         tallies = [Tally(self.task.targets) for _ in self.task.horizons]
+        by_situation = [SituationTally(self.task.targets) for _ in self.task.horizons]
         speeds = [_Speeds(self.edges) for _ in self.task.horizons]
         integrals = {target: np.zeros(2) for target in self.task.integrate}
         by_number: dict[int, dict[str, Any]] = {}
@@ -94,6 +97,7 @@ class Ruler:
                 p, t = self._ticks(predicted[:, h], truth[:, h])
                 tallies[h].update(p, t)
                 speeds[h].update(p, t)
+                self._by_situation(by_situation[h], number, horizon, predicted[:, h], truth[:, h])
                 if len(t):
                     by_number.setdefault(number, {})[str(horizon)] = self._of_recording(p, t)
             for target, sums in integrals.items():
@@ -110,6 +114,8 @@ class Ruler:
             "spread": {name: spread(values) for name, values in errors.items()},
             "by_speed": {name: speed.rows() for name, speed in zip(names, speeds, strict=True)},
         }
+        if self.situations.axes:
+            scores["by_situation"] = {name: tally.rows() for name, tally in zip(names, by_situation, strict=True)}
         roots = {target: {"rmse": float(np.sqrt(sums[1] / sums[0]))} for target, sums in integrals.items()}
         return scores | ({"integrated": roots} if roots else {})
 
@@ -142,12 +148,25 @@ class Ruler:
     def _named(self, values: Values) -> dict[str, float]:
         return {"mean": float(np.mean(values)), **dict(zip(self.task.targets, map(float, values), strict=True))}
 
-    def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Scored ticks: after start-up and where the model has its history."""
-        predicted, truth = predicted[self.skip :], truth[self.skip :]
+    def _by_situation(
+        self, tally: SituationTally, number: int, horizon: int, predicted: NDArray[Any], truth: NDArray[Any]
+    ) -> None:
+        """Add one recording's errors at one horizon."""
+        if self.situations.axes:
+            ticks_of = self.situations.of(self.data.test[number], horizon, len(truth))
+            tally.update(np.abs(predicted - truth), self._scored(predicted), ticks_of)
+
+    def _scored(self, predicted: NDArray[Any]) -> NDArray[np.bool_]:
+        """Ticks after start-up at which the model has its history."""
         # A baseline without its history says NaN; a tick counts only where all targets are predicted.
-        predicted_ticks = np.isfinite(predicted).all(axis=1)
-        return predicted[predicted_ticks], truth[predicted_ticks]
+        scored: NDArray[np.bool_] = np.isfinite(predicted).all(axis=1)
+        scored[: self.skip] = False
+        return scored
+
+    def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Scored ticks of both."""
+        scored = self._scored(predicted)
+        return predicted[scored], truth[scored]
 
     def _of_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> dict[str, Any]:
         """All scores of the mean over outputs; of each output the error alone: runs have hundreds of recordings."""

