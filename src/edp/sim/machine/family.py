@@ -225,7 +225,7 @@ def _friction(base: Machine, s: float, draws: Draws) -> Any:
 
 def _pumps(base: Machine, s: float, draws: Draws) -> Any:
     pumps = base.pumps
-    return replace(
+    scaled = replace(
         pumps,
         max_flow=pumps.max_flow * s**2 * draws.uniform(0.93, 1.07),
         volumetric_efficiency=draws.wear(0.90, 0.98),
@@ -235,6 +235,9 @@ def _pumps(base: Machine, s: float, draws: Draws) -> Any:
         relief_slope=pumps.relief_slope * s**2,
         bypass=(pumps.bypass[0] * s**2, pumps.bypass[1]),
     )
+    # Of an engine, power over that of the pumps and energy of its wheel a watt stay.
+    share = scaled.power_limit / pumps.power_limit
+    return replace(scaled, engine_power=pumps.engine_power * share, engine_inertia=pumps.engine_inertia * share)
 
 
 def _ratings(ratings: Ratings, factor: Any) -> Ratings:

@@ -93,7 +93,16 @@ class Oil:
 
 @dataclass(frozen=True)
 class Pumps:
-    """Two equal pumps with electronic positive control; SI units."""
+    """Two equal pumps with electronic positive control; SI units.
+
+    The numbers of the engine may be left out; then it turns at one speed, whatever the load.
+
+    Attributes:
+        engine_droop: share of the governed speed by which the engine falls from no load to its full power.
+        engine_power: its full power, W.
+        engine_inertia: of engine, flywheel and pumps, kg m^2.
+        engine_speed_rpm: governed speed without load, 1/min; `max_flow` belongs to it.
+    """
 
     max_flow: float
     volumetric_efficiency: float
@@ -105,6 +114,10 @@ class Pumps:
     relief_slope: float
     bypass: Rating
     bypass_closed_at: float
+    engine_droop: float = 0.0
+    engine_power: float = 0.0
+    engine_inertia: float = 0.0
+    engine_speed_rpm: float = 0.0
 
 
 @dataclass(frozen=True)

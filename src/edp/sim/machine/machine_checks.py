@@ -106,6 +106,10 @@ BOUNDS: Mapping[str, ParameterBound] = {
     "pumps.relief": POSITIVE,
     "pumps.relief_slope": POSITIVE,
     "pumps.bypass_closed_at": SOME_SHARE,
+    "pumps.engine_droop": ParameterBound(0.0, 0.5),
+    "pumps.engine_power": NOT_NEGATIVE,
+    "pumps.engine_inertia": ParameterBound(0.0, 1e4),
+    "pumps.engine_speed_rpm": ParameterBound(0.0, 1e4),
     "valves.pilot_pressure": POSITIVE,
     "valves.pilot_frequency": FREQUENCY,
     "valves.spool_frequency": FREQUENCY,
@@ -238,6 +242,7 @@ def _check_pairs(machine: Machine, where: str) -> None:
                 f"machine file {where} [cylinders]: cushion_length[{name}] = {cylinders.cushion_length[i]!r} m must be "
                 f"at most half of stroke[{name}] = {cylinders.stroke[i]!r} m"
             )
+    _check_engine(machine, where)
     for key, (low, high) in (
         ("pressure_offset", machine.sensors.pressure_offset),
         ("can_latency", machine.sensors.can_latency),
@@ -250,6 +255,23 @@ def _check_pairs(machine: Machine, where: str) -> None:
         raise ConfigError(
             f"machine file {where} [friction]: static_fraction = {friction.static_fraction!r} must be at least "
             f"coulomb_fraction = {friction.coulomb_fraction!r}"
+        )
+
+
+def _check_engine(machine: Machine, where: str) -> None:
+    """All numbers of the engine or none, and power enough for the pumps: they would stall it otherwise."""
+    pumps = machine.pumps
+    keys = ("engine_droop", "engine_power", "engine_inertia", "engine_speed_rpm")
+    absent = [key for key in keys if getattr(pumps, key) == 0.0]
+    if absent and len(absent) < len(keys):
+        raise ConfigError(
+            f"machine file {where} [pumps]: {', '.join(absent)} must be above 0 where the other numbers of the engine "
+            f"are; give all of {', '.join(keys)}, or none for an engine that turns at one speed"
+        )
+    if not absent and pumps.engine_power < pumps.power_limit:
+        raise ConfigError(
+            f"machine file {where} [pumps]: engine_power = {pumps.engine_power!r} W must be at least power_limit = "
+            f"{pumps.power_limit!r} W, or the pumps stall the engine"
         )
 
 

@@ -142,7 +142,10 @@ def _pack_supply(machine: Machine, plant: Array) -> None:
     plant[at.REGEN_CHECK] = valves.check_leakage
     plant[at.ANTI_CAVITATION] = conductance(valves.anti_cavitation)
     plant[at.PORT_SLOPE] = valves.port_relief_slope
-    plant[at.MAX_FLOW] = pumps.max_flow
+    plant[at.MAX_FLOW] = plant[at.RATED_FLOW] = pumps.max_flow
+    plant[at.ENGINE_SPEED] = 1.0
+    plant[at.ENGINE_DROOP], plant[at.ENGINE_POWER] = pumps.engine_droop, pumps.engine_power
+    plant[at.ENGINE_ENERGY] = pumps.engine_inertia * (pumps.engine_speed_rpm * math.pi / 30.0) ** 2
     plant[at.EFFICIENCY] = plant[at.EFFICIENCY_2] = pumps.volumetric_efficiency
     plant[at.POWER_LIMIT] = pumps.power_limit
     plant[at.MIN_DISPLACEMENT] = pumps.min_displacement

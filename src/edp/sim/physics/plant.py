@@ -12,7 +12,7 @@ from edp.errors import ConfigError
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
-from edp.sim.physics import dynamics, integrator, linkage, soil, terrain, terramechanics, thermal, valve
+from edp.sim.physics import dynamics, engine, integrator, linkage, soil, terrain, terramechanics, thermal, valve
 from edp.sim.physics.jit import compiled, inlined
 from edp.sim.sensors import logbook
 
@@ -63,6 +63,8 @@ def run_sample(
     time_s = clocks[0][0] * clocks[0][1]
     # Once a sample: the oil's temperature changes over minutes.
     thermal.warm(row, axes, plant, time_s)
+    # Once a sample, too: governor and inertia make tens of milliseconds.
+    engine.turn(row, plant, time_s)
     near, fine = False, near_end(row, axes)
     if ground[0][terramechanics.ACTIVE] > 0.0:
         near, touching = terrain.look(row, time_s, axes, ground)
@@ -213,6 +215,11 @@ class Plant:
         """Strokes as a share of each cylinder's stroke, shape (3,)."""
         lengths = [linkage.cylinder(i, self.state[at.PSI + i], self.plant)[0] for i in range(at.AXES)]
         return (np.array(lengths) - self.axes[:, at.CLOSED]) / self.axes[:, at.STROKE]
+
+    @property
+    def engine_speed(self) -> float:
+        """Speed of the engine as a share of the governed one; 1 where it has no droop."""
+        return float(self.plant[at.ENGINE_SPEED])
 
     @property
     def past(self) -> Array:
