@@ -26,6 +26,8 @@ _FEW = 12
 """Distinct values of a label at most."""
 _SLOW = 2e-3
 """Changes a row of a label at most: operators switch seldom."""
+_REMARKS_FILL, _REMARKS_SPAN = 0.1, 0.2
+"""Largest share of rows with a number, and of rows from the first to the last of them, of a list beside a table."""
 _SPANS = (1, 4, 16)
 """Rows over which a change is compared with a velocity: noise hides it over one, motion over many."""
 
@@ -47,6 +49,7 @@ class Behaviour:
         step: median of the steps that are not zero, 0 where there are none.
         even: nearly all steps have one size.
         steady: nearly all steps are between half and twice their median, as those of a clock that waits for others.
+        spanned: share of rows between the first and the last one that hold a number.
         restarts: rows at which an even rise begins anew.
         coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
     """
@@ -65,11 +68,17 @@ class Behaviour:
     restarts: int
     coarse: bool = False
     steady: bool = False
+    spanned: float = 1.0
 
     @property
     def counts(self) -> bool:
         """Rows are numbered, or parts of the log are: whole numbers that rise by one."""
         return self.whole and self.rises and not self.constant and abs(self.step - 1.0) < 1e-9
+
+    @property
+    def beside(self) -> bool:
+        """A few numbers in some rows on end, as a list of results that was written next to the table."""
+        return 0 < self.filled < _REMARKS_FILL and self.spanned < _REMARKS_SPAN
 
     @property
     def switches(self) -> bool:
@@ -123,6 +132,7 @@ def behaviour_of(column: LogColumn) -> Behaviour:
         restarts=falls if step > 0 and falls and float(near.mean()) > 0.9 else 0,
         coarse=levels > 4 and len(sizes) > 0 and float(np.mean(sizes <= 1.1 * least)) > 0.9,
         steady=step > 0 and float(paced.mean()) > 0.95,
+        spanned=float(np.ptp(np.flatnonzero(np.isfinite(values))) + 1) / len(values),
     )
 
 
