@@ -119,3 +119,16 @@ def test_units_that_are_not_known_are_no_clash_where_no_map_was_given(tmp_path):
     rows = [(f"{k / 100:.2f}", f"{v:.4f}", f"{1500 + 90 * v:.2f}") for k, v in enumerate(swing(800))]
     report = inspect_log(rows_of(tmp_path / "a.csv", [("time", "pull [kgf]", "servo [us]")], rows))
     assert not any("the map says" in finding.what for finding in report.findings)
+
+
+def test_an_axis_that_rests_in_the_first_log_is_that_of_another_one(tmp_path):
+    """A rig that is tested one axis a log."""
+    count = 1500
+    for number in (1, 2):
+        moved = 100 * swing(count)
+        rest = np.full(count, 40.0)
+        axes = (moved, rest) if number == 1 else (rest, moved)
+        rows = [(f"{k / 100:.2f}", f"{axes[0][k]:.3f}", f"{axes[1][k]:.3f}") for k in range(count)]
+        rows_of(tmp_path / f"axis_{number}.csv", [("time", "stroke_1 [mm]", "stroke_2 [mm]")], rows)
+    found = guesses(propose(tmp_path))
+    assert found["stroke_1"][:2] == found["stroke_2"][:2] == ("measured", "position")

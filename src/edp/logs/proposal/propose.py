@@ -78,13 +78,14 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
     Args:
         look: the columns.
         common: columns that all logs of a group have; None for all of this log. Others become no channels.
-        beside: further logs of the group: a column that repeats another one does so in each.
+        beside: further logs of the group: a column that repeats another one does so in each, and one that rests does.
     """
     behaviours = {column.name: behaviour_of(column) for column in look.columns}
     clock = clock_of(look, behaviours)
     families = Counter(tag_family(column.name) for column in look.columns)
     moving = [c for c in look.columns if _is_free(c, behaviours[c.name], clock)]
     relations = relations_of(moving)
+    behaviours = _where_they_move(behaviours, beside)
     kinds = {c.name: kind_of(c, behaviours[c.name], families[tag_family(c.name)]) for c in look.columns}
     for name, relation in relations.items():
         change = kind_of_change(relation, kinds[relation.other], clock.rate_hz)
@@ -114,6 +115,21 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
 _NO_KIND = KindGuess(Kind.GENERIC, "1", 1.0, "")
 _EMPTY = "empty"
 """Why a column is a constant: no row holds a number."""
+
+
+def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) -> dict[str, Behaviour]:
+    """Behaviours of columns, of another log of the group where they rest, or move in steps only, in the first.
+
+    A machine is often tested one axis a log.
+    """
+    moving = dict(behaviours)
+    for column in (column for look in beside for column in look.columns):
+        known = moving.get(column.name)
+        if known is not None and (known.constant or known.steps):
+            other = behaviour_of(column)
+            more = not other.constant if known.constant else not (other.constant or other.steps)
+            moving[column.name] = other if more else known
+    return moving
 
 
 def _is_free(column: LogColumn, behaviour: Behaviour, clock: ClockGuess) -> bool:
