@@ -132,3 +132,15 @@ def test_an_axis_that_rests_in_the_first_log_is_that_of_another_one(tmp_path):
         rows_of(tmp_path / f"axis_{number}.csv", [("time", "stroke_1 [mm]", "stroke_2 [mm]")], rows)
     found = guesses(propose(tmp_path))
     assert found["stroke_1"][:2] == found["stroke_2"][:2] == ("measured", "position")
+
+
+def test_velocities_of_all_axes_are_predicted_where_one_of_them_shows_what_they_are(tmp_path):
+    """Joints as robots log them: q1, q2, and qd1, qd2, of which the second is too noisy to show whose change it is."""
+    count = 3000
+    one, two = swing(count), 0.3 * swing(count, 130.0)
+    noise = np.random.default_rng(0).normal(0, 0.05, count)
+    columns = {"time": np.arange(count) / 100, "q1": one, "q2": two}
+    columns |= {"qd1": np.gradient(one) * 100, "qd2": np.gradient(two) * 100 + 40 * noise}
+    rows = [[f"{column[k]:.6f}" for column in columns.values()] for k in range(count)]
+    proposal = propose(rows_of(tmp_path / "arm.csv", [tuple(columns)], rows))
+    assert proposal.targets == ("qd1", "qd2")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -163,7 +164,15 @@ def relations_of(columns: list[LogColumn]) -> dict[str, Relation]:
         order = sorted(candidates, key=lambda relation: (relation.how != "copy", -relation.strength))
         if order:
             found_relations[column.name] = order[0]
-    return found_relations
+    return {name: relation for name, relation in found_relations.items() if not _is_turned_round(name, found_relations)}
+
+
+def _is_turned_round(name: str, relations: Mapping[str, Relation]) -> bool:
+    """Whether a column passes for the change of its own change: in a steady swing each is the change of the other."""
+    relation = relations[name]
+    back = relations.get(relation.other)
+    mutual = back is not None and relation.how == back.how == "change" and back.other == name
+    return mutual and back is not None and relation.strength < back.strength
 
 
 def _relation(column: LogColumn, other: LogColumn) -> Relation | None:
