@@ -52,7 +52,7 @@ KINDS: Mapping[Kind, KindFacts] = {
     Kind.PRESSURE: KindFacts("Pa", "bar", 1e-5, (-2e5, 1e8), 1e7),
     Kind.PILOT_PRESSURE: KindFacts("Pa", "bar", 1e-5, (-2e5, 1e7), 2e6),
     Kind.ANGLE: KindFacts("rad", "deg", 57.29577951308232, (-100.0, 100.0), 1.0, bounded=True),
-    Kind.ANGULAR_VELOCITY: KindFacts("rad/s", "deg/s", 57.29577951308232, (-100.0, 100.0), 0.2),
+    Kind.ANGULAR_VELOCITY: KindFacts("rad/s", "deg/s", 57.29577951308232, (-2100.0, 2100.0), 0.2),
     Kind.FORCE: KindFacts("N", "kN", 1e-3, (-1e7, 1e7), 1e5),
     Kind.FLOW: KindFacts("m^3/s", "L/min", 6e4, (-1.0, 1.0), 3e-3),
     Kind.MASS: KindFacts("kg", "kg", 1.0, (-1e5, 1e6), 1e3),

@@ -154,3 +154,43 @@ def test_rows_of_text_before_numbers_are_not_left_out(read):
     text = "time;a;b\n" + lines(lambda i: f"{i};off;off", 8) + lines(lambda i: f"{8 + i};1;2")
     with pytest.raises(DataError, match="holds text 'off' in line 2"):
         read(text, SignalMap((ChannelMap("a", "a"),)))
+
+
+def scope(delimiter: str = "\t", comma: str = ",", padded: bool = True) -> str:
+    """An export of TwinCAT Scope: a channel at 5 kHz, then two at 1 kHz under one time."""
+    facts = [
+        ("Name", "fast valve", "Name", "p A", "stroke"),
+        ("SymbolComment", "", "SymbolComment", "", ""),
+        ("Data-Type", "REAL32", "Data-Type", "REAL64", "REAL64"),
+        ("SampleTime[ms]", f"0{comma}2", "SampleTime[ms]", "1", "1"),
+        ("Unit", "(None)", "Unit", "bar (Pressure)", "mm (Length)"),
+        ("Unit Offset", "0", "Unit Offset", "0", "0"),
+    ]
+    rows = []
+    for k in range(500):
+        slow = (str(k), f"{100 + k}{comma}5", str(k % 7)) if k < 100 else (" ",) * 3 if padded else ()
+        rows.append((f"{0.2 * k:.1f}".replace(".", comma), str(k), *slow))
+    head = f"Name{delimiter}run\nStarttime of export{delimiter}1329{delimiter}Montag, 2. Mai\n\n"
+    table = "".join(delimiter.join(row) + "\n" for row in facts) + "\n"
+    return head + table + "".join(delimiter.join(row) + "\n" for row in rows) + "EOF\n"
+
+
+@pytest.mark.parametrize(("delimiter", "comma", "padded"), [("\t", ",", True), (";", ",", False), (",", ".", False)])
+def test_exports_of_a_scope_have_a_time_for_each_group_of_channels(read, delimiter, comma, padded):
+    made = read(scope(delimiter, comma, padded))
+    assert made.channel_names == ("fast valve", "p A", "stroke")
+    assert made.rate_hz == pytest.approx(5000.0)
+    # 0 to 99 ms are known of all; the slow ones hold for five rows.
+    np.testing.assert_allclose(made.values[:12, 1], np.repeat([100.5e5, 101.5e5, 102.5e5], 5)[:12])
+    np.testing.assert_allclose(made.values[-1], [495, 199.5e5, 99 % 7 * 1e-3], rtol=1e-6)
+
+
+def test_an_export_of_a_scope_whose_delimiter_is_in_its_cells_is_refused(read):
+    with pytest.raises(DataError, match="export it with a tab or a semicolon"):
+        read(scope(","))
+
+
+@pytest.mark.parametrize("bad", ["1\t2\tnot a number\t3\t4", "1\t2\t3\t4\t5\t6\t7"])
+def test_a_damaged_export_of_a_scope_is_refused(read, bad):
+    with pytest.raises(DataError, match="TwinCAT Scope"):
+        read(scope().replace("EOF", f"{bad}\nEOF"))

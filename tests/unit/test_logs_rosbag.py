@@ -244,3 +244,34 @@ def test_files_that_cannot_be_read_say_why(tmp_path):
     next(folder.glob("*.db3")).unlink()
     with pytest.raises(DataError, match="database files are missing"):
         read_recording(folder)
+
+
+def plan(bag, topic="/plan"):
+    """A message that holds a whole plan of a motion, as planners publish it."""
+    kinds = bag.store.types
+    point = kinds["trajectory_msgs/msg/JointTrajectoryPoint"]
+    span = kinds["builtin_interfaces/msg/Duration"](sec=1, nanosec=0)
+    one = point(
+        positions=np.zeros(3),
+        velocities=np.zeros(3),
+        accelerations=np.zeros(3),
+        effort=np.zeros(0),
+        time_from_start=span,
+    )
+    fields = {"header": bag.header(START_NS), "joint_names": ["a", "b", "c"], "points": [one] * 12_000}
+    bag.put(topic, "trajectory_msgs/msg/JointTrajectory", START_NS, **fields)
+
+
+def test_a_plan_beside_sensors_is_passed_over(tmp_path):
+    bag = Bag(tmp_path, "db3")
+    plan(bag)
+    for k in range(50):
+        bag.put("/p", "std_msgs/msg/Float64", START_NS + k * STEP_NS, data=float(k))
+    assert read_recording(bag.file(), SignalMap(others=True)).channel_names == ("p",)
+
+
+def test_a_bag_of_nothing_but_a_plan_says_so(tmp_path):
+    bag = Bag(tmp_path, "db3")
+    plan(bag)
+    with pytest.raises(DataError, match="is a list of many numbers, such as a plan"):
+        read_recording(bag.file(), SignalMap(others=True))

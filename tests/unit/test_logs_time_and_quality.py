@@ -9,6 +9,7 @@ import pytest
 
 from edp.errors import ConfigError, DataError
 from edp.logs import Repair, inspect, inspect_log, read_recording, split_at_gaps
+from edp.logs.timebase import judge
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
 
@@ -31,6 +32,27 @@ def test_rounded_stamps_are_uniform_by_row(tmp_path):
     read = read_recording(path)
     assert read.samples == 4000
     assert read.rate_hz == pytest.approx(128, rel=1e-3)
+
+
+def test_stamps_of_a_coarse_clock_are_uniform_by_row():
+    """Whatever the step of the clock is: 0.3 to 0.8 of it off what is printed, and finer at the beginning."""
+    time = np.arange(3000) / 4800
+    stamps = np.where(time < 0.05, np.round(time, 4), 0.0003 + np.floor(time * 1000) / 1000)
+    clock = judge(stamps, "a log")
+    assert clock.uniform
+    assert clock.rate_hz == pytest.approx(4800, rel=2e-3)
+
+
+@pytest.mark.parametrize("hole", [40, 400])
+def test_stamps_of_a_coarse_clock_with_rows_lost_are_not_uniform(hole):
+    rows = np.delete(np.arange(3000), np.arange(1000, 1000 + hole))
+    clock = judge(np.floor(rows / 4.8) / 1000, "a log")
+    assert not clock.uniform
+
+
+def test_rows_that_come_twice_are_not_a_coarse_clock():
+    rows = np.sort(np.concatenate([np.arange(600), np.arange(100, 400)]))
+    assert len(judge(rows / 100, "a log").duplicates) == 300
 
 
 def test_small_jitter_is_uniform_and_keeps_every_row(tmp_path):

@@ -3,7 +3,8 @@
 The rule, in order:
 
 1. Rows are taken as uniform, at the mean rate, where the stamps lie within 5 % of a step (rms) and never half a
-   step off a straight line, or within half a unit of their last printed digit of it (stamps rounded by a logger).
+   step off a straight line, or within half a unit of their last printed digit of it (stamps rounded by a logger),
+   or, where many repeat, within half of the step between those that differ.
 2. Otherwise, or where another rate is wanted, a uniform grid starts at the first stamp and each tick takes the
    latest sample whose stamp is not later than the tick (zero-order hold, causal: no future sample is ever used).
 3. A jump of more than 5 median steps and more than 50 ms is a gap: its last sample is held for one step, later
@@ -39,6 +40,10 @@ _SAME_TICK = 1e-6
 """Share of a tick by which a stamp may be late through rounding."""
 _EVEN = 1e-4
 """Share of a step below which all distances from a line are rounding."""
+_REPEATED = 0.3
+"""Share of rows that repeat a stamp, from which the clock is coarser than the rows."""
+_MOST_REPEATS = 1000
+"""Rows that one stamp may stand for."""
 _MIN_ROLLOVERS = 5
 """Ticks by which a rounded rate must leave the grid behind before lost rows are ruled out."""
 
@@ -111,7 +116,8 @@ def judge(stamps: Stamps, where: str) -> Clock:
     off = stamps - (start + step * np.arange(len(stamps))) if step > 0 else np.full(len(stamps), np.inf)
     jitter = float(np.sqrt(np.mean(off**2)) / step) if step > 0 else float("inf")
     near = jitter <= UNIFORM_RMS and float(np.abs(off).max()) <= UNIFORM_MAX * step
-    if not near and step > 0 and (rounded_line := _rounded_line(stamps, median)) is not None:
+    rounded_line = None if near or step <= 0 else _rounded_line(stamps, median) or _repeated_line(stamps, steps)
+    if rounded_line is not None:
         near, (start, step) = True, rounded_line
     if near:
         rate = nice_rate(step, len(stamps), jitter)
@@ -177,6 +183,29 @@ def _rounded_line(stamps: Stamps, median: float) -> tuple[float, float] | None:
         digit = _printed_digit(stamps[part], floor=0.02 * step)
         if float(off[part].max()) > 0.51 * digit + UNIFORM_RMS * step:
             return None
+    return mean + step * float(rows[0]), step
+
+
+def _repeated_line(stamps: Stamps, steps: Stamps) -> tuple[float, float] | None:
+    """Start and step of the line that stamps of a coarse clock follow, which repeat for some rows; None for others.
+
+    Exports that keep some digits of a number do that, whatever the last digit is worth. A row that was lost within a
+    step of the clock cannot be told from one that was not.
+    """
+    largest = float(steps.max())
+    rising = steps[steps > 0]
+    if float(steps.min()) < 0 or len(rising) > (1.0 - _REPEATED) * len(steps):
+        return None
+    # One long step is a gap; many of one length are the clock's own.
+    if float(np.mean(rising > 0.7 * largest)) < 0.2 or len(steps) > _MOST_REPEATS * len(rising):
+        return None
+    rows = np.arange(len(stamps)) - 0.5 * (len(stamps) - 1)
+    mean = float(stamps.mean())
+    step = float(rows @ (stamps - mean) / (rows @ rows))
+    off = np.abs(stamps - mean - step * rows)
+    # A step that holds one row or two is a row late or early, not a stamp of many rows.
+    if largest < 1.5 * step or float(off.max()) > 0.6 * largest:
+        return None
     return mean + step * float(rows[0]), step
 
 

@@ -36,10 +36,22 @@ ALIASES = {
     "U/min": "rpm",
     "1/min": "rpm",
     "min-1": "rpm",
+    "RPM": "rpm",
+    "r/min": "rpm",
+    "rev/min": "rpm",
     "Grad": "deg",
     "grad": "deg",
 }
 """Spellings in files, each with the usual name."""
+
+OTHER_UNITS = frozenset(
+    [
+        *("N·m", "Nm", "N*m", "N.m", "Ncm", "kN·m", "kNm", "kgf", "gf", "lbf", "N/m"),
+        *("W", "kW", "VA", "Wh", "kWh", "J", "kJ", "kgf/W", "Hz", "kHz", "MHz", "dB", "ohm", "Ω", "kΩ"),
+        *("L", "l", "mL", "ml", "µm", "um", "nm", "inch", "in", "ft", "lb", "lbs", "counts", "digit"),
+    ]
+)
+"""Units of quantities that have no kind here: their numbers are taken as they are, and they end no name."""
 
 
 def normalise_unit(text: str | None) -> str | None:

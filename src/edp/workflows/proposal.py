@@ -210,11 +210,19 @@ def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
         notes.append("no column looks measured: check task.targets")
     # A change of another column is a velocity, whatever its unit.
     changes = [guess for guess in measured if guess.relation is not None and guess.relation.how == "change"]
+    # Where one of a row of axes shows it, its brothers are velocities, too.
+    families = {_stem(guess.column) for guess in changes}
+    changes = [guess for guess in measured if guess in changes or _stem(guess.column) in families]
     by_kind = [[g for g in measured if g.kind.kind in kinds] for kinds in _TARGETS]
     chosen = next((guesses for guesses in [by_kind[0], by_kind[1], changes, *by_kind[2:]] if guesses), list(measured))
     if len(chosen) > MOST_TARGETS:
         notes.append(f"{len(chosen)} columns could be predicted; the first {MOST_TARGETS} are (task.targets)")
     return tuple(guess.channel for guess in chosen[:MOST_TARGETS]), notes
+
+
+def _stem(name: str) -> str:
+    """A name without the number of an axis; of names that end with none the name itself."""
+    return name.rstrip("0123456789") or name
 
 
 def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str], proposal: MapProposal) -> list[str]:

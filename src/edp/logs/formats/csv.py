@@ -30,8 +30,9 @@ from edp.logs.formats.base import (
 )
 from edp.logs.formats.csv_dates import dates_of
 from edp.logs.formats.csv_preamble import TablePlace, find_table
+from edp.logs.formats.csv_scope import read_scope, scope_head
 from edp.logs.formats.csv_table import CsvTable, TextLayout, is_grouped, is_number
-from edp.logs.units import normalise_unit
+from edp.logs.units import OTHER_UNITS, normalise_unit
 from edp.recording import Recording
 from edp.signals import TIME_UNITS, UNITS, SignalMap
 
@@ -68,6 +69,9 @@ class CsvFormat:
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read a text file; empty cells are missing values."""
+        lines, _, encoding, *_ = _first_lines(path)
+        if (head := scope_head(path, lines)) is not None:
+            return read_scope(path, head, lines[head.lines :], encoding)
         layout = _layout(path, signal_map)
         table = CsvTable(path, layout)
         names = [name for name in layout.names if name]
@@ -136,7 +140,7 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
         names, units, more = _header(rows[table_place.header :])
         used = table_place.first if named else table_place.header + more
         if named:
-            units = _units_between(rows[table_place.header + 1 : table_place.first], units)
+            units = _units_above(rows[: table_place.header], _units_between(rows[table_place.header + 1 : used], units))
         body = rows[used:]
     skip += ends[used - 1] if used else 0
     numeric = tuple(all(is_number(row[i], decimal) for row in body if i < len(row)) for i in range(len(names)))
@@ -189,6 +193,16 @@ def _units_between(rows: list[list[str]], units: tuple[str | None, ...]) -> tupl
             cells = [normalise_unit(cell.strip().strip("[]()")) for cell in row]
             return tuple(cells[i] or unit if i < len(cells) else unit for i, unit in enumerate(units))
     return units
+
+
+def _units_above(rows: list[list[str]], units: tuple[str | None, ...]) -> tuple[str | None, ...]:
+    """Units from the row above the names, which some loggers write there; only where no name states any."""
+    if not rows or any(units) or len(rows[-1]) != len(units):
+        return units
+    cells = [normalise_unit(cell.strip().strip("[]()")) for cell in rows[-1]]
+    known = [cell for cell in cells if cell in UNITS or cell in TIME_UNITS or cell in OTHER_UNITS]
+    # One known word may be a name, as V and A are.
+    return tuple(cells) if 2 * len(known) > len(units) else units
 
 
 def _first_lines(path: Path) -> tuple[list[str], int, str, str | None, str]:
@@ -329,7 +343,8 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
         return match["name"], normalise_unit(match["square"])
     unit = normalise_unit(match["round"])
     # Round brackets may belong to the name, as in "speed (filtered)".
-    return (match["name"], unit) if unit in UNITS or unit in TIME_UNITS else (cell, None)
+    known = unit in UNITS or unit in TIME_UNITS or unit in OTHER_UNITS
+    return (match["name"], unit) if known else (cell, None)
 
 
 def _is_unit_row(row: list[str]) -> bool:

@@ -104,6 +104,8 @@ def _header_of(rows: Sequence[Sequence[str]], top: int, first: int, is_unit_row:
     describes = any(len(cell.split()) >= _WORDS for cell in rows[lowest])
     if describes and len(named) > 1:
         above = [cell.strip() for cell in rows[lowest - 1]]
-        if len(set(above)) == len(above) and all(_NAME.fullmatch(cell) for cell in above):
+        # Letters as t, V and A may be names; longer units are none.
+        units_above = is_unit_row(above) and any(len(cell) > 1 for cell in above)
+        if not units_above and len(set(above)) == len(above) and all(_NAME.fullmatch(cell) for cell in above):
             return lowest - 1
     return lowest

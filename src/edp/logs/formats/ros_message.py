@@ -43,6 +43,10 @@ _MOST_STEPS = 100_000
 """Fields of one message, each element of a list counted; only lists of lists and of messages can have so many."""
 
 
+class LongMessageError(DataError):
+    """A message with more numbers than samples of signals have: a plan, a map or a cloud."""
+
+
 class Types(Protocol):
     """What is needed of a store of message types."""
 
@@ -132,7 +136,7 @@ class _Walk:
         """One field; returns the texts of a list of texts."""
         self.steps += 1
         if self.steps > _MOST_STEPS:
-            raise DataError(f"a message of more than {_MOST_STEPS} fields")
+            raise LongMessageError(f"a message of more than {_MOST_STEPS:,} fields")
         what, detail = int(kind[0]), kind[1]
         if what == _BASE:
             self.base(detail[0], path)

@@ -24,7 +24,7 @@ from edp.logs.formats.base import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal
 from edp.logs.formats.edp_metadata import EdpMetadata, parse_edp_metadata
 from edp.logs.formats.mcap_json import holds_json, read_json_mcap
 from edp.logs.formats.names import only, told_apart
-from edp.logs.formats.ros_message import columns_of, layout_of
+from edp.logs.formats.ros_message import LongMessageError, columns_of, layout_of
 from edp.logs.formats.rosbag_write import FACTS_TOPIC, write_bag
 from edp.recording import Recording
 from edp.signals import VOCABULARY, SignalMap
@@ -61,6 +61,11 @@ class BagFormat:
         named_signals = [signal for topic in bag.topics for signal in topic.signals(edp_metadata)]
         if not named_signals:
             topic_names = ", ".join(sorted(bag.about)) or "none"
+            if lists := [f"{topic.name} ({topic.kind})" for topic in bag.topics if topic.long]:
+                raise DataError(
+                    f"'{path}' holds no signals: each message of {', '.join(lists)} is a list of many numbers, such as "
+                    "a plan or a cloud, not a sample in time; record topics of sensors (for example /joint_states)"
+                )
             raise DataError(
                 f"'{path}' holds no numbers in messages (topics: {topic_names}); record topics that hold some"
             )
@@ -182,12 +187,18 @@ class _Topic:
         self._stamps: Column | None = None
         self.paths: dict[str, str] = {}
         self.stamp_paths: list[str] = []
+        self.long = False
         if self.types is None:
             return
         first = next(iter(bag.reader.messages(connections=connections)), None)
         if first is None:
             raise DataError(f"no message of topic '{name}', of which {self.samples} are announced")
-        fields = layout_of(first[2], self.kind, self.types, bag.cdr).fields
+        try:
+            fields = layout_of(first[2], self.kind, self.types, bag.cdr).fields
+        except LongMessageError:
+            # Beside topics of signals it is passed over, as pictures are.
+            self.long = True
+            return
         self.stamp_paths = [path for path in _STAMP if path in fields and bag.time != _LOG_TIME]
         # Headers are time, and layouts describe how an array is to be read: neither is a signal.
         numbers = [path for path in fields if not path.startswith(("header.", "layout."))]

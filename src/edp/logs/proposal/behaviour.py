@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,8 @@ _FEW = 12
 """Distinct values of a label at most."""
 _SLOW = 2e-3
 """Changes a row of a label at most: operators switch seldom."""
+_REMARKS_FILL, _REMARKS_SPAN = 0.1, 0.2
+"""Largest share of rows with a number, and of rows from the first to the last of them, of a list beside a table."""
 _SPANS = (1, 4, 16)
 """Rows over which a change is compared with a velocity: noise hides it over one, motion over many."""
 
@@ -47,6 +50,7 @@ class Behaviour:
         step: median of the steps that are not zero, 0 where there are none.
         even: nearly all steps have one size.
         steady: nearly all steps are between half and twice their median, as those of a clock that waits for others.
+        spanned: share of rows between the first and the last one that hold a number.
         restarts: rows at which an even rise begins anew.
         coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
     """
@@ -65,11 +69,17 @@ class Behaviour:
     restarts: int
     coarse: bool = False
     steady: bool = False
+    spanned: float = 1.0
 
     @property
     def counts(self) -> bool:
         """Rows are numbered, or parts of the log are: whole numbers that rise by one."""
         return self.whole and self.rises and not self.constant and abs(self.step - 1.0) < 1e-9
+
+    @property
+    def beside(self) -> bool:
+        """A few numbers in some rows on end, as a list of results that was written next to the table."""
+        return 0 < self.filled < _REMARKS_FILL and self.spanned < _REMARKS_SPAN
 
     @property
     def switches(self) -> bool:
@@ -123,6 +133,7 @@ def behaviour_of(column: LogColumn) -> Behaviour:
         restarts=falls if step > 0 and falls and float(near.mean()) > 0.9 else 0,
         coarse=levels > 4 and len(sizes) > 0 and float(np.mean(sizes <= 1.1 * least)) > 0.9,
         steady=step > 0 and float(paced.mean()) > 0.95,
+        spanned=float(np.ptp(np.flatnonzero(np.isfinite(values))) + 1) / len(values),
     )
 
 
@@ -153,7 +164,15 @@ def relations_of(columns: list[LogColumn]) -> dict[str, Relation]:
         order = sorted(candidates, key=lambda relation: (relation.how != "copy", -relation.strength))
         if order:
             found_relations[column.name] = order[0]
-    return found_relations
+    return {name: relation for name, relation in found_relations.items() if not _is_turned_round(name, found_relations)}
+
+
+def _is_turned_round(name: str, relations: Mapping[str, Relation]) -> bool:
+    """Whether a column passes for the change of its own change: in a steady swing each is the change of the other."""
+    relation = relations[name]
+    back = relations.get(relation.other)
+    mutual = back is not None and relation.how == back.how == "change" and back.other == name
+    return mutual and back is not None and relation.strength < back.strength
 
 
 def _relation(column: LogColumn, other: LogColumn) -> Relation | None:

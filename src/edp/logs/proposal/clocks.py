@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
+from edp.errors import DataError
 from edp.logs.formats.base import time_factor
 from edp.logs.proposal.behaviour import Behaviour
 from edp.logs.proposal.columns import LogColumn, LogLook
 from edp.logs.proposal.names import is_sample_time_name, is_time_name
+from edp.logs.timebase import judge
 from edp.signals import TIME_UNITS, SignalMap
 
 _SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 5e8}
 """Least value of a stamp that counts from 1970 in a unit: 2,000 or so."""
+_PRINTED, _MANY_STAMPS = 0.995, 50
+"""Share of rows that may repeat the stamp before, and stamps that differ: whole seconds of some minutes at 100 Hz."""
 _FASTEST_HZ = 200.0
 """Rates above are brought down to `_USUAL_HZ`: a machine moves slower, and a tick more costs on a controller."""
 _USUAL_HZ = 100.0
+_SHORT_S, _SHORT_HZ = 5.0, 1000.0
+"""A log as short as this shows what is fast, and at the usual rate it would have too few rows to learn from."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +53,15 @@ class ClockGuess:
 def clock_of(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
     """The time of the rows of a log."""
     if look.rate_hz is not None:
-        return _brought_down(ClockGuess(None, "s", None, look.rate_hz, confidence=1.0))
+        return _brought_down(ClockGuess(None, "s", None, look.rate_hz, confidence=1.0), look.rows)
     if look.time is None and look.step_s is not None:
-        return _brought_down(ClockGuess(None, "s", None, 1.0 / look.step_s, confidence=0.95))
+        return _brought_down(ClockGuess(None, "s", None, 1.0 / look.step_s, confidence=0.95), look.rows)
     by_name = {column.name: column for column in look.columns}
     if look.time is not None and look.step_s and look.time not in by_name:
-        return _brought_down(ClockGuess(look.time, "s", None, 1.0 / look.step_s, confidence=0.9))
+        return _brought_down(ClockGuess(look.time, "s", None, 1.0 / look.step_s, confidence=0.9), look.rows)
     column = _time_column(look, behaviours)
     if column is not None:
-        return _of_column(column, behaviours[column.name], by_reader=look.time == column.name)
+        return _of_column(column, behaviours[column.name], look)
     return _without_column(look, behaviours)
 
 
@@ -62,7 +69,7 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
     """The column of stamps: that of the reader, one named so, or the first of an even rise at the front."""
     rising = [c for c in look.columns if behaviours[c.name].rises and not behaviours[c.name].constant]
     named = [c for c in rising if c.name == look.time] + [
-        c for c in rising if is_time_name(c.name) and 1.0 - behaviours[c.name].holds > 0.5
+        c for c in rising if is_time_name(c.name) and _ticks(behaviours[c.name])
     ]
     if named:
         return named[0]
@@ -75,6 +82,11 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
     return None
 
 
+def _ticks(behaviour: Behaviour) -> bool:
+    """Whether a rise may be that of a clock: stamps that were printed with few digits repeat for some rows."""
+    return behaviour.holds < 0.5 or (behaviour.holds < _PRINTED and behaviour.levels > _MANY_STAMPS)
+
+
 def _fronts(look: LogLook) -> list[LogColumn]:
     """The first column of the log, and that of each matrix in it (``data_1`` beside ``data_2``)."""
     names = set(look.names)
@@ -82,12 +94,16 @@ def _fronts(look: LogLook) -> list[LogColumn]:
     return [*look.columns[:1], *(column for column in first if column is not look.columns[0])]
 
 
-def _of_column(column: LogColumn, behaviour: Behaviour, by_reader: bool) -> ClockGuess:
+def _of_column(column: LogColumn, behaviour: Behaviour, look: LogLook) -> ClockGuess:
     unit, confidence, check = _unit(column, behaviour)
     rate = 1.0 / (behaviour.step * TIME_UNITS[unit])
-    if not by_reader and not is_time_name(column.name):
+    if behaviour.holds > 0:
+        # Steps between stamps that repeat are not those of rows.
+        with suppress(DataError):
+            rate = judge(column.pieces[0] * TIME_UNITS[unit], column.name).rate_hz
+    if look.time != column.name and not is_time_name(column.name):
         confidence, check = min(confidence, 0.7), check or "is it time?"
-    return _brought_down(ClockGuess(column.name, unit, None, rate, None, (), confidence, check))
+    return _brought_down(ClockGuess(column.name, unit, None, rate, None, (), confidence, check), look.rows)
 
 
 def _unit(column: LogColumn, behaviour: Behaviour) -> tuple[str, float, str]:
@@ -102,6 +118,8 @@ def _unit(column: LogColumn, behaviour: Behaviour) -> tuple[str, float, str]:
             return unit, 0.85, ""
     if not behaviour.whole:
         return "s", 0.85, ""
+    if behaviour.counts and behaviour.climbs and behaviour.low in (0.0, 1.0):
+        return "s", 0.5, "seconds, or numbers of rows?"
     if behaviour.step < 5:
         return "s", 0.65, "seconds?"
     unit = "ms" if behaviour.step <= 1000 else "us" if behaviour.step <= 1e6 else "ns"
@@ -124,10 +142,13 @@ def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> Clock
     return ClockGuess(None, "s", 1.0, 1.0, None, (), 0.3, "no time found: a row counts as 1 s; set sample_time_s")
 
 
-def _brought_down(clock: ClockGuess) -> ClockGuess:
+def _brought_down(clock: ClockGuess, rows: int) -> ClockGuess:
     if clock.rate_hz is None or clock.rate_hz <= _FASTEST_HZ:
         return clock
-    check = f"{clock.rate_hz:.4g} Hz are brought to {_USUAL_HZ:g} Hz: set rate_hz"
+    wanted_hz = _USUAL_HZ if rows > _SHORT_S * clock.rate_hz else _SHORT_HZ
+    if clock.rate_hz <= wanted_hz:
+        return clock
+    check = f"{clock.rate_hz:.4g} Hz are brought to {wanted_hz:g} Hz: set rate_hz"
     return ClockGuess(
-        clock.column, clock.unit, None, clock.rate_hz, _USUAL_HZ, clock.beside, clock.confidence, clock.check or check
+        clock.column, clock.unit, None, clock.rate_hz, wanted_hz, clock.beside, clock.confidence, clock.check or check
     )

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 from edp.logs.proposal.behaviour import Behaviour, Relation
 from edp.logs.proposal.columns import LogColumn
-from edp.logs.proposal.names import kind_by_tag, kind_by_word, known_unit, unit_by_ending
-from edp.signals import KINDS, UNITS, VOCABULARY, Kind
+from edp.logs.proposal.names import is_joint, kind_by_tag, kind_by_word, known_unit, unit_by_ending
+from edp.logs.units import OTHER_UNITS, normalise_unit
+from edp.signals import KINDS, TIME_UNITS, UNITS, VOCABULARY, Kind
 
 BOUND = 0.6
 """Confidence below which a channel is mapped as numbers without a unit."""
+SURE_NUMBERS = 0.85
+"""Confidence that numbers are to be taken as they are."""
 _PRESSURES = (Kind.PRESSURE, Kind.PILOT_PRESSURE)
 _RATES = {
     Kind.POSITION: Kind.VELOCITY,
@@ -18,6 +21,13 @@ _RATES = {
     Kind.VELOCITY: Kind.ACCELERATION,
 }
 """What the change of a kind measures."""
+_TURNING = {
+    Kind.POSITION: Kind.ANGLE,
+    Kind.ANGLE: Kind.ANGLE,
+    Kind.VELOCITY: Kind.ANGULAR_VELOCITY,
+    Kind.ANGULAR_VELOCITY: Kind.ANGULAR_VELOCITY,
+}
+"""What words of motion mean of a joint."""
 _NEAR = 0.1
 """Share by which the ratio of a change may miss that of two units."""
 _SHORT_UNITS = ("t", "g")
@@ -43,6 +53,11 @@ class KindGuess:
     check: str = ""
 
 
+def with_article(kind: Kind) -> str:
+    """The kind in words: ``an angular velocity``."""
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind.replace('_', ' ')}"
+
+
 def _numbers(why: str, check: str, confidence: float = 0.5) -> KindGuess:
     return KindGuess(Kind.GENERIC, "1", confidence, why, check)
 
@@ -66,6 +81,8 @@ def kind_of(column: LogColumn, behaviour: Behaviour, family: int) -> KindGuess:
     ending = unit_by_ending(column.name)
     if ending is not None:
         return _of_ending(ending, word, behaviour)
+    if word in _TURNING and is_joint(column.name):
+        return _of_joint(_TURNING[word], behaviour)
     if word is not None:
         return _of_range(word, behaviour, 0.7, f"its name says {word}")
     tag = kind_by_tag(column.name)
@@ -73,6 +90,16 @@ def kind_of(column: LogColumn, behaviour: Behaviour, family: int) -> KindGuess:
         # One tag alone may be anything; a row of them is an instrument list.
         return _of_range(tag, behaviour, 0.65 if family > 1 else 0.5, "its name is an instrument's tag")
     return _numbers("no name or unit tells", "unit unknown")
+
+
+def _of_joint(kind: Kind, behaviour: Behaviour) -> KindGuess:
+    """What a joint of an arm does: it turns, as all but a few do, and robots count in radians."""
+    unit = KINDS[kind].si_unit
+    if kind is Kind.ANGLE and unit_by_range(kind, behaviour) is not None:
+        return _of_range(kind, behaviour, 0.7, "a joint turns")
+    if not is_plausible(kind, unit, behaviour):
+        return _numbers("a joint turns", f"{with_article(kind)}? unit unknown")
+    return KindGuess(kind, unit, 0.65, "a joint turns", f"{unit}? m if it slides")
 
 
 def _of_vocabulary(column: LogColumn, behaviour: Behaviour) -> KindGuess:
@@ -91,18 +118,23 @@ def _looks_small(kind: Kind, behaviour: Behaviour) -> bool:
 
 def _of_unit(stated: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
     unit = known_unit(stated)
+    if unit is None and normalise_unit(stated) in OTHER_UNITS | TIME_UNITS.keys():
+        return _numbers("the file states a unit without a kind", f"in {stated[:12]}, as numbers", SURE_NUMBERS)
     if unit is None:
         return _numbers("the file states a unit", f"unit '{stated[:12]}' is unknown here", BOUND)
     kinds = UNITS[unit].kinds
     kind = word if word in kinds else kinds[0]
     if Kind.GENERIC in kinds:
-        return _numbers("the file states no dimension", "", 0.85)
+        return _numbers("the file states no dimension", "", SURE_NUMBERS)
+    if word in _TURNING and _TURNING[word] in kinds:
+        # A speed in rpm and a position in degrees are those of a shaft.
+        kind = word = _TURNING[word]
     if word is not None and word not in kinds:
         return _numbers(f"its name says {word}, its unit {kinds[0]}", f"is '{unit}' right?")
     if unit in _SHORT_UNITS and word is None:
-        return _numbers("its unit may be two things", f"is '{unit}' a {kinds[0]}?")
+        return _numbers("its unit may be two things", f"is '{unit}' {with_article(kinds[0])}?")
     if not is_plausible(kind, unit, behaviour):
-        return _numbers(f"{unit} beyond what a {kind} reaches", f"is '{unit}' right?")
+        return _numbers(f"{unit} beyond what {with_article(kind)} reaches", f"is '{unit}' right?")
     return KindGuess(kind, unit, 0.95, "the file states its unit")
 
 
@@ -117,9 +149,9 @@ def _of_range(kind: Kind, behaviour: Behaviour, confidence: float, why: str) -> 
     """A kind whose unit only the numbers tell."""
     unit = unit_by_range(kind, behaviour)
     if unit is None:
-        return _numbers(why, f"a {kind.replace('_', ' ')}? unit unknown")
+        return _numbers(why, f"{with_article(kind)}? unit unknown")
     if confidence < BOUND:
-        return _numbers(why, f"a {kind.replace('_', ' ')} in {unit}?", confidence)
+        return _numbers(why, f"{with_article(kind)} in {unit}?", confidence)
     return KindGuess(kind, unit, confidence, f"{why}, its numbers {unit}", f"unit {unit}?")
 
 

@@ -58,7 +58,8 @@ ROLE_WORDS: Mapping[str, str] = {
     for role, words in {
         "reference": "soll sollwert ref reference setpoint desired des target vorgabe fuehrungsgroesse r",
         "command": "command cmd ctrl control u valve ventil joystick lever hebel pilot pwm input stellgroesse pedal",
-        "measured": "ist istwert act actual meas measured mess messwert fb feedback y output",
+        "measured": "ist istwert act actual meas measured mess messwert fb feedback y output "
+        "sensor cell transducer encoder gauge",
         "label": "flag status state mode id label condition fault error leak stable zustand fehler",
     }.items()
     for word in words.split()
@@ -70,6 +71,7 @@ _TIMES = frozenset(
     ("time", "zeit", "t", "timestamp", "zeitstempel", "uhrzeit", "tout", "sec", "seconds", "second", "sekunde")
 )
 _SAMPLE_TIMES = frozenset(("ts", "dt", "sampletime", "sample_time", "samplingtime", "tastzeit", "abtastzeit", "t_s"))
+_JOINTS = frozenset(("joint", "joints", "gelenk", "achse", "elbow", "shoulder", "wrist", "knee", "hip", "ankle"))
 _TAG = re.compile(r"([PTF])([SIT])(\d{1,3})")
 _TAGS: Mapping[str, Kind] = {"P": Kind.PRESSURE, "T": Kind.TEMPERATURE, "F": Kind.FLOW}
 """First letters of instrument tags (ISA-5.1), with sensor, indicator or transmitter behind: PS1, TT12."""
@@ -87,6 +89,11 @@ def kind_by_word(name: str) -> Kind | None:
         if word in words or (len(word) > _LONG and any(word in other for other in words)):
             return kind
     return None
+
+
+def is_joint(name: str) -> bool:
+    """Whether a name is that of a joint of an arm or a leg."""
+    return not _JOINTS.isdisjoint(words_of(name))
 
 
 def kind_by_tag(name: str) -> Kind | None:

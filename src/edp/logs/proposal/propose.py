@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_steered_by, relations_of, repeats
 from edp.logs.proposal.clocks import ClockGuess, clock_of
 from edp.logs.proposal.columns import LogColumn, LogLook
-from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change
+from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change, with_article
 from edp.logs.proposal.names import is_counter_name, role_by_word, tag_family, words_of
 from edp.signals import TABLE_A1, VOCABULARY, ChannelMap, Kind, SignalMap
 
@@ -35,7 +35,7 @@ class ColumnGuess:
     Attributes:
         column: its name in the file.
         channel: name of the channel; empty where it becomes none.
-        role: ``time``, ``counter``, ``constant``, ``text``, or one of `MAPPED_ROLES`.
+        role: ``time``, ``counter``, ``constant``, ``text``, ``remark``, or one of `MAPPED_ROLES`.
         kind: kind and unit.
         confidence: of role and kind together, from 0 to 1.
         why: what the role was taken from.
@@ -78,13 +78,14 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
     Args:
         look: the columns.
         common: columns that all logs of a group have; None for all of this log. Others become no channels.
-        beside: further logs of the group: a column that repeats another one does so in each.
+        beside: further logs of the group: a column that repeats another one does so in each, and one that rests does.
     """
     behaviours = {column.name: behaviour_of(column) for column in look.columns}
     clock = clock_of(look, behaviours)
     families = Counter(tag_family(column.name) for column in look.columns)
     moving = [c for c in look.columns if _is_free(c, behaviours[c.name], clock)]
     relations = relations_of(moving)
+    behaviours = _where_they_move(behaviours, beside)
     kinds = {c.name: kind_of(c, behaviours[c.name], families[tag_family(c.name)]) for c in look.columns}
     for name, relation in relations.items():
         change = kind_of_change(relation, kinds[relation.other], clock.rate_hz)
@@ -112,6 +113,23 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
 
 
 _NO_KIND = KindGuess(Kind.GENERIC, "1", 1.0, "")
+_EMPTY = "empty"
+"""Why a column is a constant: no row holds a number."""
+
+
+def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) -> dict[str, Behaviour]:
+    """Behaviours of columns, of another log of the group where they rest, or move in steps only, in the first.
+
+    A machine is often tested one axis a log.
+    """
+    moving = dict(behaviours)
+    for column in (column for look in beside for column in look.columns):
+        known = moving.get(column.name)
+        if known is not None and (known.constant or known.steps):
+            other = behaviour_of(column)
+            more = not other.constant if known.constant else not (other.constant or other.steps)
+            moving[column.name] = other if more else known
+    return moving
 
 
 def _is_free(column: LogColumn, behaviour: Behaviour, clock: ClockGuess) -> bool:
@@ -155,8 +173,12 @@ def _column_guess(
 
 def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | None) -> ColumnGuess | None:
     """A column that holds no motion: a constant, a counter, a label; None for all others."""
+    if behaviour.beside and not is_known(name):
+        return ColumnGuess(
+            name, "", "remark", _NO_KIND, 0.85, f"filled in {behaviour.filled:.1%} of the rows", "not taken"
+        )
     if behaviour.constant:
-        value = "empty" if not behaviour.filled else f"always {behaviour.high:g}"
+        value = _EMPTY if not behaviour.filled else f"always {behaviour.high:g}"
         return ColumnGuess(name, "", "constant", _NO_KIND, 0.95, value, "" if is_known(name) else "not taken")
     if behaviour.counts and behaviour.levels > 2:
         sure = 0.9 if is_counter_name(name) else 0.65
@@ -193,10 +215,12 @@ def _role(
         # A single letter is a habit, not a word.
         by_letter = all(len(part) == 1 or part.isdigit() for part in words_of(name)[:1])
         return word, 0.7 if by_letter else 0.85, "its name"
+    if column.unit == "us":
+        return "command", 0.75, "the width of a pulse"
     if kind.kind in _COMMANDS and kind.confidence >= BOUND:
-        return "command", 0.65, f"a {kind.kind.replace('_', ' ')}"
+        return "command", 0.65, with_article(kind.kind)
     if kind.kind in _MEASURED and kind.confidence >= BOUND:
-        return "measured", 0.85, f"a {kind.kind.replace('_', ' ')}"
+        return "measured", 0.85, with_article(kind.kind)
     if behaviour.steps:
         return "command", 0.65, "moves in steps"
     if relation is not None and relation.how == "change":
@@ -265,7 +289,8 @@ def _signal_map(look: LogLook, clock: ClockGuess, columns: Sequence[ColumnGuess]
 def plain_map(look: LogLook) -> SignalMap:
     """A map of all columns of numbers, so that they can be inspected: kinds as proposed, the others as numbers."""
     proposal = propose_map(look)
-    unmapped = [g for g in proposal.columns if not g.channel and g.role in ("constant", "counter")]
+    # A column without any number is a delimiter too many, not a sensor.
+    unmapped = [g for g in proposal.columns if not g.channel and g.role in ("constant", "counter") and g.why != _EMPTY]
     mapped = proposal.signal_map.channels
     used = {entry.name for entry in mapped}
     more = [

@@ -23,7 +23,7 @@ from edp.logs.repair import Repair
 from edp.logs.resolve import ChannelSource, resolve
 from edp.logs.timebase import Clock, judge
 from edp.recording import Recording
-from edp.signals import VOCABULARY, SignalMap
+from edp.signals import VOCABULARY, Kind, SignalMap
 
 # Everything is read, so that every defect can be found and counted.
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
@@ -195,7 +195,8 @@ def _unit_clashes(raw: RawLog, signal_map: SignalMap) -> list[Finding]:
     findings = []
     for entry in signal_map.channels:
         stated = raw.signal(entry.column).unit if entry.column in raw else None
-        if stated and entry.unit and stated != entry.unit:
+        # Numbers that are taken as they are have no unit to be wrong.
+        if stated and entry.unit and stated != entry.unit and entry.kind is not Kind.GENERIC:
             what = f"the map says {entry.unit}, the file says {stated}; the map's unit is used"
             findings.append(Finding("warning", entry.name, what, 1, "", "check which is right"))
     return findings
