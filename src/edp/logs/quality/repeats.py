@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from edp.logs.quality.columns import columns
 from edp.recording import Recording
 
 SKETCH_HZ = 10.0
@@ -53,6 +54,8 @@ _SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
 """Fractions of a block: two recordings began at different moments between the ticks of 10 Hz."""
 
 Floats = NDArray[np.float32]
+Labels = NDArray[np.int64]
+"""Recording and block of fingerprints, shape ``(fingerprint, 2)``; or votes, see `_votes`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +154,8 @@ def sketch(recording: Recording, name: str | None = None) -> Sketch:
     starts = np.minimum(np.ceil(np.arange(blocks) * rate / hz - 1e-9).astype(np.intp), recording.samples - 1)
     block_means = np.empty((blocks, len(recording.channels)), dtype=np.float32)
     counts = np.diff(np.append(starts, recording.samples))
-    for channel_index in range(len(recording.channels)):
-        values = recording.values[:, channel_index].astype(np.float64)
+    for channel_index, column in enumerate(columns(recording)):
+        values = column.astype(np.float64)
         good = np.isfinite(values)
         mean = float(values[good].mean()) if good.any() else 0.0
         values = np.where(good, values - mean, 0.0)
@@ -196,36 +199,53 @@ def _identical(a: Sketch, b: Sketch) -> Repeat:
 
 
 def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
-    """The lag, in blocks, that most fingerprints of a pair of recordings vote for."""
+    """The lag, in blocks, that most fingerprints of a pair of recordings vote for.
+
+    Fingerprints are made twice, a channel of a recording at a time: those of forty hours together take gigabytes.
+    """
     long = [i for i, entry in enumerate(sketches) if len(entry.values) >= WINDOW + _HOP]
     if len(long) < 2:
         return {}
-    prints: list[Floats] = []
-    labels: list[NDArray[np.int64]] = []
     chosen = _telling(sketches)
-    for i in long:
-        for window_index in chosen[i]:
-            marks, places = _fingerprints(sketches[i].values[:, window_index])
-            prints.append(marks)
-            labels.append(np.stack([np.full(len(places), i), places], axis=1))
-    marks, owners = np.concatenate(prints), np.concatenate(labels)
-    probes = np.flatnonzero(owners[:, 1] % _HOP == 0)
-    if not len(probes):
+    columns_of = [(i, column) for i in long for column in chosen[i]]
+    searched: list[Floats] = []
+    labels: list[Labels] = []
+    for i, column in columns_of:
+        marks, places = _fingerprints(sketches[i].values[:, column])
+        probes = np.flatnonzero(places % _HOP == 0)
+        searched.append(marks[probes])
+        labels.append(np.stack([np.full(len(probes), i), places[probes]], axis=1))
+    owners = np.concatenate(labels)
+    if not len(owners):
         return {}
-    near, which = cKDTree(marks[probes]).query(marks, k=_NEIGHBOURS, distance_upper_bound=_NEAR)
-    asked, rank = np.nonzero(np.isfinite(near))
-    mine, theirs = owners[asked], owners[probes[which[asked, rank]]]
-    other = mine[:, 0] != theirs[:, 0]
-    return _voted(mine[other], theirs[other])
+    tree = cKDTree(np.concatenate(searched))
+    votes = []
+    for i, column in columns_of:
+        marks, places = _fingerprints(sketches[i].values[:, column])
+        near, which = tree.query(marks, k=_NEIGHBOURS, distance_upper_bound=_NEAR)
+        asked, rank = np.nonzero(np.isfinite(near))
+        theirs = owners[which[asked, rank]]
+        other = theirs[:, 0] != i
+        votes.append(_votes(i, places[asked][other], theirs[other]))
+    return _elected(*(np.concatenate(part) for part in zip(*votes, strict=True)))
 
 
-def _voted(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> dict[tuple[int, int], int]:
-    swap = mine[:, 0] > theirs[:, 0]
+def _votes(i: int, places: NDArray[np.int64], theirs: Labels) -> tuple[Labels, NDArray[np.int64]]:
+    """Votes of a recording's windows, shape ``(vote, 3)`` with two recordings in order and a lag, and their numbers."""
+    swap = i > theirs[:, 0]
+    mine = np.stack([np.full(len(places), i), places], axis=1)
     a, b = np.where(swap[:, None], theirs, mine), np.where(swap[:, None], mine, theirs)
-    votes, counts = np.unique(np.stack([a[:, 0], b[:, 0], b[:, 1] - a[:, 1]], axis=1), axis=0, return_counts=True)
+    return np.unique(np.stack([a[:, 0], b[:, 0], b[:, 1] - a[:, 1]], axis=1), axis=0, return_counts=True)
+
+
+def _elected(votes: Labels, numbers: NDArray[np.int64]) -> dict[tuple[int, int], int]:
+    """The lag of each pair with enough votes."""
+    votes, where = np.unique(votes, axis=0, return_inverse=True)
+    counts = np.zeros(len(votes), dtype=np.int64)
+    np.add.at(counts, where, numbers)
     # the true lag lies between two blocks: its votes may be shared by them
     follows = (np.diff(votes[:, :2], axis=0) == 0).all(axis=1) & (np.diff(votes[:, 2]) == 1)
-    both = counts.astype(np.int64)
+    both = counts.copy()
     both[:-1] += np.where(follows, counts[1:], 0)
     both[1:] += np.where(follows, counts[:-1], 0)
     best: dict[tuple[int, int], tuple[int, int, int]] = {}
