@@ -2,13 +2,15 @@
 
 * Two workers against one, for simulate, store, inspect, the inspection of screen, and evaluate. On a computer that
   others use wall time says little, so processor time is compared: that of one process for everything, against the
-  coordinator's with two workers and that of the busier worker, with the readers of logs that each has. Starting a
-  worker (imports) is measured with next to nothing to do and taken off.
+  coordinator's with two workers and that of the busier worker, with the readers of logs that each has. All have done
+  the same with next to nothing before; what starting a worker takes (imports) is named beside it.
 * The coordinator's processor time a unit over 1,000 units, as a share of a core while two workers do units of the mean
   length of the first part.
 * A delta of 64 kB of each of some machines that the network never saw, from five minutes of logs, against their full
   fine-tuning, on the ends of the logs.
-* The error of one network, parameters and updates fixed, by the minutes of logs that train it, on machines never seen.
+* The error of one network, parameters and updates fixed, by the minutes of logs that train it, on a dozen machines
+  never seen, with as many machines as there are three minutes of logs.
+* An exchange of the gradients of that network between two processes, beside the processor time of an update.
 * The time of a fleet of 10,000 h on 100 cores: the scheduler simulated with the measured times of units, checked with
   two workers.
 """
@@ -23,7 +25,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -33,6 +35,7 @@ from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import load_bundle
 from edp.workflows.executors import Workforce
+from edp.workflows.executors.base import Executor
 from edp.workflows.executors.units import WorkUnit, run_units
 from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 from edp.workflows.fleet.judge_fleet import FleetQuestion, report_fleet
@@ -42,6 +45,7 @@ from edp.workflows.fleet.simulating import simulate_with
 from edp.workflows.fleet.storing import store_with
 from edp.workflows.train_evaluate import train
 from edp.workflows.transfer import FinetuneSpec
+from fleet_exchange import exchange_ms
 from fleet_meter import metered
 
 SPEEDUP, SHARE, NEAR = 1.8, 0.03, 1.05
@@ -78,7 +82,7 @@ class Size:
 
 SIZES = {
     True: Size(1.0, 4, 3, 3.0, 20, (2.0, 4.0)),
-    False: Size(120.0, 40, 24, 48.0, 450, (10.0, 40.0, 160.0)),
+    False: Size(60.0, 24, 24, 48.0, 450, (2.0, 8.0, 32.0, 128.0)),
 }
 
 
@@ -147,24 +151,49 @@ def commands(bench: Bench) -> dict[str, Command]:
     }
 
 
-def processor_s(command: Command, workers: int, name: str) -> tuple[float, float]:
-    """Processor time of this process, and of the busier worker."""
-    with tempfile.TemporaryDirectory() as out, metered() as meter:
-        command(Workforce(workers=workers), Path(out), name)
-    return meter.here(), meter.busiest()
+class WarmPool(Workforce):
+    """A workforce whose workers stay from one command to the next, so that starting them is done once."""
+
+    pools: ClassVar[list[Executor]] = []
+
+    def open(self) -> Executor:
+        if not self.pools:
+            self.pools.append(super().open())
+        return contextlib.nullcontext(self.pools[0])  # type: ignore[return-value]
+
+    def end(self) -> None:
+        while self.pools:
+            self.pools.pop().close()
+
+
+def in_turn(command: Command, workforce: Workforce) -> tuple[float, float, float]:
+    """Processor time of starting (the busiest process on next to nothing), then of this process and of the busier
+    worker on the data of the measure.
+    """
+    with metered() as meter, tempfile.TemporaryDirectory() as out:
+        for name in ("few", "many"):
+            (Path(out) / name).mkdir()
+        command(workforce, Path(out) / "few", "few")
+        meter.look()
+        started = meter.busiest()
+        meter.mark()
+        command(workforce, Path(out) / "many", "many")
+        meter.look()
+        return started, meter.here(), meter.busiest()
 
 
 def two_against_one(bench: Bench) -> list[dict[str, Any]]:
     rows = []
     for name, command in commands(bench).items():
-        processor_s(command, 1, "few")  # what this process loads once
-        started_here, started_there = processor_s(command, 2, "few")
-        alone, _ = processor_s(command, 1, "many")
-        here, there = processor_s(command, 2, "many")
-        two = max(0.0, here - started_here) + max(0.0, there - started_there)
+        _, alone, _ = in_turn(command, Workforce())
+        two = WarmPool(workers=2)
+        try:
+            started, here, there = in_turn(command, two)
+        finally:
+            two.end()
         rows.append({
             "command": name, "one process, s": alone, "two: coordinator, s": here, "two: busier worker, s": there,
-            "of which starting, s": started_there, "times": alone / two if two > 0.0 and alone >= LEAST_S else None,
+            "starting a worker, s": started, "times": alone / (here + there) if alone >= LEAST_S else None,
         })  # fmt: skip
         print(rows[-1], flush=True)
     return rows
@@ -202,7 +231,10 @@ def fleet_orders(bench: Bench) -> dict[str, SimulationOrder]:
         )
         for minutes in size.curve
     }  # fmt: skip
-    return {"fleet": train_set, "unseen": unseen, **curve}
+    judged = SimulationOrder(
+        minutes=2.0 if bench.quick else 18.0, recordings=12, family=12, seed=bench.seed + 4, **soil
+    )
+    return {"fleet": train_set, "unseen": unseen, "judged": judged, **curve}
 
 
 def trained(bench: Bench, name: str, order: SimulationOrder) -> Path:
@@ -223,36 +255,45 @@ def deltas(bench: Bench) -> dict[str, Any]:
     DataSource.of(bench.logs("unseen", orders["unseen"])).store(store, 1)
     found: dict[str, Any] = {"parameters": sum(p.numel() for p in load_bundle(base).predictor.parameters())}
     spec = FinetuneSpec(rounds=3 if bench.quick else 10)
-    for label, method, kilobytes in (("full", "full", 64), ("low_rank", "low_rank", 64)):
-        if bench.quick and label != "full":
-            continue
-        order = PersonalOrder(method=method, spec=spec, most_bytes=1024 * kilobytes)
-        content = finetune_fleet(Workforce(), base, store, order, bench.work / f"own_{method}_{kilobytes}")
-        rows = errors_by_machine(content)
-        found[label] = {
-            "machines": [list(row) for row in rows],
-            "bytes": max(row.get("bytes", 0) for row in content["machines"]),
-            "trained_min": float(np.mean([row["trained_min"] for row in content["machines"] if "mae" in row])),
-            **{
-                part: float(np.mean([row[1 + n] for row in rows])) for n, part in enumerate(("before", "full", "delta"))
-            },
-        }
-        print(label, found[label], flush=True)
+    content = finetune_fleet(Workforce(), base, store, PersonalOrder(method="full", spec=spec), bench.work / "own")
+    rows = errors_by_machine(content)
+    found["full"] = {
+        "machines": [list(row) for row in rows],
+        "bytes": max(row.get("bytes", 0) for row in content["machines"]),
+        "trained_min": float(np.mean([row["trained_min"] for row in content["machines"] if "mae" in row])),
+        **{part: float(np.mean([row[1 + n] for row in rows])) for n, part in enumerate(("before", "full", "delta"))},
+    }
+    print(found, flush=True)
     return found
 
 
 def curve(bench: Bench) -> dict[str, float]:
     """Error on machines never seen by minutes of training logs, in mm/s, and the exponent of a power law."""
     orders, errors = fleet_orders(bench), {}
+    store = bench.work / "judged_store"
+    DataSource.of(bench.logs("judged", orders["judged"])).store(store, 1)
     for minutes in bench.size.curve:
         name = f"curve_{minutes:g}"
         run = trained(bench, name, orders[name])
-        question = FleetQuestion(network=run, store=bench.work / "unseen_store")
+        question = FleetQuestion(network=run, store=store)
         facts = report_fleet(Workforce(), question, bench.work / f"report_{name}")
         errors[f"{minutes:g}"] = float(np.mean([row.mae for row in facts.rows]))
         print(f"{minutes:g} min: {errors[f'{minutes:g}']:.4g} mm/s on machines never seen", flush=True)
     slope = np.polyfit(np.log([float(m) for m in errors]), np.log(list(errors.values())), 1)[0]
     return {**errors, "exponent": float(slope)}
+
+
+def exchange(bench: Bench, parameters: int) -> dict[str, Any]:
+    """An exchange of gradients between two processes, and the processor time of an update, in ms."""
+    few, many = (2, 10) if bench.quick else (20, 80)
+    logs, spent = bench.logs("fleet", fleet_orders(bench)["fleet"]), []
+    for updates in (few, few, many):  # the first loads what a process loads once
+        experiment = bench.experiment("training.epochs=1", f"training.updates={updates}", 'split.kind="machines"')
+        with tempfile.TemporaryDirectory() as out:
+            began = time.process_time()
+            train(DataSource.of(logs), experiment, Path(out) / "run")
+            spent.append(time.process_time() - began)
+    return {**exchange_ms(parameters), "update_ms": 1e3 * (spent[2] - spent[1]) / (many - few)}
 
 
 def makespan(seconds: Sequence[float], workers: int) -> float:
@@ -284,7 +325,7 @@ def cost(bench: Bench, rows: Sequence[dict[str, Any]], coordinator_ms: float) ->
     seconds = unit_seconds(bench)
     hours = bench.size.minutes / 60.0
     simulated = next(row for row in rows if row["command"] == "simulate")
-    measured = simulated["two: busier worker, s"] - simulated["of which starting, s"]
+    measured = simulated["two: busier worker, s"]
     draw = np.random.default_rng(bench.seed)
     many = round(HOURS / hours * len(seconds))
     large = list(draw.choice(seconds, many))
@@ -310,6 +351,7 @@ def measure(bench: Bench, with_curve: bool) -> dict[str, Any]:
 
     found: dict[str, Any] = {"coordinator": part("coordinator", lambda: coordinating(2))}
     found["deltas"] = part("deltas", lambda: deltas(bench))
+    found["exchange"] = part("exchange", lambda: exchange(bench, found["deltas"]["parameters"]))
     found["commands"] = rows = part("two_against_one", lambda: two_against_one(bench))
     if with_curve:
         found["curve"] = part("curve", lambda: curve(bench))
@@ -333,6 +375,7 @@ def main() -> None:
     cost_of, coordinator = found["cost"], found["coordinator"]
     share = coordinator["ms_a_unit"] / 1e3 * 2 / cost_of["unit_mean_s"]
     print(f"coordinator: {coordinator['ms_a_unit']:.2f} ms a unit")
+    print(f"exchange of gradients: {found['exchange']}")
     print(f"10,000 h on 100 cores: {cost_of}")
     tuned = found["deltas"]["full"]
     verdicts = [

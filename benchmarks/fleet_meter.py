@@ -55,6 +55,7 @@ class Meter:
     seen: dict[int, dict[int, float]] = field(default_factory=dict)
     workers: set[int] = field(default_factory=set)
     done: threading.Event = field(default_factory=threading.Event)
+    marked: dict[int, float] = field(default_factory=dict)
 
     def look(self) -> None:
         own = os.getpid()
@@ -72,14 +73,23 @@ class Meter:
         while not self.done.wait(TICK_S):
             self.look()
 
+    def mark(self) -> None:
+        """What was spent until now counts no more."""
+        self.look()
+        self.marked = {process: spent for place in self.seen.values() for process, spent in place.items()}
+
     def here(self) -> float:
-        """Of this process and what is no worker, since the meter began."""
-        return sum(spent - self.begun.get(p, 0.0) for p, spent in self.seen.get(os.getpid(), {}).items())
+        """Of this process and what is no worker, since the meter began or was marked."""
+        return self._since(self.seen.get(os.getpid(), {}))
 
     def busiest(self) -> float:
-        """Of the worker that took most."""
-        workers = [sum(spent.values()) for process, spent in self.seen.items() if process != os.getpid()]
+        """Of the worker that took most, likewise."""
+        workers = [self._since(spent) for process, spent in self.seen.items() if process != os.getpid()]
         return max(workers, default=0.0)
+
+    def _since(self, place: dict[int, float]) -> float:
+        before = self.begun | self.marked
+        return sum(spent - before.get(process, 0.0) for process, spent in place.items())
 
 
 @contextlib.contextmanager

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from edp.logs import find_repeats, inspect, sketch, write_recording
+from edp.logs.quality import columns
 from edp.logs.quality.measures import measure, noise_floor
 from edp.logs.source import DataSource
 from edp.recording import Recording
@@ -204,6 +206,35 @@ def test_a_session_inside_another_with_other_noise():
     (found,) = repeats(replace(OTHERS[0], name="mixed", values=values))
     assert (found.first, found.second) == ("a", "mixed")
     assert found.seconds == pytest.approx(60, abs=14)
+
+
+def test_a_recording_at_rest_votes_for_nothing():
+    rest = replace(OTHERS[0], name="rest", values=np.ones_like(OTHERS[0].values))
+    assert repeats(rest) == ()
+    assert find_repeats([sketch(rest), sketch(replace(rest, name="shorter", values=rest.values[:9000]))]) == ()
+
+
+def test_looking_for_repeats_holds_little_beside_the_sketches():
+    """Fingerprints of all recordings at once would be as much as the sketches again and again."""
+    sketches = [sketch(session(f"s{i}", 100 + 10 * i, samples=120_000)) for i in range(10)]
+    held = sum(one.values.nbytes for one in sketches)
+    tracemalloc.start()
+    try:
+        assert find_repeats(sketches) == ()
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 5 * held
+
+
+def test_columns_in_pieces_say_the_same(monkeypatch):
+    recording = OTHERS[0]
+    whole = inspect(recording), sketch(recording)
+    monkeypatch.setattr(columns, "PIECE_BYTES", 1)  # a column at a time
+    pieces = inspect(recording), sketch(recording)
+    assert whole[0] == pieces[0]
+    np.testing.assert_array_equal(whole[1].values, pieces[1].values)
+    np.testing.assert_array_equal(np.stack(list(columns.columns(recording)), axis=1), recording.values)
 
 
 def test_data_set_tells_repeats_and_a_channel_in_two_units(tmp_path):

@@ -25,7 +25,7 @@ from edp.evaluation.tally import Tally
 from edp.logs import read_data_set, write_recording
 from edp.logs.quality.cross_recording import compare
 from edp.logs.quality.quality import inspect
-from edp.logs.quality.repeats import Sketches, sketch
+from edp.logs.quality.sketches import Sketches, sketch
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
 from edp.recording import Recording

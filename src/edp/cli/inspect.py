@@ -133,7 +133,7 @@ def _coverage(
     source: DataSource, split: str, inputs: tuple[str, ...], asked: bool, inspection: Inspection | None
 ) -> tuple[Coverage | None, str]:
     """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
-    from edp.workflows.train_evaluate import coverage
+    from edp.workflows.covering import coverage
 
     if inspection is not None and (inspection.coverage is not None or not asked):
         return inspection.coverage, inspection.why

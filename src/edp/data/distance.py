@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from edp.data.roles import Axis
 from edp.data.splits import Split, Stretch
@@ -53,6 +52,8 @@ def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split:
     mean, deviation = whole.mean(axis=0), whole.std(axis=0)
     # Infinity takes a constant signal out of the distance.
     scale = np.where(deviation > 0, deviation, np.inf) * max(int(np.count_nonzero(deviation)), 1) ** 0.5
+
+    from scipy.spatial import cKDTree  # here: whatever looks at coverage would wait for it
 
     def nearest(references: Array, queries: Array) -> Array:
         tree = cKDTree((_evenly(references, size) - mean) / scale)

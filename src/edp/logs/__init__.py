@@ -13,7 +13,8 @@ from edp.logs.quality.checks import Finding
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import inspect_log, look_into
 from edp.logs.quality.quality import ChannelFacts, ClockFacts, QualityReport, inspect
-from edp.logs.quality.repeats import Repeat, Sketch, find_repeats, sketch
+from edp.logs.quality.repeats import Repeat, find_repeats
+from edp.logs.quality.sketches import Sketch, sketch
 from edp.logs.read import (
     common_channels,
     find_recordings,

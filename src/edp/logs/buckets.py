@@ -32,7 +32,7 @@ MOST_OBJECTS = 1_000_000
 HELP = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, or a profile; AWS_ENDPOINT_URL for another server",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS; STORAGE_EMULATOR_HOST for another server",
-    "az": "AZURE_STORAGE_ACCOUNT and AZURE_STORAGE_KEY, or a login of az",
+    "az": "AZURE_STORAGE_ACCOUNT and AZURE_STORAGE_KEY, or a login of az; AZURE_STORAGE_ENDPOINT for another server",
 }
 """Where each service looks for credentials."""
 Result = TypeVar("Result")
@@ -134,12 +134,15 @@ class BucketReader:
         return digest.hexdigest()
 
     def _pieces(self, address: str, most: int) -> Iterator[bytes]:
-        stream: IO[bytes] = self._in_time(lambda: self._files.open_input_file(self._path(address)), address)
-        size = self._in_time(lambda: int(stream.size()), address)  # type: ignore[attr-defined]
-        if size > most:
-            raise DataError(f"'{address}' has {size:,} bytes, {most:,} were expected; it was changed: list it again")
-        for start in range(0, size, PIECE_BYTES):
-            yield self._in_time(lambda at=start: stream.read_at(PIECE_BYTES, at), address)  # type: ignore[attr-defined, misc]
+        # As a stream: of a file, pyarrow asks Google's servers for all bytes, and holds the interpreter's lock,
+        # so that no limit of time would count.
+        stream: IO[bytes] = self._in_time(lambda: self._files.open_input_stream(self._path(address), None), address)
+        came = 0
+        while piece := self._in_time(lambda: stream.read(PIECE_BYTES), address):
+            came += len(piece)
+            if came > most:
+                raise DataError(f"'{address}' has more than the {most:,} bytes expected; it was changed: list it again")
+            yield piece
 
     def _path(self, address: str) -> str:
         match = ADDRESS.fullmatch(address)
@@ -173,15 +176,22 @@ class BucketReader:
     def _in_words(self, error: BaseException, address: str) -> BaseException:
         if isinstance(error, FileNotFoundError):
             return DataError(f"'{address}' does not exist: the bucket has no object of this name")
-        if not isinstance(error, OSError):
+        from pyarrow import ArrowException
+
+        # Azure's refusals come as pyarrow's own errors.
+        if not isinstance(error, OSError | ArrowException):
             return error
         text = brief(error, 300)
-        if any(word in text.upper().replace(" ", "_") for word in REFUSED):
+        if REFUSED.search(text.upper().replace(" ", "_")):
             return StorageError(f"'{address}': the bucket refuses to be read ({text}); set {HELP[self.scheme]}")
         return StorageError(f"'{address}' cannot be read: {text}; see that the server can be reached, and try again")
 
 
-REFUSED = ("ACCESS_DENIED", "FORBIDDEN", "403", "401", "UNAUTHORIZED", "INVALID_ACCESS_KEY", "SIGNATURE", "CREDENTIALS")
+REFUSED = re.compile(
+    # Numbers stand alone: a port or a key may hold their digits.
+    r"ACCESS_?DENIED|PERMISSION_DENIED|FORBIDDEN|(?<![0-9A-Z:])40[13](?![0-9])|UNAUTHORIZED|AUTHORIZATION|"
+    r"AUTHENTICATION|INVALID_?ACCESS_?KEY|SIGNATURE|CREDENTIALS"
+)
 """What services call a refusal."""
 
 
@@ -206,10 +216,20 @@ def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> An
         url = urlsplit(host if "://" in host else f"http://{host}") if host else None
         server = {"endpoint_override": url.netloc, "scheme": url.scheme} if url else {}
         return fs.GcsFileSystem(anonymous=url is not None, retry_time_limit=timedelta(seconds=ANSWER_S), **server)
-    account = environment.get("AZURE_STORAGE_ACCOUNT")
+    account, endpoint = environment.get("AZURE_STORAGE_ACCOUNT"), environment.get("AZURE_STORAGE_ENDPOINT")
     if not account:
         raise ConfigError(f"az:// needs the name of the storage account: set {HELP['az']}")
-    return fs.AzureFileSystem(account, account_key=environment.get("AZURE_STORAGE_KEY"))
+    url = urlsplit(endpoint) if endpoint else None
+    server = (
+        {
+            f"{service}_{part}": value
+            for service in ("blob_storage", "dfs_storage")
+            for part, value in (("authority", url.netloc), ("scheme", url.scheme))
+        }
+        if url
+        else {}
+    )
+    return fs.AzureFileSystem(account, account_key=environment.get("AZURE_STORAGE_KEY"), **server)
 
 
 @contextmanager

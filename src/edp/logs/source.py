@@ -16,7 +16,7 @@ from edp.logs.detect import known_suffixes
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into, unreadable
 from edp.logs.quality.quality import inspect
-from edp.logs.quality.repeats import Sketches, sketch
+from edp.logs.quality.sketches import Sketches, sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
 from edp.logs.store.building import StoredLog, StoreProgress, build_store

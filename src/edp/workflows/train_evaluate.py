@@ -13,11 +13,8 @@ from safetensors.numpy import save
 
 from edp import __version__
 from edp.config.experiment import Experiment, experiment_toml, load_experiment, plain_tree
-from edp.data.coverage import Coverage, cover
 from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
-from edp.data.spectrum import LAGS
-from edp.data.splits import SPLITS
 from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
 from edp.evaluation.conditional import collinear
@@ -41,22 +38,6 @@ from edp.training.strategy import DirectFit, TrainingStrategy
 
 if TYPE_CHECKING:
     from edp.sim.data_set import SimulationOrder, simulate_data_set
-
-
-def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
-    """What a data set covers: see `edp.data.coverage`.
-
-    Args:
-        source: where the recordings are.
-        inputs: channels that command, where neither names nor kinds tell.
-        split: name of a split with its usual settings, to say how far tests lie from training.
-
-    Raises:
-        EdpError: the recordings cannot be read as they are, or do not command or move anything; an unknown split.
-    """
-    chosen = SPLITS[split]() if split else None
-    recordings = source.read()
-    return cover(recordings, inputs, None if chosen is None else chosen.split(recordings, LAGS))
 
 
 class RecordingSource(Protocol):
@@ -383,7 +364,6 @@ __all__ = [
     "StrategyFactory",
     "build_report",
     "channel_importance",
-    "coverage",
     "evaluate",
     "judge_bundle",
     "prepare_data",

@@ -10,13 +10,13 @@ from edp.data.coverage import Coverage
 from edp.errors import ConfigError, StorageError
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
+from edp.workflows.covering import coverage
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.units import UnitError
 from edp.workflows.fleet import simulating
 from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 from edp.workflows.fleet.simulating import simulate_with
 from edp.workflows.fleet.storing import store_with
-from edp.workflows.train_evaluate import coverage
 
 
 def test_simulated_logs_are_the_same_and_a_stopped_set_goes_on(small_logs, small_order, here, tmp_path):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.logs.quality.columns import columns
 from edp.logs.quality.measures import Measures, Values, measure
 from edp.logs.repair import runs
 from edp.recording import Recording
@@ -144,12 +145,11 @@ def copies(recording: Recording) -> list[Finding]:
     """Channels that equal an earlier one of the recording in every sample; constant ones do not count."""
     seen: dict[bytes, str] = {}
     findings = []
-    for channel_index, channel in enumerate(recording.channels):
-        values = np.ascontiguousarray(recording.values[:, channel_index])
+    for channel, values in zip(recording.channels, columns(recording), strict=True):
         # Constant channels equal each other without being copies.
         if len(values) < 2 or not np.nanmin(values, initial=np.inf) < np.nanmax(values, initial=-np.inf):
             continue
-        first = seen.setdefault(hashlib.blake2b(values.tobytes(), digest_size=16).digest(), channel.name)
+        first = seen.setdefault(hashlib.blake2b(values.data, digest_size=16).digest(), channel.name)
         if first != channel.name:
             advice = "one of them tells nothing new: leave it out"
             findings.append(Finding("note", channel.name, f"equals '{first}' in every sample", len(values), "", advice))

@@ -11,7 +11,8 @@ import numpy as np
 
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.quality import QualityReport, plain, verdict_of
-from edp.logs.quality.repeats import Repeat, Sketches, find_repeats
+from edp.logs.quality.repeats import Repeat, find_repeats
+from edp.logs.quality.sketches import Sketches
 from edp.signals import UNITS, Kind
 
 _LEAST_RATIO = 9.0

@@ -18,7 +18,7 @@ from edp.logs.proposal.columns import look_at_log
 from edp.logs.proposal.propose import plain_map
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.quality import ClockFacts, QualityReport, inspect
-from edp.logs.quality.repeats import Sketch, sketch
+from edp.logs.quality.sketches import Sketch, sketch
 from edp.logs.repair import Repair
 from edp.logs.resolve import ChannelSource, resolve
 from edp.logs.timebase import Clock, judge

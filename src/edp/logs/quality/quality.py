@@ -19,6 +19,7 @@ from edp.logs.quality.checks import (
     look_at,
     size_in_report_unit,
 )
+from edp.logs.quality.columns import columns
 from edp.recording import Recording
 from edp.signals import KINDS
 
@@ -137,8 +138,8 @@ def inspect(
     facts = []
     gaps = any(clock.gaps for clock in clocks)
     in_gaps = int(np.count_nonzero(np.isnan(recording.values).all(axis=1))) if gaps else 0
-    for channel_index, channel in enumerate(recording.channels):
-        looked = look_at(channel, recording.values[:, channel_index], recording.rate_hz, in_gaps)
+    for channel, values in zip(recording.channels, columns(recording), strict=True):
+        looked = look_at(channel, values, recording.rate_hz, in_gaps)
         of_channel = [finding for check in CHECKS for finding in check(looked)]
         of_file = [finding for finding in extra if finding.channel == channel.name]
         facts.append(_facts(looked, verdict_of([*of_channel, *of_file])))

@@ -7,22 +7,15 @@ recordings; the lag is then checked over the whole overlap, in every channel.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from edp.recording import Recording
+from edp.logs.quality.sketches import Floats, Sketch
 
-SKETCH_HZ = 10.0
-"""Rate of a sketch: fast enough for moves of a machine, and any logger reaches it."""
-MOST_BYTES = 256 * 2**20
-"""Of the sketches of a data set: 40 hours of 45 channels."""
-HASHED_ROWS = 65_536
 WINDOW = 128
 """Blocks of a fingerprint, 12.8 s."""
 _HOP = 32
@@ -52,47 +45,8 @@ do but for noise; of two that are driven alike about half of them did."""
 _SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
 """Fractions of a block: two recordings began at different moments between the ticks of 10 Hz."""
 
-Floats = NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class Sketch:
-    """A recording at a low rate.
-
-    Attributes:
-        name: of the recording.
-        channels: names, in the order of the columns.
-        values: means over 0.1 s, each channel over its deviation about its mean, shape ``(block, channel)``.
-        hz: blocks per second; `SKETCH_HZ`, or the recording's own rate where that is lower.
-        digest: of the samples, whatever the channels are called.
-        seconds: that the recording lasts.
-    """
-
-    name: str
-    channels: tuple[str, ...]
-    values: Floats
-    hz: float
-    digest: str
-    seconds: float
-
-    def with_hash_alone(self) -> Sketch:
-        """The sketch less its values: the recording is compared by the hash of its samples alone."""
-        return replace(self, values=self.values[:0].copy())
-
-
-class Sketches:
-    """The sketches of a data set; once they take `most` bytes, further recordings leave their hash alone."""
-
-    def __init__(self, most: int = MOST_BYTES) -> None:
-        self.left, self.all, self.by_hash = most, list[Sketch](), 0
-
-    def add(self, sketch: Sketch) -> None:
-        """Keep one more."""
-        self.left -= sketch.values.nbytes
-        if self.left < 0:
-            sketch = sketch.with_hash_alone()
-            self.by_hash += 1
-        self.all.append(sketch)
+Labels = NDArray[np.int64]
+"""Recording and block of fingerprints, shape ``(fingerprint, 2)``; or votes, see `_votes`."""
 
 
 @dataclass(frozen=True)
@@ -142,31 +96,6 @@ class Repeat:
         return {**asdict(self), "renamed": [list(pair) for pair in self.renamed], "what": self.what}
 
 
-def sketch(recording: Recording, name: str | None = None) -> Sketch:
-    """The sketch of a recording; missing values count as the mean of their channel."""
-    rate = recording.rate_hz
-    hz = min(SKETCH_HZ, rate)
-    blocks = max(int(recording.samples * hz / rate), 1)
-    # 1e-9: a rate that divides evenly must not lose a sample to rounding.
-    starts = np.minimum(np.ceil(np.arange(blocks) * rate / hz - 1e-9).astype(np.intp), recording.samples - 1)
-    block_means = np.empty((blocks, len(recording.channels)), dtype=np.float32)
-    counts = np.diff(np.append(starts, recording.samples))
-    for channel_index in range(len(recording.channels)):
-        values = recording.values[:, channel_index].astype(np.float64)
-        good = np.isfinite(values)
-        mean = float(values[good].mean()) if good.any() else 0.0
-        values = np.where(good, values - mean, 0.0)
-        coarse = np.add.reduceat(values, starts) / np.maximum(counts, 1)
-        std = float(coarse.std())
-        # Divided by a deviation of rounding, a channel at rest would become noise.
-        block_means[:, channel_index] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
-    digest = hashlib.blake2b(digest_size=16)
-    for start in range(0, recording.samples, HASHED_ROWS):
-        digest.update(np.ascontiguousarray(recording.values[start : start + HASHED_ROWS]).data)
-    text, seconds = digest.hexdigest(), recording.samples / rate
-    return Sketch(name or recording.name, recording.channel_names, block_means, hz, text, seconds)
-
-
 def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
     """Pairs of recordings that hold the same session, the longest shared stretch first.
 
@@ -196,36 +125,56 @@ def _identical(a: Sketch, b: Sketch) -> Repeat:
 
 
 def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
-    """The lag, in blocks, that most fingerprints of a pair of recordings vote for."""
+    """The lag, in blocks, that most fingerprints of a pair of recordings vote for.
+
+    Fingerprints are made twice, a channel of a recording at a time: those of forty hours together take gigabytes.
+    """
+    # Imported where it is used: every reader of a log would wait for it, half as long as for all else.
+    from scipy.spatial import cKDTree
+
     long = [i for i, entry in enumerate(sketches) if len(entry.values) >= WINDOW + _HOP]
     if len(long) < 2:
         return {}
-    prints: list[Floats] = []
-    labels: list[NDArray[np.int64]] = []
     chosen = _telling(sketches)
-    for i in long:
-        for window_index in chosen[i]:
-            marks, places = _fingerprints(sketches[i].values[:, window_index])
-            prints.append(marks)
-            labels.append(np.stack([np.full(len(places), i), places], axis=1))
-    marks, owners = np.concatenate(prints), np.concatenate(labels)
-    probes = np.flatnonzero(owners[:, 1] % _HOP == 0)
-    if not len(probes):
+    columns_of = [(i, column) for i in long for column in chosen[i]]
+    searched: list[Floats] = []
+    labels: list[Labels] = []
+    for i, column in columns_of:
+        marks, places = _fingerprints(sketches[i].values[:, column])
+        probes = np.flatnonzero(places % _HOP == 0)
+        searched.append(marks[probes])
+        labels.append(np.stack([np.full(len(probes), i), places[probes]], axis=1))
+    owners = np.concatenate(labels)
+    if not len(owners):
         return {}
-    near, which = cKDTree(marks[probes]).query(marks, k=_NEIGHBOURS, distance_upper_bound=_NEAR)
-    asked, rank = np.nonzero(np.isfinite(near))
-    mine, theirs = owners[asked], owners[probes[which[asked, rank]]]
-    other = mine[:, 0] != theirs[:, 0]
-    return _voted(mine[other], theirs[other])
+    tree = cKDTree(np.concatenate(searched))
+    votes = []
+    for i, column in columns_of:
+        marks, places = _fingerprints(sketches[i].values[:, column])
+        near, which = tree.query(marks, k=_NEIGHBOURS, distance_upper_bound=_NEAR)
+        asked, rank = np.nonzero(np.isfinite(near))
+        theirs = owners[which[asked, rank]]
+        other = theirs[:, 0] != i
+        votes.append(_votes(i, places[asked][other], theirs[other]))
+    return _elected(*(np.concatenate(part) for part in zip(*votes, strict=True)))
 
 
-def _voted(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> dict[tuple[int, int], int]:
-    swap = mine[:, 0] > theirs[:, 0]
+def _votes(i: int, places: NDArray[np.int64], theirs: Labels) -> tuple[Labels, NDArray[np.int64]]:
+    """Votes of a recording's windows, shape ``(vote, 3)`` with two recordings in order and a lag, and their numbers."""
+    swap = i > theirs[:, 0]
+    mine = np.stack([np.full(len(places), i), places], axis=1)
     a, b = np.where(swap[:, None], theirs, mine), np.where(swap[:, None], mine, theirs)
-    votes, counts = np.unique(np.stack([a[:, 0], b[:, 0], b[:, 1] - a[:, 1]], axis=1), axis=0, return_counts=True)
+    return np.unique(np.stack([a[:, 0], b[:, 0], b[:, 1] - a[:, 1]], axis=1), axis=0, return_counts=True)
+
+
+def _elected(votes: Labels, numbers: NDArray[np.int64]) -> dict[tuple[int, int], int]:
+    """The lag of each pair with enough votes."""
+    votes, where = np.unique(votes, axis=0, return_inverse=True)
+    counts = np.zeros(len(votes), dtype=np.int64)
+    np.add.at(counts, where, numbers)
     # the true lag lies between two blocks: its votes may be shared by them
     follows = (np.diff(votes[:, :2], axis=0) == 0).all(axis=1) & (np.diff(votes[:, 2]) == 1)
-    both = counts.astype(np.int64)
+    both = counts.copy()
     both[:-1] += np.where(follows, counts[1:], 0)
     both[1:] += np.where(follows, counts[:-1], 0)
     best: dict[tuple[int, int], tuple[int, int, int]] = {}

@@ -12,7 +12,7 @@ from edp.data.coverage import Coverage
 from edp.errors import DataError, EdpError
 from edp.logs import DataQuality, QualityReport, Sketch, compare, inspect, look_into, sketch, unique_names
 from edp.logs.quality.inspection import unreadable
-from edp.logs.quality.repeats import Sketches
+from edp.logs.quality.sketches import Sketches
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource
 from edp.logs.store import read_index, read_store
@@ -20,11 +20,11 @@ from edp.recording import Recording
 from edp.settings.tree import build, plain_tree
 from edp.signals import SignalMap
 from edp.storage.ledger import TrainingIdentity, WithState
+from edp.workflows.covering import coverage
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.packing import packed, unpacked
 from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 from edp.workflows.fleet.storing import keys_of, stored_logs
-from edp.workflows.train_evaluate import coverage
 
 STORED_UNITS = 64
 """Units that the recordings of a store are divided into, about: opening a store takes longer the more it holds."""
@@ -33,7 +33,7 @@ OnLog = Callable[[Path, int, int], None]
 
 @dataclass(frozen=True)
 class CoverageOrder:
-    """Which coverage is asked for; see `edp.workflows.train_evaluate.coverage`."""
+    """Which coverage is asked for; see `edp.workflows.covering.coverage`."""
 
     inputs: tuple[str, ...] = ()
     split: str = ""
@@ -65,7 +65,7 @@ class Inspection:
 def inspect_with(
     workforce: Workforce, source: DataSource, covers: CoverageOrder | None = None, on_log: OnLog | None = None
 ) -> Inspection:
-    """As `DataSource.inspect`, and `edp.workflows.train_evaluate.coverage`, by a workforce.
+    """As `DataSource.inspect`, and `edp.workflows.covering.coverage`, by a workforce.
 
     Args:
         workforce: who looks; nodes see the logs under the same paths.

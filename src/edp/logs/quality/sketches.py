@@ -1,0 +1,84 @@
+"""Recordings at a low rate, as they are compared by: whether a session repeats, and which samples are the same."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.logs.quality.columns import columns
+from edp.recording import Recording
+
+SKETCH_HZ = 10.0
+"""Rate of a sketch: fast enough for moves of a machine, and any logger reaches it."""
+MOST_BYTES = 256 * 2**20
+"""Of the sketches of a data set: 40 hours of 45 channels."""
+HASHED_ROWS = 65_536
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """A recording at a low rate.
+
+    Attributes:
+        name: of the recording.
+        channels: names, in the order of the columns.
+        values: means over 0.1 s, each channel over its deviation about its mean, shape ``(block, channel)``.
+        hz: blocks per second; `SKETCH_HZ`, or the recording's own rate where that is lower.
+        digest: of the samples, whatever the channels are called.
+        seconds: that the recording lasts.
+    """
+
+    name: str
+    channels: tuple[str, ...]
+    values: Floats
+    hz: float
+    digest: str
+    seconds: float
+
+    def with_hash_alone(self) -> Sketch:
+        """The sketch less its values: the recording is compared by the hash of its samples alone."""
+        return replace(self, values=self.values[:0].copy())
+
+
+class Sketches:
+    """The sketches of a data set; once they take `most` bytes, further recordings leave their hash alone."""
+
+    def __init__(self, most: int = MOST_BYTES) -> None:
+        self.left, self.all, self.by_hash = most, list[Sketch](), 0
+
+    def add(self, sketch: Sketch) -> None:
+        """Keep one more."""
+        self.left -= sketch.values.nbytes
+        if self.left < 0:
+            sketch = sketch.with_hash_alone()
+            self.by_hash += 1
+        self.all.append(sketch)
+
+
+def sketch(recording: Recording, name: str | None = None) -> Sketch:
+    """The sketch of a recording; missing values count as the mean of their channel."""
+    rate = recording.rate_hz
+    hz = min(SKETCH_HZ, rate)
+    blocks = max(int(recording.samples * hz / rate), 1)
+    # 1e-9: a rate that divides evenly must not lose a sample to rounding.
+    starts = np.minimum(np.ceil(np.arange(blocks) * rate / hz - 1e-9).astype(np.intp), recording.samples - 1)
+    block_means = np.empty((blocks, len(recording.channels)), dtype=np.float32)
+    counts = np.diff(np.append(starts, recording.samples))
+    for channel_index, column in enumerate(columns(recording)):
+        values = column.astype(np.float64)
+        good = np.isfinite(values)
+        mean = float(values[good].mean()) if good.any() else 0.0
+        values = np.where(good, values - mean, 0.0)
+        coarse = np.add.reduceat(values, starts) / np.maximum(counts, 1)
+        std = float(coarse.std())
+        # Divided by a deviation of rounding, a channel at rest would become noise.
+        block_means[:, channel_index] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
+    digest = hashlib.blake2b(digest_size=16)
+    for start in range(0, recording.samples, HASHED_ROWS):
+        digest.update(np.ascontiguousarray(recording.values[start : start + HASHED_ROWS]).data)
+    text, seconds = digest.hexdigest(), recording.samples / rate
+    return Sketch(name or recording.name, recording.channel_names, block_means, hz, text, seconds)

@@ -1,0 +1,26 @@
+"""What the recordings of a source cover; without the libraries of a training, which take most of a command's start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from edp.data.coverage import Coverage, cover
+from edp.data.spectrum import LAGS
+from edp.data.splits import SPLITS
+from edp.logs.source import DataSource
+
+
+def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
+    """What a data set covers: see `edp.data.coverage`.
+
+    Args:
+        source: where the recordings are.
+        inputs: channels that command, where neither names nor kinds tell.
+        split: name of a split with its usual settings, to say how far tests lie from training.
+
+    Raises:
+        EdpError: the recordings cannot be read as they are, or do not command or move anything; an unknown split.
+    """
+    chosen = SPLITS[split]() if split else None
+    recordings = source.read()
+    return cover(recordings, inputs, None if chosen is None else chosen.split(recordings, LAGS))
