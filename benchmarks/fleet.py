@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -54,6 +55,7 @@ PARTS = ("before", "full", "delta")
 LEAST_S = 1.0
 """Processor time of one process, below which two are not compared with it: the system counts in hundredths, and the
 start of a worker differs by tenths."""
+BASELINES = ("persistence", "ridge_arx", "small_mlp")
 HOURS, CORES = 10_000.0, 100
 NETWORK = (
     'model.backbone={kind="hybrid",channels=[64],kernel=4,units=64}',
@@ -125,7 +127,7 @@ def commands(bench: Bench) -> dict[str, Command]:
     """Each command on the data of a name: ``many`` for the measure, ``few`` for what starting takes."""
     size = bench.size
     orders = {"many": bench.order(size.minutes, size.recordings), "few": bench.order(0.2, 2)}
-    run = Path() if bench.quick else bench.run()
+    run = Path() if bench.quick or (bench.work / "command_evaluate.json").exists() else bench.run()
     for name, order in orders.items():
         bench.logs(name, order)
 
@@ -140,7 +142,7 @@ def commands(bench: Bench) -> dict[str, Command]:
 
     def evaluate(workforce: Workforce, out: Path, name: str) -> object:
         shutil.copytree(run, out / "run")
-        return evaluate_with(workforce, out / "run", source(name))
+        return evaluate_with(workforce, out / "run", source(name), BASELINES)
 
     return {
         "simulate": lambda workforce, out, name: simulate_with(workforce, out / "logs", orders[name]),
@@ -182,21 +184,18 @@ def in_turn(command: Command, workforce: Workforce) -> tuple[float, float, float
         return started, meter.here(), meter.busiest()
 
 
-def two_against_one(bench: Bench) -> list[dict[str, Any]]:
-    rows = []
-    for name, command in commands(bench).items():
-        _, alone, _ = in_turn(command, Workforce())
-        two = WarmPool(workers=2)
-        try:
-            started, here, there = in_turn(command, two)
-        finally:
-            two.end()
-        rows.append({
-            "command": name, "one process, s": alone, "two: coordinator, s": here, "two: busier worker, s": there,
-            "starting a worker, s": started, "times": alone / (here + there) if alone >= LEAST_S else None,
-        })  # fmt: skip
-        print(rows[-1], flush=True)
-    return rows
+def two_against_one(command: Command) -> dict[str, Any]:
+    """Processor time of a command in one process and in two workers."""
+    _, alone, _ = in_turn(command, Workforce())
+    two = WarmPool(workers=2)
+    try:
+        started, here, there = in_turn(command, two)
+    finally:
+        two.end()
+    return {
+        "one process, s": alone, "two: coordinator, s": here, "two: busier worker, s": there,
+        "starting a worker, s": started, "times": alone / (here + there) if alone >= LEAST_S else None,
+    }  # fmt: skip
 
 
 def coordinating(workers: int) -> dict[str, float]:
@@ -352,7 +351,11 @@ def measure(bench: Bench, with_curve: bool) -> dict[str, Any]:
     found: dict[str, Any] = {"coordinator": part("coordinator", lambda: coordinating(2))}
     found["deltas"] = part("deltas", lambda: deltas(bench))
     found["exchange"] = part("exchange", lambda: exchange(bench, found["deltas"]["parameters"]))
-    found["commands"] = rows = part("two_against_one", lambda: two_against_one(bench))
+    rows = []
+    for name, command in commands(bench).items():
+        rows.append({"command": name, **part(f"command_{name}", partial(two_against_one, command))})
+        print(rows[-1], flush=True)
+    found["commands"] = rows
     if with_curve:
         found["curve"] = part("curve", lambda: curve(bench))
     return found | {"cost": part("cost", lambda: cost(bench, rows, found["coordinator"]["ms_a_unit"]))}

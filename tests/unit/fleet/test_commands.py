@@ -1,5 +1,6 @@
 """Commands in units give what the commands give in one process, to the bit."""
 
+import errno
 import json
 from dataclasses import replace
 
@@ -7,13 +8,15 @@ import numpy as np
 import pytest
 
 from edp.data.coverage import Coverage
-from edp.errors import ConfigError, StorageError
+from edp.errors import ConfigError, DataError, StorageError
+from edp.logs import read_data_set
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
+from edp.storage import replacing
 from edp.workflows.covering import coverage
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.units import UnitError
-from edp.workflows.fleet import simulating
+from edp.workflows.fleet import simulating, storing
 from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 from edp.workflows.fleet.simulating import simulate_with
 from edp.workflows.fleet.storing import store_with
@@ -55,6 +58,51 @@ def test_a_folder_that_only_the_node_sees_is_told(small_order, here, tmp_path, m
     monkeypatch.setattr(simulating, "write_one", elsewhere)
     with pytest.raises(StorageError, match="was written on another node"):
         simulate_with(here, tmp_path / "logs", replace(small_order, recordings=1))
+
+
+def test_a_disk_that_fills_in_a_unit_is_named_and_what_was_written_stays(
+    small_logs, small_order, here, tmp_path, monkeypatch
+):
+    real, written = simulating.write_recording, []
+
+    def full(recording, path, options):
+        if len(written) == 2:
+            with replacing(path):
+                raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(real(recording, path, options))
+
+    monkeypatch.setattr(simulating, "write_recording", full)
+    with pytest.raises(StorageError, match=r"recording '.*': .*No space left on device; free space"):
+        simulate_with(here, tmp_path / "logs", small_order)
+    assert len(list((tmp_path / "logs").glob("*.parquet"))) == 2
+    monkeypatch.setattr(simulating, "write_recording", real)
+    kept = []
+    paths = simulate_with(here, tmp_path / "logs", small_order, lambda recording, there: kept.append(there))
+    assert sorted(kept) == [False, False, True, True]
+    assert [path.read_bytes() for path in paths] == [(small_logs / path.name).read_bytes() for path in paths]
+
+
+def test_a_store_whose_disk_fills_in_a_unit_goes_on_where_it_was(small_logs, here, tmp_path, monkeypatch):
+    monkeypatch.setattr(storing, "BATCH_LOG_BYTES", 1)  # a batch a log
+    real, done = storing.store_batch, []
+
+    def full(batch):
+        if len(done) == 2:
+            with replacing(tmp_path / "rows"):
+                raise OSError(errno.ENOSPC, "No space left on device")
+        done.append(batch.key)
+        return real(batch)
+
+    source = DataSource.of(small_logs)
+    monkeypatch.setattr(storing, "store_batch", full)
+    with pytest.raises(StorageError, match="No space left on device; free space"):
+        store_with(here, source, tmp_path / "store")
+    with pytest.raises(DataError, match="is half built"):
+        read_store(tmp_path / "store")
+    monkeypatch.setattr(storing, "store_batch", lambda batch: done.append(batch.key) or real(batch))
+    index = store_with(here, source, tmp_path / "store")
+    assert len(done) == len(set(done)) == 4  # none twice
+    assert [one.digest for one in index.recordings] == [one.digest for one in read_data_set(small_logs)]
 
 
 def test_a_store_built_in_units_holds_the_same_recordings_and_reads_nothing_twice(small_logs, here, tmp_path):
