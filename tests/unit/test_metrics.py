@@ -1,11 +1,22 @@
 import json
+from statistics import NormalDist
 
 import numpy as np
 import pytest
 from sklearn import metrics as sk
 
 from edp.errors import DataError
-from edp.stats.metrics import COMPOSITE_WEIGHTS, Scores, composite, interval_scores, mean_scores, score, spread
+from edp.stats.metrics import (
+    COMPOSITE_WEIGHTS,
+    Scores,
+    composite,
+    interval_score,
+    interval_scores,
+    mean_scores,
+    score,
+    spread,
+    weighted_interval_score,
+)
 
 
 @pytest.fixture
@@ -107,6 +118,41 @@ def test_spread():
     assert spread([2.0])["std"] is None
     with pytest.raises(DataError, match="NaN"):
         spread([1.0, float("nan")])
+
+
+def test_interval_scores_by_hand():
+    """Width 2; the second value lies 1 below and the third 3 above: (0 + 1 + 3) / 3 times 2 / 0.1."""
+    low, high, truth = np.zeros(3), np.full(3, 2.0), np.array([1.0, -1.0, 5.0])
+    assert interval_score(low, high, truth, 0.9) == pytest.approx(2.0 + 20.0 * 4.0 / 3.0)
+    for coverage in (0.0, 1.0, float("nan")):
+        with pytest.raises(DataError, match="between 0 and 1"):
+            interval_score(low, high, truth, coverage)
+
+
+def test_true_quantiles_have_the_least_interval_score():
+    truth = np.random.default_rng(0).normal(size=20_000)
+
+    def score_of(reach):
+        return interval_score(np.full(truth.shape, -reach), np.full(truth.shape, reach), truth, 0.9)
+
+    assert score_of(1.645) < min(score_of(1.3), score_of(2.0))
+
+
+def test_a_weighted_interval_score_is_twice_the_mean_pinball_loss_and_nears_the_crps():
+    """Of a point it is the absolute error; of many intervals of N(0, 1) its CRPS, 0.5642 in expectation."""
+    assert weighted_interval_score(3.0, {}) == 3.0
+    truth, levels = np.random.default_rng(1).normal(size=20_000), (np.arange(1, 100) / 100)
+    normal = NormalDist()
+    bounds = {c: normal.inv_cdf(0.5 + c / 2) for c in (2 * levels[levels > 0.5] - 1).tolist()}
+    scores = {
+        c: interval_score(np.full(truth.shape, -reach), np.full(truth.shape, reach), truth, c)
+        for c, reach in bounds.items()
+    }
+    ours = weighted_interval_score(float(np.abs(truth).mean()), scores)
+    quantiles = np.array([normal.inv_cdf(level) for level in levels])
+    off = truth[:, None] - quantiles
+    assert ours == pytest.approx(2 * np.maximum(levels * off, (levels - 1) * off).mean(), rel=1e-9)
+    assert ours == pytest.approx(0.5642, rel=0.03)
 
 
 def test_intervals_count_what_lies_between_their_bounds():

@@ -185,14 +185,20 @@ def test_intervals_are_judged_and_shown(output, logs, tmp_path, capsys):
     assert [row["coverage"] for row in rows] == [0.9, 0.5]
     # The same by hand, from bounds in SI units.
     data = prepare_data(source_of(logs), load_experiment(tmp_path / "run" / "config.toml", preset=None))
-    inside, width = [], []
+    inside, width, outside = [], [], []
     for part, bounds in zip(data.test, stream_intervals(bundle.predictor, data.test), strict=True):
         truth = part.targets[2 + 8 :]
         lower, upper = bounds[8 : part.samples - 2, 0, :, 0].transpose(1, 0, 2)
         inside.append((lower <= truth) & (truth <= upper))
         width.append(1000 * (upper - lower))
+        outside.append((1000 * np.maximum(lower - truth, 0.0), 1000 * np.maximum(truth - upper, 0.0)))
     assert rows[0]["covered"]["v"] == rows[0]["covered"]["mean"] == pytest.approx(np.concatenate(inside).mean())
     assert rows[0]["width"]["v"] == pytest.approx(np.concatenate(width).mean(), rel=1e-5)
+    below, above = (np.concatenate(parts) for parts in zip(*outside, strict=True))
+    assert rows[0]["score"]["v"] == pytest.approx((np.concatenate(width) + 20.0 * (below + above)).mean(), rel=1e-5)
+    mae = scores["models"]["network"]["overall"]["2"]["v"]["mae"]
+    weighted = 0.5 * mae + sum(0.5 * (1 - row["coverage"]) * row["score"]["v"] for row in rows)
+    assert scores["models"]["network"]["weighted_interval_score"]["2"]["v"] == pytest.approx(weighted / 2.5)
     score_table(scores)
     assert "meant" in capsys.readouterr().out
     page = build_report(tmp_path / "run").read_text(encoding="utf-8")

@@ -274,3 +274,5 @@ def interval_rows(scores: dict[str, Any], unit: str) -> None:
     ]
     if rows:
         table(f"intervals of the network, mean over outputs, {unit}", ["ahead", "meant", "holds", "mean width"], rows)
+    for horizon, score in scores["models"]["network"].get("weighted_interval_score", {}).items():
+        out.print(f"weighted interval score, k = {horizon}: {score['mean']:.4g} {unit} (a point: its MAE)")

@@ -22,6 +22,7 @@ from edp.evaluation.situation import situation_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import streamed
 from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
+from edp.stats.metrics import weighted_interval_score
 from edp.stats.sketch import MOST_EXACT
 from edp.storage.memory import check_setting
 
@@ -184,6 +185,7 @@ class ModelBench:
         if coverages:
             bounds = pictures.bounds(streamed(net, net.intervals, test), nearest_to_shown(coverages))
             entry["intervals"] = self.ruler.intervals(bounds, coverages)
+            entry["weighted_interval_score"] = _weighted(entry["overall"], entry["intervals"])
         return JudgedModel(entry, pictures.tensors)
 
     def baseline(self, name: str) -> JudgedModel:
@@ -206,6 +208,19 @@ class ModelBench:
         entries = {name: dict(model.entry) for name, model in models.items()}
         scores = self.ruler.header() | {"models": entries, "situation": situation_of(self.data)} | left
         return Evaluation(scores, tensors)
+
+
+def _weighted(overall: Mapping[str, Any], intervals: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Weighted interval score by horizon and target, of medians and intervals of the same ticks."""
+    return {
+        horizon: {
+            target: weighted_interval_score(
+                overall[horizon][target]["mae"], {row["coverage"]: row["score"][target] for row in rows}
+            )
+            for target in rows[0]["score"]
+        }
+        for horizon, rows in intervals.items()
+    }
 
 
 def _on_validation(baseline: Baseline, data: Prepared, skip: int) -> dict[str, Any]:

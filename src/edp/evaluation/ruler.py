@@ -13,7 +13,7 @@ from edp.errors import DataError
 from edp.evaluation.by_situation import Situations, SituationTally
 from edp.evaluation.tally import Tally, Values, named_scores
 from edp.signals import KINDS
-from edp.stats.metrics import interval_scores, score, spread
+from edp.stats.metrics import interval_score, interval_scores, score, spread
 from edp.stats.sketch import QuantileSketch
 
 # Six bins show where an error grows with speed and leave enough samples in each.
@@ -120,9 +120,9 @@ class Ruler:
         return scores | ({"integrated": roots} if roots else {})
 
     def intervals(self, bounds: Numbered, coverages: Sequence[float]) -> dict[str, Any]:
-        """Share of the truth that each interval holds and its mean width, by horizon, coverage and target."""
+        """Share of the truth that each interval holds, its mean width and score, by horizon, coverage and target."""
         shape = (len(self.task.horizons), len(coverages), len(self.task.targets))
-        covered, wide, ticks = np.zeros(shape), np.zeros(shape), 0
+        covered, wide, scored, ticks = np.zeros(shape), np.zeros(shape), np.zeros(shape), 0
         for number, pairs in bounds:
             truth = self.truth(number)[self.skip :]
             if not len(truth):
@@ -130,7 +130,9 @@ class Ruler:
             within = pairs[self.skip : self.skip + len(truth)].astype(np.float64) * self.factors
             ticks += len(truth)
             for h, which, i in np.ndindex(*shape):
-                share, width = interval_scores(within[:, which, 0, h, i], within[:, which, 1, h, i], truth[:, h, i])
+                bounds_of = within[:, which, 0, h, i], within[:, which, 1, h, i], truth[:, h, i]
+                share, width = interval_scores(*bounds_of)
+                scored[h, which, i] += interval_score(*bounds_of, coverages[which]) * len(truth)
                 covered[h, which, i] += share * len(truth)
                 wide[h, which, i] += width * len(truth)
         return {
@@ -139,6 +141,7 @@ class Ruler:
                     "coverage": coverage,
                     "covered": self._named(covered[h, which] / ticks),
                     "width": self._named(wide[h, which] / ticks),
+                    "score": self._named(scored[h, which] / ticks),
                 }
                 for which, coverage in enumerate(coverages)
             ]

@@ -97,6 +97,7 @@ MODEL = KeyedObject(
             )
         ),
         "intervals": NamedValues(Listed(KeyedObject({"coverage": REAL, "covered": MEANS, "width": MEANS}, BOUNDS))),
+        "weighted_interval_score": NamedValues(MEANS),
         "integrated": NamedValues(METRICS),
     },
     ("overall",),

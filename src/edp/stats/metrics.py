@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TypedDict
 
@@ -108,6 +108,43 @@ def interval_scores(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike) -> tup
         )
     inside = np.greater_equal(true, low) & np.less_equal(true, high)
     return float(inside.mean()), float(np.subtract(high, low, dtype=np.float64).mean())
+
+
+def interval_score(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike, coverage: float) -> float:
+    """Mean interval score: width, plus ``2 / (1 - coverage)`` times the distance of a true value outside.
+
+    Least in expectation where the bounds are the true quantiles (Gneiting and Raftery 2007, eq. 43).
+
+    Args:
+        lower: ``(sample,)`` in the unit of the score.
+        upper: likewise.
+        truth: likewise.
+        coverage: share of the truth that the interval is meant to hold, between 0 and 1.
+
+    Raises:
+        DataError: as `interval_scores`, or the coverage is none.
+    """
+    if not 0.0 < coverage < 1.0:
+        raise DataError(f"coverage {coverage!r} came; a share between 0 and 1 must hold")
+    _, width = interval_scores(lower, upper, truth)
+    low, high, true = (np.asarray(values, dtype=np.float64) for values in (lower, upper, truth))
+    outside = np.maximum(low - true, 0.0) + np.maximum(true - high, 0.0)
+    return width + 2.0 / (1.0 - coverage) * float(outside.mean())
+
+
+def weighted_interval_score(mae: float, scores: Mapping[float, float]) -> float:
+    """Weighted interval score of a median and its intervals, in the unit of both.
+
+    ``(mae / 2 + sum over intervals of (1 - coverage) / 2 score) / (1/2 + their number)``: the pinball loss, mean over
+    the levels of median and bounds, times two. It is the mean absolute error of a prediction without intervals, and
+    goes to the continuous ranked probability score (CRPS) with ever more intervals (Bracher et al. 2021).
+
+    Args:
+        mae: mean absolute error of the medians.
+        scores: mean interval score by coverage, of the same samples.
+    """
+    total = 0.5 * mae + sum(0.5 * (1.0 - coverage) * each for coverage, each in scores.items())
+    return total / (0.5 + len(scores))
 
 
 def mean_scores(scores: Sequence[Scores]) -> Scores:

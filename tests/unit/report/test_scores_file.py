@@ -54,6 +54,7 @@ def test_any_change_is_one_error_or_a_page(drawn, step):
     scores["models"]["network"]["intervals"] = {
         "10": [{"coverage": 0.9, "covered": {"mean": 0.88}, "width": {"mean": 3.0}}]
     }
+    scores["models"]["network"]["weighted_interval_score"] = {"10": {"mean": 2.0}}
     messages = []
     for number, path in enumerate(paths(scores)):
         for other in (KeyError, *OTHERS)[number % step :: step]:

@@ -103,7 +103,16 @@ def interval_table(facts: Facts) -> TextTable | None:
         for k, row in rows
     )
     columns = (("Interval", ""), ("Meant to hold", ""), ("Holds", ""), ("Mean width", facts.unit))
-    return TextTable("The network's intervals: share of the truth inside, mean over outputs", columns, lines)
+    caption = "The network's intervals: share of the truth inside, mean over outputs"
+    scores = facts.models[NETWORK].get("weighted_interval_score", {})
+    if scores:
+        listed = ", ".join(
+            f"{number(scores[str(k)]['mean'], places)} {facts.unit} {horizon_text(facts, k)} ahead".replace("  ", " ")
+            for k in facts.horizons
+            if str(k) in scores
+        )
+        caption += f"; weighted interval score (a point's is its MAE) {listed}"
+    return TextTable(caption, columns, lines)
 
 
 def worst_recordings_table(facts: Facts, most: int = 10) -> TextTable | None:
