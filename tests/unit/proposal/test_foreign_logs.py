@@ -144,3 +144,9 @@ def test_velocities_of_all_axes_are_predicted_where_one_of_them_shows_what_they_
     rows = [[f"{column[k]:.6f}" for column in columns.values()] for k in range(count)]
     proposal = propose(rows_of(tmp_path / "arm.csv", [tuple(columns)], rows))
     assert proposal.targets == ("qd1", "qd2")
+
+
+def test_logs_too_short_to_train_on_are_said_to_be(tmp_path):
+    rows = [(f"{k / 100:.2f}", f"{v:.4f}") for k, v in enumerate(swing(300))]
+    notes = propose(rows_of(tmp_path / "a.csv", [("time", "p [bar]")], rows)).notes
+    assert any("some 300 rows in all" in note for note in notes)
