@@ -263,6 +263,14 @@ def test_find_recordings_says_what_it_looks_for(tmp_path):
     assert [path.name for path in find_recordings(tmp_path)] == ["a.parquet", "b.csv"]
 
 
+def test_a_folder_of_files_that_are_not_read_says_how_they_become_logs(tmp_path):
+    for number in range(3):
+        np.savez(tmp_path / f"joint_{number}.npz", q=np.zeros(5))
+    (tmp_path / "notes.md").write_text("of the rig")
+    with pytest.raises(DataError, match=r"3 end in '\.npz': write its arrays as CSV or Parquet"):
+        find_recordings(tmp_path)
+
+
 def test_text_files_are_logs_where_there_are_no_others(tmp_path):
     (tmp_path / "a.txt").write_text("time,x\n0,1\n")
     assert [path.name for path in find_recordings(tmp_path)] == ["a.txt"]

@@ -15,6 +15,10 @@ _HEAD = 4096
 """Bytes by which a format is recognised: beyond the header of every format."""
 BAG_MARK = "metadata.yaml"
 """The file that makes a folder a ROS 2 bag."""
+_ARRAYS = (
+    "write its arrays as CSV or Parquet, a column a channel (in Python: pandas.DataFrame(...).to_parquet), or give "
+    "them to edp.Recordings.from_arrays"
+)
 _EXPORT = {
     ".mldatx": (
         "only MATLAB reads MLDATX: open it in the Simulation Data Inspector, press Export and choose a MAT, Parquet or "
@@ -33,6 +37,17 @@ _EXPORT = {
     ".dat": "save it as MDF 4 (.mf4), MAT or CSV with your measurement tool",
     ".xlsx": "save the sheet as CSV",
     ".xls": "save the sheet as CSV",
+    ".ods": "save the sheet as CSV",
+    ".npz": _ARRAYS,
+    ".npy": _ARRAYS,
+    ".pkl": _ARRAYS,
+    ".pickle": _ARRAYS,
+    ".feather": _ARRAYS,
+    ".h5": "copy its tables to CSV or Parquet (in Python: pandas or h5py), or save it with MATLAB's -v7.3 as .mat",
+    ".hdf5": "copy its tables to CSV or Parquet (in Python: pandas or h5py), or save it with MATLAB's -v7.3 as .mat",
+    ".json": "write its numbers as CSV or Parquet, a row a sample (in Python: pandas.DataFrame(...).to_csv)",
+    ".svdx": "export it in TwinCAT Scope as CSV with a tab or a semicolon",
+    ".tdms": "export it as MDF 4 (.mf4), MAT or CSV with your measurement tool",
 }
 _OTHERS = {
     b"PK\x03\x04": "a ZIP archive (xlsx, mldatx and the like)",
@@ -52,6 +67,11 @@ _OTHERS = {
 def known_suffixes() -> tuple[str, ...]:
     """All file endings that can be read, in the order of the registry."""
     return tuple(suffix for part in FORMATS.values() for suffix in part.suffixes)
+
+
+def export_advice(suffix: str) -> str:
+    """How a file of an ending that is not read becomes one that is; empty where nothing is known of it."""
+    return _EXPORT.get(suffix, "")
 
 
 def format_for(path: Path) -> LogFormat:

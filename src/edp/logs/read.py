@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
-from edp.logs.detect import BAG_MARK, format_for, known_suffixes, open_log
+from edp.logs.detect import BAG_MARK, export_advice, format_for, known_suffixes, open_log
 from edp.logs.formats.base import TRUTH, RawLog, holds_truth_apart, is_truth
 from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
@@ -18,6 +20,8 @@ from edp.recording import Recording, columns
 from edp.signals import SignalMap
 
 TEXT = ".txt"
+_MOST_FILES = 10_000
+"""Of a folder without logs, files whose endings are looked at."""
 RATE_TOLERANCE = 1e-3
 """Share by which rates of logs of one data set may differ: loggers state the same rate with different digits."""
 
@@ -138,8 +142,15 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         files = [file for file in files if file.suffix.lower() != TEXT]
     recording_paths = sorted([*bags, *(file for file in files if file.parent not in bags)])
     if not recording_paths:
-        raise DataError(f"'{source}' holds no log files; known endings: {', '.join(suffixes)}")
+        raise DataError(f"'{source}' holds no log files; known endings: {', '.join(suffixes)}{_instead(source)}")
     return tuple(recording_paths)
+
+
+def _instead(folder: Path) -> str:
+    """How the most frequent files of a folder become logs, where that is known; else empty."""
+    found = Counter(entry.suffix.lower() for entry in islice(folder.rglob("*"), _MOST_FILES) if entry.is_file())
+    advised = [(suffix, export_advice(suffix)) for suffix, _ in found.most_common()]
+    return next((f". {found[suffix]} end in '{suffix}': {advice}" for suffix, advice in advised if advice), "")
 
 
 def _is_truth(path: Path) -> bool:

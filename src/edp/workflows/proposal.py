@@ -225,12 +225,23 @@ def _stem(name: str) -> str:
     return name.rstrip("0123456789") or name
 
 
+_FEW_ROWS = 700
+"""Rows of all logs below which training refuses to divide them, or learns next to nothing."""
+
+
 def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str], proposal: MapProposal) -> list[str]:
     look, clock = proposal.look, proposal.clock
     notes = [] if not look.part else [f"{look.path.name}: looked at {look.part}"]
     notes += [f"{count} column(s) {reason}: left out" for reason, count in look.left_out.items()]
     if clock.check:
         notes.append(f"time: {clock.check}")
+    rows = sum(look.rows for look in group.looks) * len(group.paths) / len(group.looks)
+    rate = clock.wanted_hz or clock.rate_hz
+    rows *= rate / clock.rate_hz if rate and clock.rate_hz else 1.0
+    if rows < _FEW_ROWS:
+        notes.append(
+            f"some {rows:,.0f} rows in all: too few to train and to test on; record more, or set rate_hz higher"
+        )
     if len(group.looks) < len(group.paths):
         notes.append(f"{len(group.looks)} of {len(group.paths)} logs were looked at; the others are taken for alike")
     for other in others:

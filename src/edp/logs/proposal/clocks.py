@@ -19,10 +19,10 @@ _SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 5e8}
 _PRINTED, _MANY_STAMPS = 0.995, 50
 """Share of rows that may repeat the stamp before, and stamps that differ: whole seconds of some minutes at 100 Hz."""
 _FASTEST_HZ = 200.0
-"""Rates above are brought down to `_USUAL_HZ`: a machine moves slower, and a tick more costs on a controller."""
-_USUAL_HZ = 100.0
-_SHORT_S, _SHORT_HZ = 5.0, 1000.0
-"""A log as short as this shows what is fast, and at the usual rate it would have too few rows to learn from."""
+"""Rates above are brought down to one of `_PLAIN_HZ`: a machine moves slower, and a tick more costs on a controller."""
+_PLAIN_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0)
+_LEAST_ROWS = 1500
+"""Rows that a log should keep: from some 700 nothing can be set apart for tests and validation."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,10 @@ def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> Clock
 def _brought_down(clock: ClockGuess, rows: int) -> ClockGuess:
     if clock.rate_hz is None or clock.rate_hz <= _FASTEST_HZ:
         return clock
-    wanted_hz = _USUAL_HZ if rows > _SHORT_S * clock.rate_hz else _SHORT_HZ
-    if clock.rate_hz <= wanted_hz:
+    # A short log shows what is fast: the lowest plain rate that leaves it enough rows, else its own.
+    plain = (hz for hz in _PLAIN_HZ if hz < clock.rate_hz and rows * hz >= _LEAST_ROWS * clock.rate_hz)
+    wanted_hz = next(plain, None)
+    if wanted_hz is None:
         return clock
     check = f"{clock.rate_hz:.4g} Hz are brought to {wanted_hz:g} Hz: set rate_hz"
     return ClockGuess(
