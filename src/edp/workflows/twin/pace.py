@@ -21,8 +21,8 @@ LEAST_TICKS = 16
 def paced(training: FreeRunSpec, rate_hz: float, block: int) -> FreeRunSpec:
     """The training with lengths in ticks where the log is slow or short; lengths that the settings name stay.
 
-    On the Sjoberg arm, whose tick counts as a second, the chosen twin is 0.50 off with 5 to 40 ticks, and networks of
-    10 to 60 ticks that were all validated by one stretch 0.66 (`docs/findings.md`).
+    On the Sjoberg arm, whose tick counts as a second, the chosen twin is 0.62 off (one seed), and networks with lengths
+    of a league's own, all validated by one stretch, 0.66 (median of five; `docs/results.md`).
 
     Args:
         training: of the settings.
