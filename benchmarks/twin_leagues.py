@@ -1,66 +1,70 @@
-"""How good is a twin on public benchmarks in free run, beside what others published for them?
+"""How good is the default twin on recordings that other people made, in free run on commands alone?
 
 Each set is a machine with one actuator: a command, and a velocity (backward difference of the position or level) with
-its integral. Where the league scores what does not integrate anything (the pressure of the arm), that stands in the
-place of the velocity, alone: weights are chosen by the velocities of a twin. The twin is measured for a few ticks and
-then runs on the commands through the whole test recording. Candidates are trained on the first four fifths of the
-estimation data and chosen by a free run through the last fifth, with the first seed: recurrent networks of some
-widths, and where the description of a set names its parts (two tanks, an axis with a drive) a twin of these elements.
-The choice is trained with every seed, and so is the best candidate of the other formulation, which is shown beside it.
-The median counts, and the spread is shown.
+its integral. Where what is scored does not integrate anything (the pressure of the arm, the speed of a drive), it
+stands in the place of the velocity, alone. The twin is what `edp twin` chooses without settings from the estimation
+data; where the description of a set names its parts (two tanks, an axis with a drive), these elements are one more
+candidate. It is measured for a few ticks and then runs on the commands through the whole test recording.
 
-The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
+Published leagues have their leaders beside it. Sets from outside were chosen before anything was run on them; all have
+the static map, ARX, a subspace model and a NARX model beside it, fitted in the same run to the same estimation data.
+
+The recordings are no part of the repository: the folder of the leagues is given by --shared or EDP_SHARED_DATA, that
+of the sets from outside by --outside: drive, ballbeam, damper and dryer (.mat) as github.com/RomanFoell/DRGP-VSS has
+them in matlab/data_raw. --work keeps what is finished, so that a run may be stopped, and divided by --only.
 """
 
 from __future__ import annotations
 
 import statistics
+import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from common import Verdict, finish, parser, table
+from common import Verdict, finish, in_folder, kept, parser, table, verdict
+from edp.config.twin import TwinExperiment, load_twin_experiment, with_budget
 from edp.data.series import Series
+from edp.data.stretch_folds import StretchFold
 from edp.data.twin_channels import TwinChannels, twin_channels
+from edp.evaluation.free_run import calibrated, coverage_of, free_runs
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, Twin, fit_scales
 from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.lumped.parts import MassElement, TankElement
-from edp.networks.twin.recurrent import Recurrent
 from edp.recording import Recording
 from edp.settings.tree import read_toml
 from edp.signals import Channel, Kind
-from edp.training.elements_fit import fit_elements
-from edp.training.free_run import FreeRunSpec, fit_free_runs
-from edp.training.optimizers import Soap
+from edp.storage.runs import KeyedRun, RunFolder
+from edp.workflows.twin.choose_twin import TwinChoice
+from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from published_leagues import verdicts_of
 from real_recordings import EXAMPLES, VARIABLE, shared_folder
+from twin_rivals import fit_narx
 
 ESTIMATION = 0.8
-"""Share of the estimation data that trains; the rest chooses."""
-FLOORS = ("static", "arx")
-Candidate = tuple[int, float] | ElementsBox
-"""Units of a recurrent twin and weight of errors of its stroke, or elements."""
+"""Share of the estimation data that trains where nothing is left out in turn; the rest chooses."""
+RIVALS = ("static", "arx", "n4sid")
+QUICK = ("training.updates=[20,20,20,20]", "training.lanes=16")
+STARTS, HALF = 64, 0.5
+"""Free runs along the test recording on which intervals are judged, each of at most this share of it."""
 
 
 @dataclass(frozen=True)
 class LeagueSet:
-    """How a set becomes a machine with one actuator, and what is tried on it.
+    """How a set becomes a machine with one actuator.
 
     Attributes:
         command: column of the command.
         stroke: column of the position or level; empty for none.
         velocity: column of the velocity; empty for the backward difference of the stroke.
-        target: answer that the league scores.
+        target: answer that is scored.
         prefix_ticks: measured ticks before the free run.
-        training: lengths and updates of the free runs.
         elements: what the description of the set says that it is made of; None where it names no parts.
-        candidates: recurrent twins.
     """
 
     command: str
@@ -68,32 +72,58 @@ class LeagueSet:
     velocity: str
     target: str
     prefix_ticks: int
-    training: FreeRunSpec
     elements: ElementsBox | None = None
-    candidates: tuple[tuple[int, float], ...] = field(default=((8, 10.0), (16, 10.0), (32, 10.0), (16, 1.0)))
 
 
-def spec_of(lengths_s: tuple[float, ...], validation_s: float) -> FreeRunSpec:
-    """Free runs of these lengths; a recording of a thousand ticks needs few updates."""
-    return FreeRunSpec(
-        lengths_s=lengths_s, updates=(300, 300, 400), lanes=32, validate_every=50, validation_s=validation_s,
-        optimizer=Soap(learning_rate=3e-3), patience=0,
-    )  # fmt: skip
+@dataclass(frozen=True)
+class OutsideSet:
+    """A set from outside: file, what it is, sample time, and how many rows are for estimation.
+
+    Attributes:
+        machine: how it becomes a machine with one actuator.
+        what: in words.
+        unit: of what is scored.
+        sample_time_s: as its authors say.
+        rows: for estimation and in all, as in the literature.
+    """
+
+    machine: LeagueSet
+    what: str
+    unit: str
+    sample_time_s: float
+    rows: tuple[int, int]
 
 
 TWO_TANKS = ElementsBox(
     tanks=(TankElement(name="upper", source="command"), TankElement(name="lower", source="upper", level="stroke")),
-    prefix_ticks=5, starts=2, rounds=25,
+    starts=2, rounds=25,
 )  # fmt: skip
-AXIS = ElementsBox(
-    masses=(MassElement(name="axis", command="command", velocity="velocity"),),
-    prefix_ticks=20, starts=2, rounds=15, length_s=2.0,
-)  # fmt: skip
+AXIS = ElementsBox(masses=(MassElement(name="axis", command="command", velocity="velocity"),), starts=2, rounds=15)
 SETS = {
-    "tanks.toml": LeagueSet("u", "y", "", "stroke", 5, spec_of((80.0, 240.0, 560.0), 600.0), TWO_TANKS),
-    "emps.toml": LeagueSet("u", "q", "", "stroke", 20, spec_of((0.2, 1.0, 3.0), 4.0), AXIS),
-    "sjoberg.toml": LeagueSet("u", "", "p", "velocity", 10, spec_of((10.0, 30.0, 60.0), 80.0)),
+    "tanks.toml": LeagueSet("u", "y", "", "stroke", 5, TWO_TANKS),
+    "emps.toml": LeagueSet("u", "q", "", "stroke", 20, AXIS),
+    "sjoberg.toml": LeagueSet("u", "", "p", "velocity", 10),
 }
+OUTSIDE = {
+    "drive": OutsideSet(LeagueSet("u1", "", "z1", "velocity", 10), "coupled electric drives", "V", 0.02, (250, 500)),
+    "ballbeam": OutsideSet(LeagueSet("X", "y", "", "stroke", 10), "ball on a beam", "m", 0.1, (500, 1000)),
+    "damper": OutsideSet(LeagueSet("X", "", "y", "velocity", 10), "magnetorheological damper", "N", 5e-3, (2000, 3499)),
+    "dryer": OutsideSet(LeagueSet("X", "", "y", "velocity", 10), "hot air in a tube", "V", 0.08, (500, 1000)),
+}
+
+
+def outside_source(name: str, folder: Path, work: Path) -> DataSource:
+    """A set from outside as two recordings, estimation and test."""
+    which = OUTSIDE[name]
+    cut, rows = which.rows
+    file = (folder / f"{name}.mat").resolve()
+    parts = [f'[[recordings]]\npath = "{file}"\nname = "{n}"\nrows = [{a}, {b}]\n'
+             for n, a, b in (("estimation", 0, cut), ("test", cut, rows))]  # fmt: skip
+    columns = (which.machine.command, which.machine.stroke or which.machine.velocity)
+    channels = [f'{column} = {{ column = "{column}" }}' for column in columns]
+    text = "\n".join([*parts, f"[map]\nsample_time_s = {which.sample_time_s}\n[map.channels]", *channels])
+    (work / f"{name}.toml").write_text(text + "\n")
+    return DataSource.of(work / f"{name}.toml")
 
 
 def machine(recording: Recording, which: LeagueSet) -> Recording:
@@ -110,105 +140,177 @@ def machine(recording: Recording, which: LeagueSet) -> Recording:
     return Recording(recording.name, tuple(channels), values, recording.rate_hz, recording.source)
 
 
+def column_of(channels: TwinChannels, target: str) -> int:
+    """Column of the answer that is scored."""
+    return [channel.name for channel in channels.answers].index(target)
+
+
 def free_run_rmse(twin: Twin, part: Series, target: str) -> float:
     """Error of one free run through a whole stretch, behind the prefix."""
-    prefix = twin.prefix_ticks
-    column = [channel.name for channel in twin.channels.answers].index(target)
+    prefix, column = twin.prefix_ticks, column_of(twin.channels, target)
     state = twin.reset(part.inputs[None, :prefix], part.targets[None, :prefix])
     answers, _ = twin.rollout(part.inputs[None, prefix:-1], state)
-    error: NDArray[np.float64] = answers[0, :, column].astype(np.float64) - part.targets[prefix + 1 :, column]
+    error = answers[0, :, column].astype(np.float64) - part.targets[prefix + 1 :, column]
     return float(np.sqrt(np.square(error).mean()))
 
 
-def trained(
-    channels: TwinChannels, parts: tuple[Series, Series], which: LeagueSet, candidate: Candidate, seed: int
-) -> Twin:
-    """A twin of a candidate, with the weights or starting values that were best in the last fifth."""
-    scales = fit_scales(channels, parts[:1])
-    if isinstance(candidate, ElementsBox):
-        return fit_elements(candidate.start(channels, scales, parts[:1], seed), parts[:1], parts[1:], seed).twin
-    units, stroke_weight = candidate
-    spec = Recurrent(units=units, prefix_ticks=which.prefix_ticks)
-    twin = spec.start(channels, scales, parts[:1], seed)
-    training = replace(which.training, seed=seed, stroke_weight=stroke_weight)
-    return fit_free_runs(twin, parts[:1], parts[1:], training).twin
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Estimation and test data of a set as series of a twin; the choice may take so many minutes (0: any)."""
+
+    channels: TwinChannels
+    estimation: Series
+    test: Series
+    which: LeagueSet
+    minutes: float
+
+    @staticmethod
+    def of(source: DataSource, which: LeagueSet, minutes: float) -> Judged:
+        """From the two recordings of a set."""
+        estimation, test = (machine(recording, which) for recording in source.read())
+        channels = twin_channels(estimation)
+        task = channels.task()
+        return Judged(channels, task.series(estimation), task.series(test), which, minutes)
+
+    def experiment(self, seed: int, quick: bool) -> TwinExperiment:
+        """The defaults, the budget, the prefix of the league, and the elements that the description names."""
+        made = load_twin_experiment(None, (f"training.seed={seed}", *(QUICK if quick else ())))
+        elements = self.which.elements
+        if quick and elements is not None:
+            elements = replace(elements, starts=1, rounds=2)
+        made = replace(made, twin=replace(made.twin, prefix_ticks=self.which.prefix_ticks, elements=elements))
+        return with_budget(made, self.minutes) if self.minutes else made
+
+    def chosen(self, seed: int, quick: bool) -> tuple[FittedFormulation, dict[str, Any], TwinExperiment]:
+        """The twin that the defaults choose, and what was tried."""
+        experiment, cut = self.experiment(seed, quick), round(ESTIMATION * self.estimation.samples)
+        parts = [
+            replace(self.estimation, inputs=self.estimation.inputs[rows], targets=self.estimation.targets[rows])
+            for rows in (slice(0, cut), slice(cut, None))
+        ]
+        data: Any = StretchFold(parts[:1], parts[1:])
+        scales = fit_scales(self.channels, parts[:1])
+        with tempfile.TemporaryDirectory() as folder, RunFolder(folder) as run:
+            fit = TwinFit(self.channels, scales, data, experiment, None, lambda text: None)
+            result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
+        facts = {"chosen": next(one.label for one in tried if one.chosen), "candidates": [one.row() for one in tried]}
+        return result, facts, experiment
+
+    def rivals(self, seed: int) -> dict[str, float]:
+        """Errors of what is fitted to the same data in the same run."""
+        prefix, target = self.which.prefix_ticks, self.which.target
+        scales, found = fit_scales(self.channels, [self.estimation]), {}
+        for name in RIVALS:
+            spec = replace(TWINS[name](), prefix_ticks=prefix)
+            rival = spec.start(self.channels, scales, [self.estimation], seed)
+            found[name] = free_run_rmse(rival, self.test, target)
+        column = column_of(self.channels, target)
+        pairs = [(part.inputs.astype(np.float64), part.targets[:, column].astype(np.float64))
+                 for part in (self.estimation, self.test)]  # fmt: skip
+        narx = fit_narx(*pairs[0], prefix, seed)
+        # As late a start as the twin's: what is measured before is told to all.
+        begin = prefix + 1 - narx.lags
+        said = narx.free_run(pairs[1][0][begin:], pairs[1][1][begin:])
+        error = said - pairs[1][1][prefix + 1 :]
+        return found | {"narx": float(np.sqrt(np.square(error).mean()))}
+
+    def coverage(self, result: FittedFormulation, experiment: TwinExperiment) -> list[dict[str, Any]]:
+        """Share of free runs along the test recording that the intervals hold, by horizon."""
+        shortest, longest = 1.0 / self.channels.rate_hz, self.test.samples / self.channels.rate_hz
+        twin, judge = result.fitted.twin, experiment.judge
+        intervals = calibrated(result.unseen or ((twin, [self.estimation]),), judge)
+        part = "strokes" if self.which.target == "stroke" else "velocities"
+        rows = []
+        for at in sorted({max(at, shortest) for at in judge.covered_at_s if at < HALF * longest}):
+            # Runs as long as each horizon, so that starts lie all along the recording.
+            runs = free_runs(twin, [self.test], at, STARTS)
+            row = coverage_of(runs, replace(judge, covered_at_s=(at,)), intervals)["at"][0]
+            rows.append({"at_s": at, "calibrated": row["calibrated"], "share": row[part]["share"]})
+        return rows
+
+    def measure(self, seed: int, quick: bool) -> dict[str, Any]:
+        """The chosen twin of a seed: error in the unit of the set, what was chosen, coverage, processor time."""
+        began = time.process_time()
+        result, facts, experiment = self.chosen(seed, quick)
+        error = free_run_rmse(result.fitted.twin, self.test, self.which.target)
+        facts |= {"error": error, "coverage": self.coverage(result, experiment)}
+        return facts | {"processor_s": round(time.process_time() - began, 1)}
 
 
-def named(candidate: Candidate) -> str:
-    """How tables call it."""
-    if isinstance(candidate, ElementsBox):
-        return "elements"
-    return f"recurrent, {candidate[0]} units, stroke weight {candidate[1]:g}"
+def summary(judged: Judged, seeds: Sequence[int], factor: float, quick: bool, work: Path, name: str) -> dict[str, Any]:
+    """All seeds of a set, in the unit of its table, and its rivals."""
+    form = "_quick" if quick else ""
+    rows = {seed: kept(work / f"{name}_{seed}{form}.json", lambda seed=seed: judged.measure(seed, quick))
+            for seed in seeds}  # fmt: skip
+    rivals = kept(work / f"{name}_rivals.json", lambda: judged.rivals(seeds[0]))
+    ours = {seed: factor * row["error"] for seed, row in rows.items()}
+    return {
+        "ours": ours,
+        "median": statistics.median(ours.values()),
+        "rivals": {rival: factor * error for rival, error in rivals.items()},
+        "seeds": {seed: {k: v for k, v in row.items() if k != "error"} for seed, row in rows.items()},
+        "processor_s": sum(row["processor_s"] for row in rows.values()),
+    }
 
 
-def shortened(which: LeagueSet) -> LeagueSet:
-    """One candidate of each formulation, hardly trained."""
-    training = replace(which.training, updates=(20, 20, 20))
-    elements = which.elements and replace(which.elements, starts=1, rounds=2)
-    return replace(which, training=training, elements=elements, candidates=which.candidates[:1])
+def show(title: str, found: dict[str, Any], published: dict[str, float]) -> None:
+    """Print a table of a set."""
+    print(f"\nFree run of the default twin: {title}")
+    rows = [*published.items(), ("TWIN", found["median"]), *((f"{n}, here", e) for n, e in found["rivals"].items())]
+    table(["method", "test RMSE"], sorted(rows, key=lambda pair: pair[1]))
+    for seed, row in found["seeds"].items():
+        held = ", ".join(f"{one['share']:.0%} at {one['at_s']:g} s" for one in row["coverage"])
+        print(f"seed {seed}: {found['ours'][seed]:.4g}; {row['chosen']}; intervals of 90 % hold {held}")
 
 
-def measure(entry: dict[str, Any], which: LeagueSet, seeds: Sequence[int]) -> dict[str, Any]:
-    """Test errors of the chosen candidate, a figure a seed, and of the floors, in the unit of the league."""
-    began = time.process_time()
-    estimation, test = (machine(recording, which) for recording in DataSource.of(EXAMPLES / entry["data"]).read())
-    channels = twin_channels(estimation)
-    task, cut = channels.task(), round(ESTIMATION * estimation.samples)
-    parts = (task.series(estimation, 0, cut), task.series(estimation, cut))
-    candidates: dict[str, list[Candidate]] = {"recurrent": list(which.candidates)}
-    if which.elements is not None:
-        candidates["elements"] = [which.elements]
-    firsts = {one: trained(channels, parts, which, one, seeds[0]) for each in candidates.values() for one in each}
-    errors = {one: free_run_rmse(twin, parts[1], which.target) for one, twin in firsts.items()}
-    factor = 1000.0 if entry["unit"] == "mm" else 1.0
-    judged = task.series(test)
-    formulations: dict[str, Any] = {}
-    for name, each in candidates.items():
-        best = min(each, key=lambda one: errors[one])
-        twins = {seeds[0]: firsts[best]}
-        twins |= {seed: trained(channels, parts, which, best, seed) for seed in seeds[1:]}
-        by_seed = {seed: factor * free_run_rmse(twin, judged, which.target) for seed, twin in twins.items()}
-        shown = {"candidate": named(best), "validation": factor * errors[best], "ours": by_seed}
-        formulations[name] = shown | {"median": statistics.median(by_seed.values())}
-    chosen = min(formulations, key=lambda name: float(formulations[name]["validation"]))
-    found: dict[str, Any] = {**formulations[chosen], "chosen": chosen, "formulations": formulations}
-    scales = fit_scales(channels, [task.series(estimation)])
-    for name in FLOORS:
-        spec = replace(TWINS[name](), prefix_ticks=which.prefix_ticks)
-        floor = spec.start(channels, scales, [task.series(estimation)], seeds[0])
-        found[name] = factor * free_run_rmse(floor, judged, which.target)
-    every = {named(one): factor * error for one, error in errors.items()}
-    return found | {"every_validation": every, "processor_s": round(time.process_time() - began, 1)}
+def against_rivals(title: str, found: dict[str, Any], unit: str, quick: bool) -> Verdict:
+    """The twin beside the best of its rivals."""
+    best = min(found["rivals"], key=lambda rival: float(found["rivals"][rival]))
+    return verdict(f"{title}: twin against {best}", found["median"], found["rivals"][best], "<= 1", unit, quick)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     options = parser(__doc__ or "")
     options.add_argument("--shared", type=Path, default=None, help=f"folder of the recordings (else ${VARIABLE})")
+    options.add_argument("--outside", type=Path, default=None, help="folder of the sets from outside; else left out")
     options.add_argument("--seeds", type=int, default=5)
+    options.add_argument("--minutes", type=float, default=0.0, help="as of edp twin; 0: no bound")
+    options.add_argument("--only", nargs="*", default=None, help="sets by name, such as tanks or drive")
+    options.add_argument("--work", type=Path, default=None, help="folder that keeps what is finished")
     given = options.parse_args(arguments)
     if shared_folder(given.shared) is None:
         return
+    in_folder(given.work, lambda work: run(given, work))
+
+
+def run(given: Any, work: Path) -> None:
+    """All sets that were asked for."""
+    seeds = range(given.seed, given.seed + (1 if given.quick else given.seeds))
     verdicts: list[Verdict] = []
-    kept: dict[str, Any] = {}
+    details: dict[str, Any] = {}
     for entry in read_toml(EXAMPLES / "leagues.toml")["leagues"]:
-        seeds = range(given.seed, given.seed + (1 if given.quick else given.seeds))
-        which = SETS[entry["data"]]
-        found = measure(entry, shortened(which) if given.quick else which, seeds)
-        print(f"\nFree run of a twin: {entry['title']}" + (" (quick: hardly trained)" if given.quick else ""))
-        twins = [
-            (f"{'TWIN' if n == found['chosen'] else 'twin'}, {n}", f["median"])
-            for n, f in found["formulations"].items()
-        ]
-        rows = [*entry["published"].items(), *twins, *((f"{n}, here", found[n]) for n in FLOORS)]
-        table(["method", "test RMSE"], sorted(rows, key=lambda pair: pair[1]))
-        for name, one in found["formulations"].items():
-            each = ", ".join(f"{value:.4g}" for value in one["ours"].values())
-            print(f"{name} by seed: {each}; {one['candidate']}, {one['validation']:.4g} in the last fifth")
-        print(f"chosen: {found['chosen']}; {found['processor_s']} processor s")
-        verdicts += verdicts_of(entry, found, given.quick, ", twin")
-        kept[entry["title"]] = found
-    finish("twin_leagues", verdicts, given.seed, kept)
+        name = Path(entry["data"]).stem
+        if given.only is not None and name not in given.only:
+            continue
+        judged = Judged.of(DataSource.of(EXAMPLES / entry["data"]), SETS[entry["data"]], given.minutes)
+        factor = 1000.0 if entry["unit"] == "mm" else 1.0
+        found = summary(judged, seeds, factor, given.quick, work, name)
+        show(entry["title"], found, entry["published"])
+        verdicts += [*verdicts_of(entry, found, given.quick, ", twin"),
+                     against_rivals(entry["title"], found, entry["unit"], given.quick)]  # fmt: skip
+        details[entry["title"]] = found
+    for name, which in OUTSIDE.items() if given.outside else ():
+        if given.only is not None and name not in given.only:
+            continue
+        judged = Judged.of(outside_source(name, given.outside, work), which.machine, given.minutes)
+        title = f"{which.what} ({name})"
+        found = summary(judged, seeds, 1.0, given.quick, work, name)
+        show(title, found, {})
+        verdicts.append(against_rivals(title, found, which.unit, given.quick))
+        details[title] = found
+    # A part of the sets takes no whole result's place.
+    finish("twin_leagues" if given.only is None else "twin_leagues_part", verdicts, given.seed, details)
 
 
 if __name__ == "__main__":

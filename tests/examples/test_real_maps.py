@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from edp.config.experiment import load_experiment, read_toml
 from edp.errors import ConfigError
@@ -119,6 +120,29 @@ def test_a_set_becomes_a_machine_with_one_actuator(scripts):
     answers = twin.rollout(part.inputs[None, 10:-1], state)[0][0, :, 1]
     expected = np.sqrt(np.mean((answers - part.targets[11:, 1]) ** 2))
     assert twins.free_run_rmse(twin, part, "stroke") == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_narx_rival_follows_a_quadratic_system_through_a_run_that_it_was_not_fitted_to(scripts):
+    rng = np.random.default_rng(0)
+    command, answer = np.repeat(rng.uniform(-1, 1, 80), 10), np.zeros(800)
+    for t in range(1, 800):
+        answer[t] = 0.8 * answer[t - 1] + 0.2 * command[t - 1] ** 2 - 0.1 * command[t - 1]
+    fit_narx = scripts["twin_leagues"].fit_narx
+    rival = fit_narx(command[:600, None], answer[:600], 10, 0)
+    said = rival.free_run(command[600:, None], answer[600:])
+    assert np.sqrt(np.mean((said - answer[600 + rival.lags :]) ** 2)) < 0.02 * np.std(answer)
+
+
+def test_a_set_from_outside_is_divided_as_the_literature_does(scripts, tmp_path):
+    twins = scripts["twin_leagues"]
+    command, answer = np.arange(500.0)[:, None], 2.0 * np.arange(500.0)[:, None]
+    savemat(tmp_path / "drive.mat", {"u1": command, "z1": answer, "z2": answer})
+    source = twins.outside_source("drive", tmp_path, tmp_path)
+    judged = twins.Judged.of(source, twins.OUTSIDE["drive"].machine, 0.0)
+    assert judged.channels.rate_hz == 50.0
+    assert [c.name for c in judged.channels.answers] == ["velocity"]
+    assert (judged.estimation.samples, judged.test.samples) == (250, 250)
+    assert judged.test.inputs[0, 0] == 250.0
 
 
 def test_the_default_twin_is_held_against_the_best_of_its_rivals(scripts):

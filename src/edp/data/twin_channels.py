@@ -81,7 +81,8 @@ class TwinChannels:
         if wrong:
             raise ConfigError(
                 f"channels: '{wrong[0].name}' is of kind {wrong[0].kind}; {' or '.join(INTEGRAL)} must hold: correct "
-                "its kind in the signal map, or name other velocities"
+                "its kind in the signal map (velocity for a speed in any unit, and for whatever else shall be answered "
+                "with and is no position or pressure), or name other velocities"
             )
         wrong = [c for c in self.pressures if c.kind not in (Kind.PRESSURE, Kind.PILOT_PRESSURE)]
         if wrong:

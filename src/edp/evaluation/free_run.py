@@ -22,6 +22,8 @@ MOST_SECONDS = 86_400.0
 """Of a free run: a day."""
 ASTRAY = 0.5
 """Share of a stroke's range; a run whose stroke is further off than that counts as diverged."""
+SHORTER = (2, 4, 8)
+"""Parts of the longest free run that calibrate intervals as well, where stretches are shorter than what is asked."""
 LANES = 64
 """Free runs side by side: all of a data set at once would need memory without bound."""
 
@@ -187,9 +189,22 @@ def calibrated(unseen: Sequence[tuple[Twin, Sequence[Series]]], spec: FreeRunJud
     Raises:
         DataError: no stretch has a tick behind the prefix.
     """
-    runs = [free_runs(twin, series, spec.seconds, spec.calibration_starts) for twin, series in unseen]
-    whole = FreeRuns.joined(runs)
-    return calibrate(whole.answers - whole.truth, spec.coverage)
+    whole = _unseen_runs(unseen, spec.seconds, spec.calibration_starts)
+    errors = [whole.answers - whole.truth]
+    rate, longest = whole.channels.rate_hz, whole.truth.shape[1]
+    # Runs as long as a short stretch all begin at its first tick: shorter ones tell short horizons by more starts.
+    for ticks in (longest // share for share in SHORTER if longest < round(spec.seconds * rate)):
+        if ticks < 1:
+            break
+        runs = _unseen_runs(unseen, ticks / rate, spec.calibration_starts)
+        missed = runs.answers - runs.truth
+        errors.append(np.pad(missed, ((0, 0), (0, longest - missed.shape[1]), (0, 0)), constant_values=np.nan))
+    return calibrate(np.concatenate(errors), spec.coverage)
+
+
+def _unseen_runs(unseen: Sequence[tuple[Twin, Sequence[Series]]], seconds: float, starts: int) -> FreeRuns:
+    """Free runs of each twin beside its own stretches."""
+    return FreeRuns.joined([free_runs(twin, series, seconds, starts) for twin, series in unseen])
 
 
 def free_run_scores(

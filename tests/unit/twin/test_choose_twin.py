@@ -13,7 +13,9 @@ from edp.errors import ConfigError, DataError
 from edp.ir.memory import Gru
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.arx import Arx
+from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.kinds import AutoTwin
+from edp.networks.twin.lumped.parts import MassElement
 from edp.networks.twin.recurrent import Recurrent, averaged, member_seed
 from edp.networks.twin.static_map import StaticMap
 from edp.storage.runs import KeyedRun, RunFolder
@@ -392,3 +394,61 @@ def test_a_choice_looks_at_helpers_while_it_waits(run, monkeypatch):
     fit = replace(choice(run).fit, helpers=Waiting())
     assert list(fit.train_members([], looks.append)) == []
     assert [event.update for event in looks] == [3]
+
+
+AXES = ElementsBox(
+    masses=tuple(MassElement(name=f"m{i}", command=f"lever_{i}", velocity=f"speed_{i}") for i in (1, 2)),
+    starts=1, rounds=2, length_s=1.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("candidates", "tried"),
+    [
+        (("static", "recurrent"), ("static", "elements", "recurrent")),
+        (("static",), ("static", "elements")),
+        (("elements", "static"), ("elements", "static")),
+    ],
+)
+def test_known_elements_are_one_more_candidate_before_the_networks(candidates, tried):
+    assert AutoTwin(candidates=candidates).tried == candidates
+    assert AutoTwin(candidates=candidates, elements=AXES).tried == tried
+
+
+def test_known_elements_are_fitted_without_each_fold_and_at_last_to_everything(run, monkeypatch):
+    recordings = [sample_actuators(seed=seed, pressures=False) for seed in range(6)]
+    fits = []
+    plain = fit_twin.fit_elements
+
+    def noted(twin, train, validation, *rest):
+        fits.append([sum(part.samples for part in side) for side in (train, validation)])
+        return plain(twin, train, validation, *rest)
+
+    monkeypatch.setattr(fit_twin, "fit_elements", noted)
+    monkeypatch.setattr(TwinChoice, "_error", lambda self, runs, reference: 0.5 if fits else 1.0)
+    one = choice(run, recordings=recordings, candidates=("static",), elements=AXES, folds=2)
+    result, tried = one.best()
+    assert [row.label for row in tried] == ["static", "elements"]
+    assert result.spec == replace(AXES, prefix_ticks=20)
+    assert {row["element"] for row in result.datasheet} == {"m1", "m2"}
+    everything = sum(part.samples for part in [*one.fit.data.train, *one.fit.data.validation])
+    assert fits[-1] == [everything, everything]
+    assert len(fits) == 3
+    assert all(train < everything for train, _ in fits[:-1])
+
+
+def test_known_elements_are_read_from_settings_and_written_to_them():
+    name = 'twin.elements.masses=[{name="axis", command="u", velocity="v"}]'
+    experiment = load_twin_experiment(None, (name, "twin.elements.starts=2"))
+    assert experiment.twin.elements.masses == (MassElement(name="axis", command="u", velocity="v"),)
+    assert experiment.twin.elements.starts == 2
+    with pytest.raises(ConfigError, match="startz"):
+        load_twin_experiment(None, (name, "twin.elements.startz=2"))
+
+
+def test_a_slow_log_is_trained_and_judged_by_ticks(run):
+    recordings = [replace(sample_actuators(seed=seed), rate_hz=1.0) for seed in range(6)]
+    one = choice(run, FreeRunSpec(), recordings, candidates=("static",))
+    assert max(one.training.lengths_s) == 100.0
+    assert one.training.validation_s == 150.0
+    assert len(one.folds) == 5

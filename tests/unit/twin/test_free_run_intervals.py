@@ -56,6 +56,27 @@ def test_few_runs_give_the_largest_error():
     assert calibrate(np.arange(19, dtype=np.float32).reshape(19, 1, 1), 0.9).half_width.tolist() == [[17.0]]
 
 
+def test_runs_that_end_early_calibrate_the_horizons_that_they_reach():
+    rng = np.random.default_rng(1)
+    whole = wandering(60, rng).astype(np.float32)
+    cut = whole.copy()
+    cut[20:, 50:] = np.nan
+    half, short, few = (calibrate(errors, 0.9).at(np.arange(1, TICKS + 1)) for errors in (cut, whole, whole[:20]))
+    np.testing.assert_allclose(half[:20], short[:20], rtol=0.2)  # far from where knots mix
+    np.testing.assert_allclose(half[200:], few[200:], rtol=0.2)
+    assert calibrate(cut, 0.9).runs == 60
+
+
+def test_a_short_stretch_calibrates_short_horizons_by_more_starts_than_fit_a_long_run():
+    twin, series = twin_and_series()
+    short = [replace(part, inputs=part.inputs[:60], targets=part.targets[:60]) for part in series[1:4]]
+    spec = FreeRunJudgeSpec(seconds=60.0, calibration_starts=8)
+    intervals = calibrated([(twin, short)], spec)
+    assert intervals.ticks[-1] == 60 - 10 - 1
+    assert 50 < intervals.runs <= 3 + 3 * 3 * 8  # but for starts beyond an end stop
+    assert calibrated([(twin, short)], replace(spec, seconds=0.9)).runs <= 3 * 5  # as long as asked: nothing is added
+
+
 def twin_and_series():
     return sample_twin(StaticMap(prefix_ticks=10))[0], sample_series(16)[1]
 

@@ -82,11 +82,12 @@ def calibrate(errors: Array, coverage: float) -> FreeRunIntervals:
     """Split-conformal half widths by horizon, from free runs that chose and trained nothing.
 
     At each knot the width is the quantile of the absolute errors around it whose level is ``ceil((n + 1) coverage) /
-    n`` of n runs, the finite-sample level of split conformal prediction; the largest error where that is above 1.
-    Widths are then made to grow with the horizon by isotonic regression.
+    n`` of the n runs that reach it, the finite-sample level of split conformal prediction; the largest error where
+    that is above 1. Widths are then made to grow with the horizon by isotonic regression.
 
     Args:
-        errors: of free runs ``(run, tick, answer)``, SI units, tick 1 first.
+        errors: of free runs ``(run, tick, answer)``, SI units, tick 1 first; NaN behind the end of a run. At least one
+            run goes to the last tick.
         coverage: share of runs that an interval is meant to hold.
     """
     # Here, since every command with a network imports this module, and scipy.optimize takes a second.
@@ -95,16 +96,18 @@ def calibrate(errors: Array, coverage: float) -> FreeRunIntervals:
     runs, longest, answers = errors.shape
     count = 1 + math.ceil(KNOTS_A_DECADE * math.log10(longest)) if longest > 1 else 1
     ticks = np.unique(np.geomspace(1, longest, count).round().astype(np.int64))
-    rank = min(runs, math.ceil((runs + 1) * coverage))
     # Up to the middle of the way to the neighbours, so that each tick counts at one knot.
     middles = np.sqrt(ticks[1:] * ticks[:-1].astype(np.float64))
     first = np.concatenate([[0], np.floor(middles).astype(np.int64)])
     last = np.concatenate([first[1:], [longest]])
     widths = np.empty((len(ticks), answers))
     for knot, (start, stop) in enumerate(zip(first, last, strict=True)):
-        around = np.abs(errors[:, start : max(stop, start + 1)]).reshape(-1, answers)
+        window = errors[:, start : max(stop, start + 1)]
+        window = window[~np.isnan(window[:, -1, 0])]
+        rank = min(len(window), math.ceil((len(window) + 1) * coverage))
+        around = np.abs(window).reshape(-1, answers)
         # A whole number of ticks of each run is pooled, so the rank among runs stays exact.
-        row = rank * (len(around) // runs) - 1
+        row = rank * window.shape[1] - 1
         widths[knot] = np.partition(around, row, axis=0)[row]
     for column in range(answers):
         widths[:, column] = isotonic_regression(widths[:, column]).x

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from edp.errors import ConfigError
 from edp.networks.twin import TWINS
 from edp.networks.twin.base import PREFIX
+from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.registry import Registry
 from edp.settings.bounds import MOST_NAMES, SHARE, check_bounds, check_count, integer, span
@@ -33,6 +34,7 @@ class AutoTwin:
         prefix_ticks: measured ticks before a free run.
         minutes: counted processor time for the recurrent networks: trainings that do not fit into it are left out;
             0: no bound.
+        elements: what a small system is known to be made of, as one more candidate, tried before the networks.
 
     Raises:
         ConfigError: a value out of range, no candidate, or an unknown one.
@@ -43,6 +45,7 @@ class AutoTwin:
     folds: int = 5
     prefix_ticks: int = 30
     minutes: float = 0.0
+    elements: ElementsBox | None = None
 
     def __post_init__(self) -> None:
         check_bounds("automatic twin", self, least_gain=SHARE, folds=FOLDS, prefix_ticks=PREFIX, minutes=BUDGET)
@@ -54,3 +57,11 @@ class AutoTwin:
                 raise ConfigError(f"twin.candidates: {error}") from None
         if len(set(self.candidates)) < len(self.candidates):
             raise ConfigError(f"twin.candidates: {', '.join(self.candidates)}; each once must hold")
+
+    @property
+    def tried(self) -> tuple[str, ...]:
+        """Every candidate in the order of trial; known elements stand where they are named, else before networks."""
+        if self.elements is None or "elements" in self.candidates:
+            return self.candidates
+        place = self.candidates.index("recurrent") if "recurrent" in self.candidates else len(self.candidates)
+        return (*self.candidates[:place], "elements", *self.candidates[place:])

@@ -15,6 +15,7 @@ from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.evaluation.free_run import FreeRuns, free_run_scores, free_runs
 from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
+from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, member_seed
 from edp.report.twin.candidates import MOST_TEXT
@@ -22,6 +23,7 @@ from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec
 from edp.training.free_run_members import MemberTraining, joined_members
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
+from edp.workflows.twin.pace import paced
 from edp.workflows.twin.training_cost import training_seconds
 
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
@@ -114,7 +116,7 @@ class TwinChoice:
             ConfigError: none can be fitted to these recordings.
         """
         tried: list[TwinCandidate] = []
-        for name in self.auto.candidates:
+        for name in self.auto.tried:
             tried += self._tried(name, _best(tried))
         chosen = self._simplest(tried)
         if chosen is None or chosen.trial is None:
@@ -128,12 +130,18 @@ class TwinChoice:
         return replace(result, fitted=fitted, facts=facts), tried
 
     @cached_property
+    def training(self) -> FreeRunSpec:
+        """How networks are trained and candidates compared: as the settings say, at the pace of slow and short logs."""
+        block = sum(part.samples for part in self._everything) // self.auto.folds
+        return paced(self.fit.experiment.training, self.fit.channels.rate_hz, block)
+
+    @cached_property
     def folds(self) -> list[StretchFold]:
         """How training and validation part are divided: as the settings say, or each stretch left out in turn.
 
         From `LONG_TICKS` on, and where a fold would be shorter than what is trained on, the settings' own division.
         """
-        data, count, training = self.fit.data, self.auto.folds, self.fit.experiment.training
+        data, count, training = self.fit.data, self.auto.folds, self.training
         own = [StretchFold(data.train, data.validation)]
         if count == 1 or sum(part.samples for part in data.train) >= LONG_TICKS:
             return own
@@ -159,7 +167,7 @@ class TwinChoice:
     @cached_property
     def _reference(self) -> list[FreeRuns]:
         """Free runs of the static map in each fold."""
-        spec, seed = self._default("static"), self.fit.experiment.training.seed
+        spec, seed = self._default("static"), self.training.seed
         shared = (self._whole.channels, self._whole.scales)
         return [self._runs(spec.start(*shared, fold.train, seed), fold) for fold in self.folds]
 
@@ -192,7 +200,7 @@ class TwinChoice:
             before, count_before = _least(tried), len(tried)
             ahead = self._simplest(tried)
             for form in forms if round_ < BOTH_FORMS or ahead is None else [one for one in forms if one == ahead.spec]:
-                training = shortened(self.fit.experiment.training, share)
+                training = shortened(self.training, share)
                 cost = training_seconds(form, self.fit.channels, training, count)
                 if self.auto.minutes and spent + cost > 60.0 * self.auto.minutes:
                     unfit.append(self._beyond_budget(form, training, spent + cost))
@@ -292,6 +300,10 @@ class TwinChoice:
             result = FittedFormulation(trial.spec, joined_members([fit.fitted for fit in trial.fits]))
         elif not first.fitted.history:
             result = self._whole.fitted(trial.spec, None)
+        elif isinstance(trial.spec, ElementsBox):
+            # Few numbers: free runs of all that may be learned from choose among the starting values as well.
+            data = replace(self._whole.data, validation=self._everything)
+            result = replace(self._whole, data=data).fitted(trial.spec, None)
         elif several:
             # Weights of several such fits have no mean; and each needs stretches that tell it when to stop.
             with part_of(self.run, TWINS.name_of(trial.spec)) as own:
@@ -307,8 +319,9 @@ class TwinChoice:
         return None if spec is None else _best([one for one in tried if one.spec == spec])
 
     def _default(self, name: str) -> TwinSpec:
-        """The defaults of a formulation, with the prefix of all candidates."""
-        spec: TwinSpec = replace(TWINS[name](), prefix_ticks=self.auto.prefix_ticks)
+        """A formulation with its defaults, or with the elements that are known, and the prefix of all candidates."""
+        known = self.auto.elements if name == "elements" else None
+        spec: TwinSpec = replace(known or TWINS[name](), prefix_ticks=self.auto.prefix_ticks)
         return spec
 
     def _runs(self, twin: Any, fold: StretchFold) -> FreeRuns:
@@ -316,12 +329,11 @@ class TwinChoice:
 
         More of them fit into it, and differ more from one another, than long ones.
         """
-        training = self.fit.experiment.training
-        return free_runs(twin, fold.validation, training.validation_s, training.lanes)
+        return free_runs(twin, fold.validation, self.training.validation_s, self.training.lanes)
 
     def _error(self, runs: Sequence[FreeRuns], reference: Sequence[FreeRuns]) -> float:
         """Error over that of a reference in the same folds."""
-        seconds = self.fit.experiment.training.validation_s
+        seconds = self.training.validation_s
         judge = replace(self.fit.experiment.judge, seconds=seconds, at_s=tuple(sorted({a * seconds for a in AT})))
         ours, theirs = (FreeRuns.joined(some) for some in (runs, reference[: len(runs)]))
         return free_run_error(free_run_scores(ours, judge), free_run_scores(theirs, judge))
