@@ -148,9 +148,9 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
 
 def _instead(folder: Path) -> str:
     """How the most frequent files of a folder become logs, where that is known; else empty."""
-    found = Counter(entry.suffix.lower() for entry in islice(folder.rglob("*"), _MOST_FILES) if entry.is_file())
-    advised = [(suffix, export_advice(suffix)) for suffix, _ in found.most_common()]
-    return next((f". {found[suffix]} end in '{suffix}': {advice}" for suffix, advice in advised if advice), "")
+    endings = Counter(entry.suffix.lower() for entry in islice(folder.rglob("*"), _MOST_FILES) if entry.is_file())
+    advised = [(suffix, export_advice(suffix)) for suffix, _ in endings.most_common()]
+    return next((f". {endings[suffix]} end in '{suffix}': {advice}" for suffix, advice in advised if advice), "")
 
 
 def _is_truth(path: Path) -> bool:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from edp.data.even_split import blocks_where_time_is_uneven
 from edp.data.splits import ByTime
@@ -19,21 +18,28 @@ from edp.logs.proposal.columns import LogLook
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
-from edp.logs.read import find_recordings, unique_names
-from edp.logs.source import map_of_table
+from edp.logs.read import find_recordings
 from edp.recording import Recording
-from edp.settings.tree import parse_toml
-from edp.signals import VOCABULARY, Channel, Kind, SignalMap
+from edp.signals import Channel, Kind
 from edp.storage import make_folder, write_bytes
+from edp.workflows.proposal_files import (
+    DATA,
+    MAP,
+    MOST_FEATURES,
+    SETTINGS,
+    check_files,
+    data_set_text,
+    horizons_for,
+    listed_path,
+    map_table,
+    named_paths,
+    remarks_of,
+    settings_text,
+    toml_text,
+)
 
-MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
 MOST_TARGETS = 4
 """Outputs at most: each is a model of its own in the time that a first run takes."""
-MOST_FEATURES = 48
-_AHEAD_S = 0.1
-"""How far ahead a machine's motion is of use to a controller; two steps of a slow hydraulic valve."""
-_SLOW_TICKS = 5
-"""Ticks ahead where a tick takes longer than half of that."""
 _LEAST_RECORDINGS = 5
 """Recordings from which whole ones test; of fewer a single one would decide the score."""
 _TARGETS = (
@@ -138,17 +144,17 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     split, why = _split(group, proposal, targets)
     notes += why
     files = {
-        MAP: _text(_map_table(proposal.signal_map), _remarks(source, proposal)),
-        SETTINGS: _settings(proposal, channels, targets, split),
+        MAP: toml_text(map_table(proposal.signal_map), remarks_of(source, proposal)),
+        SETTINGS: settings_text(proposal, channels, targets, split),
     }
     repairs, apart = timing.shared, timing.apart
     if others or broken or apart:
         recordings = [
-            {"path": _listed(one), "name": name} | ({"repair": repair_table(apart[one])} if one in apart else {})
-            for one, name in _named(group.paths)
+            {"path": listed_path(one), "name": name} | ({"repair": repair_table(apart[one])} if one in apart else {})
+            for one, name in named_paths(group.paths)
         ]
-        files[DATA] = _data_set(recordings, MAP, repair_table(repairs) if apart else {})
-    _check(files)
+        files[DATA] = data_set_text(recordings, MAP, repair_table(repairs) if apart else {})
+    check_files(files)
     repairs = () if apart else repairs
     inputs = _untold_inputs(proposal)
     return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
@@ -182,12 +188,6 @@ def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool =
     for path, text in zip(paths, proposal.files.values()):
         write_bytes(path, text.encode())
     return paths
-
-
-def horizons_for(rate_hz: float | None) -> tuple[int, int]:
-    """Look-ahead in samples: one, and a tenth of a second or five."""
-    ahead = round(_AHEAD_S * (rate_hz or 0.0))
-    return 1, ahead if ahead > 1 else _SLOW_TICKS
 
 
 def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
@@ -253,43 +253,6 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     return notes
 
 
-def _map_table(signal_map: SignalMap) -> dict[str, Any]:
-    """A signal map as a file has it, without what is as usual."""
-    table: dict[str, Any] = {}
-    for key in ("time", "sample_time_s", "rate_hz"):
-        value = getattr(signal_map, key)
-        if value is not None:
-            table[key] = value
-    if signal_map.time is not None and signal_map.time_unit != "s":
-        table["time_unit"] = signal_map.time_unit
-    if not signal_map.header:
-        table |= {"header": False, "columns": list(signal_map.columns)}
-    table["channels"] = {
-        entry.name: {"column": entry.column}
-        | ({} if _usual_kind(entry.name) == entry.kind else {"kind": str(entry.kind)})
-        | {"unit": entry.unit or "1"}
-        for entry in signal_map.channels
-    }
-    return table
-
-
-def _usual_kind(name: str) -> Kind | None:
-    channel = VOCABULARY.get(name)
-    return None if channel is None else channel.kind
-
-
-def _remarks(source: Path, proposal: MapProposal) -> list[str]:
-    """Comments on top of a map: where it comes from and what is to be checked."""
-    lines = [f"Proposed by edp init for {source.name}. To be checked:"]
-    checked = [guess for guess in proposal.columns if guess.check and guess.channel]
-    lines += [f"  {guess.channel}: {guess.role}, {guess.sureness}; {guess.check}" for guess in checked]
-    if proposal.clock.check:
-        lines.append(f"  time: {proposal.clock.check}")
-    absent = [guess for guess in proposal.columns if not guess.channel and guess.role != "time"]
-    lines += [f"Not taken: {guess.column[:60]} ({guess.role}: {guess.why})" for guess in absent[:MOST_FEATURES]]
-    return lines
-
-
 def _split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """Whole logs where there are many, else time; blocks where ends are unlike the rest; and why, for notes."""
     if len(group.paths) >= _LEAST_RECORDINGS:
@@ -315,61 +278,6 @@ def _targets_of(look: LogLook, names: Sequence[str], step: int, rate: float) -> 
     values = [np.concatenate([x for piece in columns[name].pieces for x in (piece[::step], apart)]) for name in names]
     channels = tuple(Channel(name, Kind.GENERIC) for name in names)
     return Recording(look.path.name, channels, np.stack(values, axis=1).astype(np.float32), rate)
-
-
-def _text(table: dict[str, Any], remarks: Iterable[str] = ()) -> str:
-    """TOML with comments above; a comment ends at no character of a name."""
-    visible = ["".join(letter if letter.isprintable() else "?" for letter in line) for line in remarks]
-    return "".join(f"# {line}\n" for line in visible) + tomli_w.dumps(table)
-
-
-def _settings(proposal: MapProposal, channels: Sequence[str], targets: Sequence[str], split: dict[str, Any]) -> str:
-    clock = proposal.clock
-    rate = clock.wanted_hz or clock.rate_hz
-    table = {
-        "task": {
-            "targets": list(targets),
-            "horizons": list(horizons_for(rate)),
-            "mode": "delta",
-            "features": {"name": "proposed", "channels": list(channels)},
-        },
-        "split": split,
-    }
-    return _text(
-        table, ["Proposed by edp init: what is predicted, how far ahead (in samples), from what, tested on what."]
-    )
-
-
-def _listed(path: Path) -> str:
-    """A path for a data-set file, which puts environment variables in."""
-    return str(path.resolve())
-
-
-def _named(paths: Sequence[Path]) -> list[tuple[Path, str]]:
-    usable = [path for path in paths if "$" not in str(path.resolve()) and str(path).isprintable()]
-    return list(zip(usable, unique_names([path.stem for path in usable], usable)))
-
-
-def _data_set(
-    recordings: list[dict[str, Any]], map_file: str | None = None, repair: dict[str, str] | None = None
-) -> str:
-    if not recordings:
-        raise DataError("no path of these logs can be listed in a file ($ or unprintable characters); rename them")
-    table: dict[str, Any] = ({"map": map_file} if map_file else {}) | ({"repair": repair} if repair else {})
-    table["recordings"] = recordings
-    return _text(table, ["Proposed by edp init: the logs with one set of columns."])
-
-
-def _check(files: dict[str, str]) -> None:
-    """See that what will be written is read as it was meant.
-
-    Raises:
-        ConfigError: it is not; nothing was written.
-    """
-    tables = {name: parse_toml(text, name) for name, text in files.items()}
-    # Settings themselves are not built here: their classes import PyTorch, which takes seconds.
-    if MAP in tables:
-        map_of_table(tables[MAP], MAP)
 
 
 def _side_by_side(proposal: MapProposal) -> dict[str, dict[str, ColumnGuess]]:
@@ -399,7 +307,7 @@ def _of_pairs(
     train = next(ending for ending in pairs if ending in _TRAINS)
     test = next(ending for ending in pairs if ending != train)
     recordings = []
-    for path, name in _named(group.paths):
+    for path, name in named_paths(group.paths):
         for ending in (train, test):
             renamed = [(stem, guess) for stem, guess in pairs[ending].items()]
             entries = tuple(
@@ -408,8 +316,8 @@ def _of_pairs(
                 for entry in proposal.signal_map.channels
                 if entry.column == guess.column
             )
-            table = _map_table(replace(proposal.signal_map, channels=entries))
-            recordings.append({"path": _listed(path), "name": f"{name}_{ending}", "map": table})
+            table = map_table(replace(proposal.signal_map, channels=entries))
+            recordings.append({"path": listed_path(path), "name": f"{name}_{ending}", "map": table})
     renamed_columns = tuple(replace(guess, channel=stem) for stem, guess in pairs[train].items())
     renamed_proposal = replace(proposal, columns=renamed_columns)
     targets, notes = _targets(renamed_proposal)
@@ -417,10 +325,10 @@ def _of_pairs(
     channels = [guess.channel for guess in renamed_proposal.of_role("reference", "command", "measured")]
     tests = [str(one["name"]) for one in recordings if str(one["name"]).endswith(f"_{test}")]
     files = {
-        DATA: _data_set(recordings),
-        SETTINGS: _settings(proposal, channels, targets, {"kind": "recordings", "test": tests}),
+        DATA: data_set_text(recordings),
+        SETTINGS: settings_text(proposal, channels, targets, {"kind": "recordings", "test": tests}),
     }
-    _check(files)
+    check_files(files)
     notes += _notes(group, others, broken, proposal)
     notes.append(f"two experiments stand side by side: columns of '{train}' train, those of '{test}' test")
     inputs = _untold_inputs(renamed_proposal)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from edp.workflows.proposal import DATA, propose, write_proposal
+from edp.workflows.proposal import propose, write_proposal
+from edp.workflows.proposal_files import DATA
 
 
 def save(path: Path, times: np.ndarray, seed: int = 0) -> Path:

@@ -18,7 +18,8 @@ from edp.logs.proposal import columns as columns_module
 from edp.logs.proposal.kinds import BOUND
 from edp.logs.source import DataSource, load_signal_map
 from edp.workflows.auto import load_auto
-from edp.workflows.proposal import DATA, MAP, SETTINGS, LogsProposal, horizons_for, propose, write_proposal
+from edp.workflows.proposal import LogsProposal, propose, write_proposal
+from edp.workflows.proposal_files import DATA, MAP, SETTINGS, horizons_for
 
 Rows = dict[str, np.ndarray]
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from edp.logs.proposal.kinds import BOUND
-from edp.workflows.proposal import MAP, SETTINGS, propose
+from edp.workflows.proposal import propose
+from edp.workflows.proposal_files import MAP, SETTINGS
 
 ROOT = Path(os.environ.get("EDP_SHARED_DATA") or Path(__file__).parents[3].parent / "shared" / "data")
 pytestmark = pytest.mark.shared_data

@@ -200,9 +200,9 @@ def _units_above(rows: list[list[str]], units: tuple[str | None, ...]) -> tuple[
     if not rows or any(units) or len(rows[-1]) != len(units):
         return units
     cells = [normalise_unit(cell.strip().strip("[]()")) for cell in rows[-1]]
-    known = [cell for cell in cells if cell in UNITS or cell in TIME_UNITS or cell in OTHER_UNITS]
-    # One known word may be a name, as V and A are.
-    return tuple(cells) if 2 * len(known) > len(units) else units
+    unit_cells = [cell for cell in cells if cell in UNITS or cell in TIME_UNITS or cell in OTHER_UNITS]
+    # One word that is a unit may be a name, as V and A are.
+    return tuple(cells) if 2 * len(unit_cells) > len(units) else units
 
 
 def _first_lines(path: Path) -> tuple[list[str], int, str, str | None, str]:
@@ -343,8 +343,8 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
         return match["name"], normalise_unit(match["square"])
     unit = normalise_unit(match["round"])
     # Round brackets may belong to the name, as in "speed (filtered)".
-    known = unit in UNITS or unit in TIME_UNITS or unit in OTHER_UNITS
-    return (match["name"], unit) if known else (cell, None)
+    is_unit = unit in UNITS or unit in TIME_UNITS or unit in OTHER_UNITS
+    return (match["name"], unit) if is_unit else (cell, None)
 
 
 def _is_unit_row(row: list[str]) -> bool:

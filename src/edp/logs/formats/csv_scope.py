@@ -92,7 +92,7 @@ def scope_head(path: Path, lines: Sequence[str]) -> ScopeHead | None:
 
 def _time_places(steps: Sequence[str], width: int) -> list[int]:
     """Places of time columns that a row of some cells reaches."""
-    return [place for place, cell in enumerate(steps[:width]) if cell == _STEP_KEY]
+    return [index for index, cell in enumerate(steps[:width]) if cell == _STEP_KEY]
 
 
 def _unit(cell: str) -> str | None:
@@ -122,16 +122,16 @@ def read_scope(path: Path, head: ScopeHead, sample: Sequence[str], encoding: str
     values = _numbers(path, head, "," if comma else ".", encoding)
     signals: dict[str, RawSignal] = {}
     time: Column | None = None
-    for place, name in enumerate(head.names):
-        column = values[:, place]
+    for index, name in enumerate(head.names):
+        column = values[:, index]
         if name == _STEP_KEY:
             time = column[np.isfinite(column)] * 1e-3
             continue
         if time is None or not len(time):
             raise DataError(f"'{path}': column '{name[:60]}' has no time stamps beside it; export it again")
         part = np.ascontiguousarray(column[: len(time)])
-        full = name if name and name not in signals else f"{name or 'column'}.{place + 1}"
-        signals[full] = RawSignal(full, partial(np.asarray, part), len(part), time, unit=head.units[place])
+        full = name if name and name not in signals else f"{name or 'column'}.{index + 1}"
+        signals[full] = RawSignal(full, partial(np.asarray, part), len(part), time, unit=head.units[index])
     return RawLog(path, signals)
 
 

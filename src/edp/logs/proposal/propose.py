@@ -124,11 +124,11 @@ def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]
     """
     moving = dict(behaviours)
     for column in (column for look in beside for column in look.columns):
-        known = moving.get(column.name)
-        if known is not None and (known.constant or known.steps):
+        first = moving.get(column.name)
+        if first is not None and (first.constant or first.steps):
             other = behaviour_of(column)
-            more = not other.constant if known.constant else not (other.constant or other.steps)
-            moving[column.name] = other if more else known
+            more = not other.constant if first.constant else not (other.constant or other.steps)
+            moving[column.name] = other if more else first
     return moving
 
 
