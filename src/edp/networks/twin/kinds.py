@@ -63,5 +63,5 @@ class AutoTwin:
         """Every candidate in the order of trial; known elements stand where they are named, else before networks."""
         if self.elements is None or "elements" in self.candidates:
             return self.candidates
-        place = self.candidates.index("recurrent") if "recurrent" in self.candidates else len(self.candidates)
-        return (*self.candidates[:place], "elements", *self.candidates[place:])
+        before = self.candidates.index("recurrent") if "recurrent" in self.candidates else len(self.candidates)
+        return (*self.candidates[:before], "elements", *self.candidates[before:])

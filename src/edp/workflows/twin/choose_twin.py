@@ -320,8 +320,8 @@ class TwinChoice:
 
     def _default(self, name: str) -> TwinSpec:
         """A formulation with its defaults, or with the elements that are known, and the prefix of all candidates."""
-        known = self.auto.elements if name == "elements" else None
-        spec: TwinSpec = replace(known or TWINS[name](), prefix_ticks=self.auto.prefix_ticks)
+        elements = self.auto.elements if name == "elements" else None
+        spec: TwinSpec = replace(elements or TWINS[name](), prefix_ticks=self.auto.prefix_ticks)
         return spec
 
     def _runs(self, twin: Any, fold: StretchFold) -> FreeRuns:
