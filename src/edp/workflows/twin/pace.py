@@ -33,8 +33,8 @@ def paced(training: FreeRunSpec, rate_hz: float, block: int) -> FreeRunSpec:
     asked = max(training.lengths_s) * rate_hz
     slow = rate_hz < SLOW_HZ
     longest = min(max(asked, MOST_TICKS) if slow else asked, block // 2)
-    own_lengths = (training.lengths_s, training.validation_s) != (usual.lengths_s, usual.validation_s)
-    if own_lengths or longest < LEAST_TICKS or not (slow or longest < asked):
+    named = (training.lengths_s, training.validation_s) != (usual.lengths_s, usual.validation_s)
+    if named or longest < LEAST_TICKS or not (slow or longest < asked):
         return training
     lengths_s = tuple(round(share * longest) / rate_hz for share in SHARES)
     return replace(training, lengths_s=lengths_s, validation_s=round(VALIDATED * longest) / rate_hz)
