@@ -77,17 +77,17 @@ class TwinChannels:
             raise ConfigError(
                 f"channels: a twin has no {missing}; name them in the settings, channels.{missing} = [...]"
             )
-        wrong = [c for c in self.velocities if c.kind not in INTEGRAL]
+        wrong = [c for c in self.velocities if c.kind not in INTEGRAL and c.kind is not Kind.GENERIC]
         if wrong:
             raise ConfigError(
-                f"channels: '{wrong[0].name}' is of kind {wrong[0].kind}; {' or '.join(INTEGRAL)} must hold: correct "
-                "its kind in the signal map (velocity for a speed in any unit, and for whatever else shall be answered "
-                "with and is no position or pressure), or name other velocities"
+                f"channels: '{wrong[0].name}' is of kind {wrong[0].kind}; {' or '.join(INTEGRAL)} must hold, or generic: "
+                "correct its kind in the signal map (velocity for a speed in any unit, generic for whatever else shall "
+                "be answered with and is no position or pressure), or name other velocities"
             )
         wrong = [c for c in self.pressures if c.kind not in (Kind.PRESSURE, Kind.PILOT_PRESSURE)]
         if wrong:
             raise ConfigError(f"channels: '{wrong[0].name}' is of kind {wrong[0].kind}; a pressure must hold")
-        expected = [INTEGRAL[channel.kind] for channel in self.velocities]
+        expected = [INTEGRAL.get(channel.kind, Kind.GENERIC) for channel in self.velocities]
         if self.strokes and [channel.kind for channel in self.strokes] != expected:
             names = ", ".join(f"{channel.name} ({channel.kind})" for channel in self.strokes)
             raise ConfigError(
