@@ -55,7 +55,15 @@ SMALL = {
     ],
     "committee": [
         CommitteeSpec(
-            lags=(1, 3, 4, 6), smoothed=(3, 6), members=2, units=4, centres=5, near=(0, 3), trees=5, tree_depth=3
+            lags=(1, 3, 4, 6),
+            smoothed=(3, 6),
+            members=2,
+            units=4,
+            centres=5,
+            near=(0, 3),
+            trees=5,
+            tree_depth=3,
+            bounded=True,
         ),
         CommitteeSpec(lags=(2, 5), members=1, units=4, layers=1, activations=("relu",), dropout=0.2),
     ],

@@ -15,6 +15,7 @@ from edp.data.prepared import prepare
 from edp.data.splits import ByTime
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
+from edp.ir.reference import Reference
 from edp.networks.backbones import CommitteeSpec, HybridSpec
 from edp.networks.heads import LinearHead, MlpHead
 from edp.networks.lag_bank import LagBank
@@ -374,6 +375,40 @@ def test_a_channel_that_never_moved_moves_no_prediction_later():
     net = fit_bagged(data, MODEL, spec(steps=60)).fitted.predictor
     other = replace(data.test[0], inputs=data.test[0].inputs + np.float32([0, 0, 1]))
     assert np.abs(stream_predictions(net, [other])[0] - stream_predictions(net, data.test)[0]).max() < 1e-6
+
+
+@pytest.mark.parametrize("parts", [{}, {"centres": 30, "trees": 10}])
+def test_what_is_far_outside_of_what_trained_is_held_at_limits(parts):
+    """A sensor that jumps far off moves no prediction further than one at the limits does, as a graph just as well."""
+    data = data_of(recording())
+    nets = [fit_bagged(data, committee(bounded=b, **parts), spec()).fitted.predictor for b in (False, True)]
+    usual = replace(data.test[0], inputs=data.test[0].inputs[:200])
+    spread = np.ptp(data.train[0].inputs[:, 0])
+
+    def moved_by(jump):
+        """The largest change of any prediction, of each network."""
+        inputs = usual.inputs.copy()
+        inputs[100:, 0] += jump
+        far = replace(usual, inputs=inputs)
+        return [np.abs(stream_predictions(net, [far])[0] - stream_predictions(net, [usual])[0]).max() for net in nets]
+
+    np.testing.assert_array_equal(*(stream_predictions(net, [usual])[0] for net in nets))
+    free, held = moved_by(1e3 * spread)
+    free_further, held_further = moved_by(1e5 * spread)
+    assert free_further > 10 * free
+    assert held_further == pytest.approx(held, rel=1e-3)
+    assert held < 0.1 * free
+    far = np.concatenate([usual.inputs, 1e3 * usual.inputs])
+    (expected,) = stream_predictions(nets[1], [replace(usual, inputs=far)])
+    graph = Reference(nets[1].double().graph())
+    rows = [graph.results(row)["prediction"] for row in far.astype(np.float64)]
+    np.testing.assert_allclose(np.reshape(rows, expected.shape), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_limits_that_nothing_sets_are_refused():
+    with pytest.raises(ConfigError, match=r"bounded = true.*training on folds sets limits"):
+        check_fitted_parts(committee(bounded=True), TrainingSpec())
+    check_fitted_parts(committee(bounded=True), spec())
 
 
 @pytest.mark.parametrize(

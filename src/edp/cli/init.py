@@ -48,7 +48,7 @@ def init(
         err.print("nothing was written")
         raise typer.Exit(1)
     paths = write_proposal(proposal, folder, overwrite)
-    commands = proposal.commands(folder)
+    commands, plant = proposal.commands(folder), proposal.plant_command(folder)
 
     def show() -> None:
         for path in paths:
@@ -56,8 +56,11 @@ def init(
         out.print("next: " + commands[0])
         for command in commands[1:]:
             out.print("      " + command)
+        if plant:
+            out.print("or a plant model, which runs on commands alone:")
+            out.print("      " + plant)
 
-    emit(as_json, _facts(proposal, paths, commands), show)
+    emit(as_json, _facts(proposal, paths, commands) | {"plant_command": plant or None}, show)
 
 
 def show_proposal(proposal: LogsProposal) -> None:

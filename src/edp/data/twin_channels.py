@@ -80,7 +80,7 @@ class TwinChannels:
         wrong = [c for c in self.velocities if c.kind not in INTEGRAL and c.kind is not Kind.GENERIC]
         if wrong:
             raise ConfigError(
-                f"channels: '{wrong[0].name}' is of kind {wrong[0].kind}; {' or '.join(INTEGRAL)} must hold, or generic: "
+                f"channels: '{wrong[0].name}' is of kind {wrong[0].kind}; {', '.join(INTEGRAL)} or generic must hold: "
                 "correct its kind in the signal map (velocity for a speed in any unit, generic for whatever else shall "
                 "be answered with and is no position or pressure), or name other velocities"
             )

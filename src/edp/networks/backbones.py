@@ -258,6 +258,8 @@ class CommitteeSpec:
         trees: regression trees for each predicted number; their sums join the representation. A training on folds
             fits them.
         tree_depth: comparisons from the root of a tree to a leaf.
+        bounded: whether present values and changes far outside what a training on folds saw are held at limits around
+            it. An axis that first moves on the machine, or a sensor that jumps, is then no multiple of what trained.
     """
 
     # Spans in powers of two cover 0.01 to 0.32 s at 100 Hz with few columns.
@@ -272,6 +274,7 @@ class CommitteeSpec:
     near: tuple[int, ...] = ()
     trees: int = 0
     tree_depth: int = 4
+    bounded: bool = False
 
     def __post_init__(self) -> None:
         check_count("backbone", "lags", self.lags, MOST_LEVELS, least=1)
@@ -309,7 +312,7 @@ class CommitteeSpec:
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """The bank of changes, and the members and trees on it."""
-        bank = LagBank(features, self.lags, self.smoothed)
+        bank = LagBank(features, self.lags, self.smoothed, self.bounded)
         groups = [
             Members(bank.columns, self.members, self.units, self.layers, name, self.dropout)
             for name in self.activations

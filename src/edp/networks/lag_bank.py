@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from edp.data.features import MOST_LAG
 from edp.errors import ConfigError
 from edp.ir import Builder
-from edp.ir.layers import ScaleShift
+from edp.ir.layers import Clip, ScaleShift
 from edp.ir.memory import Difference
 from edp.networks.streaming import Cost, State, Streaming
 from edp.networks.trailing import StreamingTrailingMean
@@ -54,21 +54,35 @@ class LagBank(Streaming):
     gone on like this before. The change of means over m is the mean of the last m changes over m. State: the input
     before, whether there was one, and the changes that each mean needs.
 
+    Args:
+        width: inputs.
+        lags: spans in ticks, rising.
+        smoothed: spans among them that also give the change of a mean.
+        bounded: whether columns are held within `low` and `high`.
+
     Attributes:
         gain: what each change is multiplied by, ``(lag + smoothed, width)``; a trainer sets one over its deviation.
+        low: least value of each column, ``(columns,)``, of a bounded bank; until it is set it holds nothing back.
+        high: largest likewise.
     """
 
     gain: Tensor
+    low: Tensor
+    high: Tensor
 
-    def __init__(self, width: int, lags: Sequence[int], smoothed: Sequence[int] = ()) -> None:
+    def __init__(self, width: int, lags: Sequence[int], smoothed: Sequence[int] = (), bounded: bool = False) -> None:
         super().__init__()
         check_lags(lags)
         check_smoothed(lags, smoothed)
-        self.width, self.lags, self.smoothed = width, tuple(lags), tuple(smoothed)
+        self.width, self.lags, self.smoothed, self.bounded = width, tuple(lags), tuple(smoothed), bounded
         # A mean of one is the change itself, and would carry a ring without rows.
         self.means = nn.ModuleList(StreamingTrailingMean(width, lag) for lag in self.lags if lag > 1)
         self.means_of_means = nn.ModuleList(StreamingTrailingMean(width, span) for span in self.smoothed)
         self.register_buffer("gain", torch.ones(len(self.spans), width))
+        if bounded:
+            most = torch.full((self.columns,), torch.finfo(torch.float32).max)
+            self.register_buffer("low", -most)
+            self.register_buffer("high", most)
 
     @property
     def spans(self) -> tuple[int, ...]:
@@ -91,6 +105,12 @@ class LagBank(Streaming):
         first = 0 if span == 0 else self.width * (1 + self.lags.index(span))
         return [*present, *(range(first, first + self.width) if span else ())]
 
+    def set_limits(self, low: Tensor, high: Tensor) -> None:
+        """Hold each column of a bounded bank within limits, ``(columns,)`` each."""
+        with torch.no_grad():
+            self.low.copy_(low)
+            self.high.copy_(high)
+
     def _means(self) -> list[StreamingTrailingMean]:
         """Means of changes, then means of some of these."""
         return [mean for mean in (*self.means, *self.means_of_means) if isinstance(mean, StreamingTrailingMean)]
@@ -110,7 +130,10 @@ class LagBank(Streaming):
             values.append(value)
             new.append(after)
         parts = [x, *(value * (span * gain) for span, gain, value in zip(self.spans, self.gain, values, strict=True))]
-        return torch.cat(parts, dim=-1), (x[:, -1:], torch.ones_like(age), tuple(new))
+        columns = torch.cat(parts, dim=-1)
+        if self.bounded:
+            columns = torch.clamp(columns, self.low.to(columns), self.high.to(columns))
+        return columns, (x[:, -1:], torch.ones_like(age), tuple(new))
 
     def _smooths(self, span: int) -> int:
         """Number of the change whose mean the change with the number `span` is."""
@@ -126,7 +149,11 @@ class LagBank(Streaming):
         joined = build.join("changes", x, *values)
         spans = torch.tensor(self.spans, dtype=self.gain.dtype, device=self.gain.device)
         gain = torch.cat([one.to(self.gain), (spans[:, None] * self.gain).flatten()])
-        return build.add(ScaleShift, "scaled_changes", joined, gain=gain, shift=torch.zeros_like(gain))
+        columns = build.add(ScaleShift, "scaled_changes", joined, gain=gain, shift=torch.zeros_like(gain))
+        # Limits that nothing has set hold nothing back.
+        if not self.bounded or bool((self.high == torch.finfo(torch.float32).max).all()):
+            return columns
+        return build.add(Clip, "within", columns, low=self.low, high=self.high)
 
     def costs(self) -> list[Cost]:
         """Differences and sums only: no multiply-accumulates."""

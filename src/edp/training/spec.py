@@ -189,9 +189,14 @@ def check_fitted_parts(model: ModelSpec, spec: TrainingSpec) -> None:
     """Refuse parts that only a training on folds fits, where a training from random weights has none.
 
     Raises:
-        ConfigError: it has trees, which no gradient reaches.
+        ConfigError: it has trees, which no gradient reaches, or limits that only such a training sets.
     """
     backbone = model.backbone
+    if spec.bagging is None and isinstance(backbone, CommitteeSpec) and backbone.bounded:
+        raise ConfigError(
+            "training: model.backbone.bounded = true, but only a training on folds sets limits (a table "
+            "training.bagging, as in the preset 'committee'); take one, or set bounded = false"
+        )
     if spec.bagging is None and isinstance(backbone, CommitteeSpec) and backbone.trees:
         raise ConfigError(
             f"training: model.backbone.trees = {backbone.trees}, but no gradient reaches trees; train on folds (a "

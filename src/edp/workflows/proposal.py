@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ import numpy as np
 
 from edp.data.even_split import blocks_where_time_is_uneven
 from edp.data.splits import ByTime
+from edp.data.twin_channels import INTEGRAL
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.proposal.columns import LogLook
 from edp.logs.proposal.groups import LogGroup, group_logs
@@ -87,10 +89,7 @@ class LogsProposal:
 
     def commands(self, folder: Path) -> list[str]:
         """The commands that come next, in order."""
-        data, mapped = _quoted(self.source), f" --map {_quoted(folder / MAP)}"
-        if DATA in self.files:
-            data, mapped = _quoted(folder / DATA), ""
-        repair = "".join(f" --repair {one}" for one in self.repairs)
+        data, mapped, repair = self._logs(folder)
         run = _quoted(folder / "runs" / "first")
         inputs = f" --inputs {shlex.quote(','.join(self.inputs))}" if self.inputs else ""
         return [
@@ -99,6 +98,28 @@ class LogsProposal:
             f"edp evaluate {run}",
             f"edp report {run}",
         ]
+
+    def plant_command(self, folder: Path) -> str:
+        """The command that trains a plant model, which runs on commands alone; empty where it needs more names."""
+        guesses = {guess.channel: guess.kind.kind for guess in self.proposal.columns if guess.channel}
+        kinds = {guesses.get(name, Kind.GENERIC) for name in self.targets}
+        if not self.proposal.of_role("command") or not kinds <= {*INTEGRAL, Kind.GENERIC}:
+            return ""
+        parts = {"commands": self.inputs, "velocities": self.targets if Kind.GENERIC in kinds else ()}
+        named = "".join(
+            f" --set {shlex.quote(f'channels.{part}={json.dumps(names, ensure_ascii=False)}')}"
+            for part, names in parts.items()
+            if names
+        )
+        data, mapped, repair = self._logs(folder)
+        return f"edp twin {data}{mapped} --out {_quoted(folder / 'runs' / 'twin')}{repair}{named}"
+
+    def _logs(self, folder: Path) -> tuple[str, str, str]:
+        """Logs, map and repairs as arguments of a command."""
+        repair = "".join(f" --repair {one}" for one in self.repairs)
+        if DATA in self.files:
+            return _quoted(folder / DATA), "", repair
+        return _quoted(self.source), f" --map {_quoted(folder / MAP)}", repair
 
 
 def _untold_inputs(proposal: MapProposal) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
+from edp.config.twin import load_twin_experiment
+from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.proposal import columns as columns_module
 from edp.logs.proposal.kinds import BOUND
@@ -107,6 +110,12 @@ def test_commands_name_the_channels_of_experiments_that_stand_side_by_side(tmp_p
     assert proposal.targets == ("y",)
     assert all({"u", "y"} == set(recording.channel_names) for recording in recordings)
     assert proposal.commands(tmp_path / "out")[0].endswith(" --inputs u")
+    plant = shlex.split(proposal.plant_command(tmp_path / "out"))
+    assert plant[:2] == ["edp", "twin"]
+    assert plant[-4:] == ["--set", 'channels.commands=["u"]', "--set", 'channels.velocities=["y"]']
+    settings = load_twin_experiment(None, plant[-3::2])
+    channels = twin_channels(recordings[0], settings.channels)
+    assert [channel.name for channel in channels.commands + channels.answers] == ["u", "y"]
 
 
 def test_nothing_is_replaced_silently(cylinder, tmp_path):

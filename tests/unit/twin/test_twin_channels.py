@@ -62,7 +62,11 @@ def test_names_of_the_settings_come_before_kinds():
     ("settings", "error", "message"),
     [
         ({"commands": ("uu",)}, DataError, "input 'uu' is not a channel of 'log'.*did you mean 'u'"),
-        ({"velocities": ("pA",), "pressures": ("pB",)}, ConfigError, "'pA' is of kind pressure; velocity or"),
+        (
+            {"velocities": ("pA",), "pressures": ("pB",)},
+            ConfigError,
+            "'pA' is of kind pressure; velocity, angular_velocity or generic must",
+        ),
         ({"strokes": ("pA",), "pressures": ("pB",)}, ConfigError, r"strokes are pA \(pressure\); one for each"),
         ({"pressures": ("x",), "strokes": ("x",)}, ConfigError, "x is named twice"),
         ({"pressures": ("x",)}, ConfigError, "'x' is of kind position; a pressure must hold"),

@@ -24,6 +24,10 @@ from edp.training.validation import standard_targets
 PIECE = 4096
 """Ticks of a stretch that go through the front end in one call."""
 FLOAT, DOUBLE = 4, 8
+PRESENT_BEYOND, CHANGE_BEYOND = 1.0, 10.0
+"""How far beyond what trained a column may go, in ranges of it. A position or temperature that leaves its range by more
+than all of it says little by a linear map; larger changes than recorded ones are often real, as in quicker motion
+(findings: Sjoberg's arm, and an arm of which an axis moved for the first time)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +116,8 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     still = torch.from_numpy(np.ptp(columns, axis=0) == 0)
     with torch.no_grad():
         bank.gain.copy_(torch.from_numpy(gain).view_as(bank.gain))
+        if bank.bounded:
+            bank.set_limits(*_limits(columns, bank.width))
         for group in committee_of(net).members:
             # No gradient reaches these weights: random ones would answer a channel that moves later for the first time.
             group.weights[0][:, still] = 0.0
@@ -123,6 +129,14 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     gap = min(gap, max(1, sum(lengths) // (4 * spec.folds * pieces)))
     starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), skips, strict=True)
     return Table(columns, targets, blocked_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
+
+
+def _limits(columns: NDArray[np.float32], present: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Least and largest value that each column may have: its range, widened; the first `present` are no changes."""
+    low, high = columns.min(axis=0), columns.max(axis=0)
+    share = np.where(np.arange(len(low)) < present, PRESENT_BEYOND, CHANGE_BEYOND)
+    beyond = (share * (high - low)).astype(np.float32)
+    return torch.from_numpy(low - beyond), torch.from_numpy(high + beyond)
 
 
 def _pieces(share: float, test: Sequence[Series], reach: int, stride: int) -> int:

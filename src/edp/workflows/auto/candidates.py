@@ -281,7 +281,7 @@ def _committee(amount: Amount) -> Table:
 
 def _tables(amount: Amount, parts: Table, bagging: Table) -> Table:
     spans = spans_of(amount)
-    bank = {"lags": spans.lags, "smoothed": spans.smoothed}
+    bank = {"lags": spans.lags, "smoothed": spans.smoothed, "bounded": True}
     backbone = {"kind": "committee", **bank, "members": MEMBERS, "units": UNITS, "layers": 2}
     return {
         "model": {
