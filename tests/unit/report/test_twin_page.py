@@ -23,10 +23,10 @@ HOSTILE = "</script><img src=x onerror=alert(1)>"
 SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), covered_at_s=(0.2, 1.0))
 
 
-def judged(strokes=True, name="boom", swing=False):
+def judged(strokes=True, name="boom", swing=False, kind=Kind.VELOCITY):
     """Scores and runs of a twin of one cylinder with noise for errors, in two recordings; with a swing of two axes."""
     stroke = (Channel(f"{name} stroke", Kind.POSITION),) if strokes else ()
-    velocity, pressure = (Channel(name, Kind.VELOCITY),), (Channel("p", Kind.PRESSURE),)
+    velocity, pressure = (Channel(name, kind),), (Channel("p", Kind.PRESSURE),)
     if swing:
         velocity, stroke = (*velocity, Channel("swing", Kind.ANGULAR_VELOCITY)), (*stroke, Channel("pose", Kind.ANGLE))
         pressure = ()
@@ -103,6 +103,12 @@ def test_a_twin_without_strokes_has_a_page_too():
     facts = facts_of(strokes=False)
     assert "runs_strokes" not in plots_of(facts)
     assert "Strokes off by" in render(facts)
+
+
+def test_plain_numbers_have_no_strokes_in_the_headline():
+    facts = facts_of(strokes=False, name="level", kind=Kind.GENERIC)
+    assert headline(facts).startswith("level off by ")
+    assert "Strokes off by" not in render(facts)
 
 
 def test_names_are_text_on_the_page():

@@ -27,7 +27,7 @@ from edp.evaluation.scores_file import (
     read_shaped,
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import number, percent
+from edp.report.common.wording import listed, number, percent, short_label
 from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.report.twin.steps import read_steps
@@ -38,6 +38,7 @@ TWIN = "twin"
 PARTS = ("velocities", "strokes", "pressures")
 SITUATIONS = {"end_stops": "at an end stop", "rest": "at rest (idling)", "motion": "in motion"}
 MOST_ROWS = 40
+PLAIN_UNIT = "1"
 """Recordings of a table, the worst first: nobody reads more."""
 UNIT = Leaf(lambda value: value is None or isinstance(value, str), "a text or null")
 BY_CHANNEL = KeyedObject(
@@ -210,12 +211,23 @@ def _check_arrays(facts: FreeRunFacts, path: Path) -> None:
 
 
 def headline(facts: FreeRunFacts) -> str:
-    """The error of the strokes at the end of the runs, in one sentence."""
+    """The error of the strokes at the end of the runs in one sentence; of the answers where they are plain numbers."""
     twin = facts.twin
+    plain = _plain_answers(facts)
+    if plain:
+        off = number(twin["velocity_mae"]["mean"])
+        return f"{plain} off by {off} on average in {twin['seconds']:g} s on commands alone"
     last = twin["stroke_error"][-1] if twin["stroke_error"] else None
     if last is None or last["mean"] is None:
         return f"{twin['runs']} free runs of {twin['seconds']:g} s on commands alone"
     return f"Strokes off by {number(last['mean'])} {last['unit']} after {last['at_s']:g} s on commands alone"
+
+
+def _plain_answers(facts: FreeRunFacts) -> str:
+    """Names of the answers where they are numbers without a unit, whose integral is no stroke; else empty."""
+    if facts.twin["velocity_mae"].get("unit") != PLAIN_UNIT or facts.twin["velocity_mae"]["mean"] is None:
+        return ""
+    return listed(short_label(str(channel["name"])) for channel in facts.channels("velocities"))
 
 
 def verdict(facts: FreeRunFacts) -> list[str]:
@@ -227,8 +239,11 @@ def verdict(facts: FreeRunFacts) -> list[str]:
         else f"{twin['runs']} free runs of {twin['seconds']:g} s."
     ]
     lines += [f"It is {sentence}" for sentence in (choice_sentence(facts.candidates),) if sentence]
+    plain = _plain_answers(facts)
     for name, scores in facts.models.items():
-        if name != TWIN and scores["stroke_error"] and scores["stroke_error"][-1]["mean"] is not None:
+        if name != TWIN and plain:
+            lines.append(f"The floor {name} is off by {number(scores['velocity_mae']['mean'])}.")
+        elif name != TWIN and scores["stroke_error"] and scores["stroke_error"][-1]["mean"] is not None:
             last = scores["stroke_error"][-1]
             lines.append(f"The floor {name} is off by {number(last['mean'])} {last['unit']} then.")
     return lines
