@@ -20,7 +20,7 @@ from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
 from edp.monitor.fitting import SessionBlocks, blocks_of, fit_from_blocks, fit_summaries, session_means
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
-from edp.monitor.residuals.base import FitMaterial, ResidualSource
+from edp.monitor.residuals.base import FitMaterial, ResidualSource, sisters_of
 from edp.monitor.summaries import BlockSummaries
 from edp.recording import Recording
 from edp.sim.plan import ordered
@@ -229,7 +229,10 @@ def refitted(plan: Plan, old: Monitor, experiment: MonitorExperiment) -> FittedM
         fresh = source if source is not None and source.parts().bundles else spec.fit(material)
         sources += [] if fresh is None else [fresh]
     summaries = fit_summaries(experiment.chain, sources, old.channels, rest)
-    held = [_held(plan, summaries, sources, old, recording) for recording in rest]
+    held = []
+    for number, recording in enumerate(rest):
+        sisters = sisters_of(sources, experiment.chain.tolerance, number)
+        held.append(_held(plan, summaries, sisters, old, recording))
     chain = fit_from_blocks(
         experiment.chain, summaries, held, old.rate_hz, old.chain.settle, experiment.hours_per_false_alarm, noted
     )

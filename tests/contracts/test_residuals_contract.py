@@ -20,8 +20,6 @@ from edp.training.bundle import Bundle
 from edp.training.twin_bundle import TwinBundle
 
 TICKS = 400
-LATEST = 5
-"""Ticks in which an offset must show."""
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +108,7 @@ def test_facts_have_one_entry_a_residual(source):
 
 
 def test_a_bias_of_what_is_judged_shows(source, sessions):
-    """Measured less expected: an offset of the channel moves its residual to its side, at least for a while."""
+    """Measured less expected: an offset of the channel moves its residual to its side, `delay` ticks later."""
     rows = rows_of(source, sessions[:1])
     before, _ = source.run(rows, source.initial_state(1))
     for place, judged in enumerate(source.judged):
@@ -119,9 +117,27 @@ def test_a_bias_of_what_is_judged_shows(source, sessions):
         moved[:, TICKS // 2 :, column] += 10.0 * rows[..., column].std()
         after, _ = source.run(moved, source.initial_state(1))
         moved_by = np.nan_to_num((after - before)[0, :, place])
-        # A rate in the middle of some ticks is known a little later.
-        soon = moved_by[TICKS // 2 :][:LATEST]
+        soon = moved_by[TICKS // 2 :][: source.delay + 1]
         assert soon[np.flatnonzero(soon)[:1]].sum() > 0.0, source.names[place]
+        # Not before it happened, and a source that promises to be late is late.
+        assert not moved_by[: TICKS // 2 + source.delay].any(), source.names[place]
+
+
+def test_a_source_of_a_sister_reads_and_judges_the_same(source, sessions):
+    rows = rows_of(source, sessions[:1])
+    other = source.of_sister(np.random.default_rng(0), 0.02)
+    assert (other.names, other.reads, other.inputs, other.delay) == (
+        source.names,
+        source.reads,
+        source.inputs,
+        source.delay,
+    )
+    residuals, _ = other.run(rows, other.initial_state(1))
+    assert np.isfinite(residuals).mean() > 0.9
+    own, _ = source.run(rows, source.initial_state(1))
+    same, _ = source.of_sister(np.random.default_rng(0), 0.0).run(rows, source.initial_state(1))
+    # Numbers that are taken apart and put together again: to the last digits.
+    np.testing.assert_allclose(same, own, atol=1e-3 * np.nanstd(own))
 
 
 def test_parts_give_the_same_source(source, sessions):

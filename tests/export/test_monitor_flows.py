@@ -38,11 +38,17 @@ def test_balances_of_flow_have_the_bits_of_python(c, excavator, tmp_path):
     rows = session.select(monitor.inputs).copy()
     rows[300:310, 1] = np.nan
     rows[700, monitor.inputs.index("AmIn")] = np.nan
+    # Oil that was not learned, and a thermometer that fails while it is hot.
+    rows[900:950, monitor.inputs.index("OilTemperature")] += 40.0
+    rows[930:940, monitor.inputs.index("OilTemperature")] = np.nan
     found = c.run(tmp_path / "program", "stream", feed=np.ascontiguousarray(rows, np.float32).tobytes())
     count = len(monitor.residual_names)
     residuals = np.frombuffer(found, np.float32).reshape(len(rows), -1)[:, :count]
     expected, _ = monitor.residuals(rows, monitor.initial_state())
     np.testing.assert_array_equal(residuals, expected)
+    flows = [name.startswith("flow:") for name in monitor.residual_names]
+    assert np.isnan(residuals[900:950][:, flows]).all()
+    assert np.isfinite(residuals[950:960][:, flows]).all()
 
 
 def test_their_cycles_count(excavator):

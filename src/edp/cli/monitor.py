@@ -127,6 +127,9 @@ def run(
     def show() -> None:
         for name, channels in watched.silent.items():
             out.print(f"'{name}' lacks {', '.join(channels)}: what judges or reads these channels is silent")
+        for name, reasons in watched.unlearned.items():
+            for reason in reasons:
+                out.print(f"'{name}': {reason}")
         # A fault that stays alarms again and again: one row tells it.
         rows = [
             [

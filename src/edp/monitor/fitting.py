@@ -16,7 +16,7 @@ from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
 from edp.monitor.detectors.separate_cusums import SeparateCusumsSpec
-from edp.monitor.residuals.base import ResidualSource, note_nothing, residuals_of, rows_of
+from edp.monitor.residuals.base import ResidualSource, note_nothing, residuals_of, rows_of, sisters_of
 from edp.monitor.summaries import BlockSummaries
 from edp.monitor.watches import BankSpec, Watch, WatchSpec, fit_watch, scaled_alike
 from edp.recording import Recording
@@ -58,6 +58,9 @@ class ChainSpec:
             without its part. Of few parts each lacks much of what the monitor itself is fitted to: limits are too high.
         drift_per_hour: of the level of a summary that is followed, in healthy standard deviations.
         most_drift: of them together.
+        tolerance: share by which numbers of machines of the series may lie off that of the logs. The sessions that set
+            the limit are seen as those of such machines, a machine each, by the residuals that know what a machine is
+            made of; 0 watches this one machine, and sees smaller faults of it.
         doubtful: largest deviation of a session's means, over the usual largest one, beyond which it is left out and
             named.
 
@@ -72,6 +75,7 @@ class ChainSpec:
     folds: int = 10
     drift_per_hour: float = 0.05
     most_drift: float = 0.5
+    tolerance: float = 0.0
     doubtful: float = 8.0
 
     def __post_init__(self) -> None:
@@ -84,6 +88,7 @@ class ChainSpec:
             folds=integer(2, 100),
             drift_per_hour=below(0.0, 1e3),
             most_drift=below(0.0, 1e3),
+            tolerance=below(0.0, 0.2),
             doubtful=above(0.0, 1e6),
         )
         check_count("chain", "watches", self.watches, 16, least=1)
@@ -145,7 +150,10 @@ def fit_chain(
         )
     note("summaries of healthy sessions")
     summaries = fit_summaries(spec, sources, channels, sessions)
-    blocks = [blocks_of(summaries, sources, channels, session) for session in sessions]
+    blocks = [
+        blocks_of(summaries, sisters_of(sources, spec.tolerance, number), channels, session)
+        for number, session in enumerate(sessions)
+    ]
     rate_hz = sessions[0].rate_hz
     shortest = min(session.samples for session in sessions)
     # A tenth: one-minute cycles of a rig would otherwise lose most of what they have.

@@ -283,6 +283,10 @@ class Monitor:
         self._check_machine(recording, lacking)
         return lacking
 
+    def unlearned(self, recording: Recording) -> tuple[str, ...]:
+        """Sentences on residuals that are silent in parts of a recording that healthy logs do not cover."""
+        return tuple(filter(None, (source.unlearned(recording) for source in self.sources)))
+
     def _check_machine(self, recording: Recording, lacking: Sequence[str]) -> None:
         """Refuse a log whose channels lie far from all healthy sessions."""
         names = [name for name in self.inputs if name not in lacking]

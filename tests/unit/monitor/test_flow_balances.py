@@ -11,6 +11,7 @@ from edp.monitor.residuals.base import SourceParts, residuals_of
 from edp.monitor.residuals.flow_balances import FlowBalances, FlowBalancesSpec
 from edp.monitor.residuals.flow_curves import KNOTS, hats, opened, played
 from edp.monitor.residuals.groups import sensed_channels
+from edp.recording import Recording
 from edp.sim import Scenario, simulate
 
 SPEC = FlowBalancesSpec(trials=40, rows=20_000)
@@ -82,6 +83,37 @@ def test_ticks_and_chunks_are_one_run_and_a_file_brings_it_back(source):
     assert np.isfinite(gone[0, 301:]).all()
 
 
+def test_oil_that_was_not_learned_silences_them_and_is_said(source):
+    recording = session(102, seconds=6.0)
+    column = recording.channel_names.index("OilTemperature")
+    values = recording.values.copy()
+    values[200:, column] = source.oil.high + 0.5
+    hot = Recording("hot", recording.channels, values, recording.rate_hz)
+    rows = residuals_of(source, [hot])[0]
+    assert np.isfinite(rows[:200]).all()
+    assert np.isnan(rows[200:]).all()
+    assert "67%" in source.unlearned(hot)
+    assert "OilTemperature" in source.unlearned(hot)
+    assert source.unlearned(recording) == ""
+    # A thermometer that fails is no reason to be blind.
+    values[:, column] = np.nan
+    gone = Recording("gone", recording.channels, values, recording.rate_hz)
+    assert np.isfinite(residuals_of(source, [gone])[0]).all()
+
+
+def test_sisters_scatter_about_the_machine_by_their_tolerance(source):
+    rows = session(103, seconds=20.0).select(source.inputs)[None]
+    own, _ = source.run(rows, source.initial_state(1))
+
+    def apart(tolerance):
+        sisters = [source.of_sister(np.random.default_rng(seed), tolerance) for seed in range(4)]
+        return np.mean([np.abs(one.run(rows, one.initial_state(1))[0] - own).mean() for one in sisters])
+
+    near, far = apart(0.01), apart(0.03)
+    assert 0.0 < near < 0.5 * far
+    assert source.oil == source.of_sister(np.random.default_rng(0), 0.01).oil
+
+
 def test_a_damaged_file_is_refused(source):
     parts = source.parts()
     entry = dict(parts.plain["chambers"][0])
@@ -94,6 +126,10 @@ def test_a_damaged_file_is_refused(source):
             FlowBalances.of_parts(SourceParts(parts.plain, dict(parts.arrays) | {name: np.array(values)}))
     with pytest.raises(ValueError, match="rate"):
         FlowBalances.of_parts(SourceParts(dict(parts.plain) | {"rate_hz": -1.0}, parts.arrays))
+    for change in ({"place": 99}, {"low": float("nan")}, {"low": 90.0, "high": 80.0}):
+        oil = parts.plain["oil"] | change
+        with pytest.raises(ValueError, match=r"thermometer|temperatures"):
+            FlowBalances.of_parts(SourceParts(dict(parts.plain) | {"oil": oil}, parts.arrays))
 
 
 def test_a_machine_without_pressures_has_none():

@@ -175,7 +175,13 @@ static void {own}_residuals({name}_state *s) {{
     for (uint32_t i = 0; i < {residuals}u; i++) {{
         s->residuals[{first}u + i] = {own}_balance(s, &{own}_chambers[i], spools);
     }}
-}}
+{oil}}}
+"""
+OIL = """\
+    if ((s->{own}_in[{place}] < {low}) || (s->{own}_in[{place}] > {high})) {{
+        /* Oil that was not learned: nothing is known of these flows. */
+        edp_fill((float)edp_unknown(), {residuals}u, &s->residuals[{first}u]);
+    }}
 """
 CHAMBER = """\
 typedef struct {{
@@ -247,8 +253,12 @@ class FlowCode:
 
     def code(self, name: str, first: int) -> str:
         """See `SourceCode`."""
-        part = self.part
+        part, oil = self.part, ""
+        if part.oil is not None:
+            low, high = (number(np.float32(end)) for end in part.oil[1:])
+            oil = OIL.format(own=self.own, place=part.oil[0], low=low, high=high, residuals=self.residuals, first=first)
         return FLOW.format(
+            oil=oil,
             own=self.own,
             name=name,
             hold=self.hold,

@@ -144,6 +144,7 @@ class FlowPart:
         doubtful: place of the relief, among `reliefs`, beyond which a balance is uncertain.
         per_tick: a sixth of the ticks per second.
         chambers: the balances.
+        oil: place of the thermometer among `reads`, lowest and highest temperature at which they hold; None without.
     """
 
     reads: Places
@@ -164,6 +165,7 @@ class FlowPart:
     doubtful: int
     per_tick: float
     chambers: tuple[FlowChamber, ...]
+    oil: tuple[int, float, float] | None = None
 
 
 SourcePart = NetworkPart | BalancePart | TwinPart | FlowPart

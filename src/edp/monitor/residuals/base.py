@@ -20,6 +20,8 @@ from edp.training.twin_bundle import TwinBundle
 Rows = NDArray[np.float32]
 MOST_RESIDUALS = 512
 """Of one source: a machine with more channels is watched in parts."""
+SISTERS = 11
+"""Seeds of drawn machines are apart from all others."""
 
 
 def note_nothing(text: str) -> None:
@@ -104,6 +106,7 @@ class ResidualSource(ABC):
         units: SI unit of each residual.
         inputs: raw channels, SI units.
         middle: what stands in for an input that was never there, shape (inputs,).
+        delay: ticks after which an offset of a judged channel shows at the latest.
     """
 
     names: tuple[str, ...]
@@ -112,6 +115,7 @@ class ResidualSource(ABC):
     units: tuple[str, ...]
     inputs: tuple[str, ...]
     middle: Rows
+    delay: int = 0
 
     def initial_state(self, streams: int) -> SourceState:
         """State at the start of `streams` machines."""
@@ -166,6 +170,19 @@ class ResidualSource(ABC):
         padded = np.concatenate([state.last[:, None], rows], axis=1)
         filled = np.take_along_axis(padded, newest, axis=1)
         return filled, filled[:, -1].copy()
+
+    def of_sister(self, rng: np.random.Generator, tolerance: float) -> ResidualSource:
+        """The source as it would have to be for another machine of the same series; itself where it knows no machine.
+
+        Args:
+            rng: draws that machine.
+            tolerance: share by which each of its numbers may lie off, evenly.
+        """
+        return self
+
+    def unlearned(self, recording: Recording) -> str:
+        """Why it is silent in a part of a recording that healthy logs do not cover; empty where it is not."""
+        return ""
 
     @abstractmethod
     def _start(self, streams: int) -> Any:
@@ -246,6 +263,14 @@ def residuals_of(source: ResidualSource, recordings: Sequence[Recording], stream
         whole = np.concatenate(out, axis=1)
         results.update({i: whole[lane, : len(inputs[lane])].copy() for lane, i in enumerate(members)})
     return [results[i] for i in range(len(recordings))]
+
+
+def sisters_of(sources: Sequence[ResidualSource], tolerance: float, number: int) -> list[ResidualSource]:
+    """Sources as if a session were that of another machine of the series, drawn by the number of the session."""
+    if not tolerance:
+        return list(sources)
+    rng = np.random.default_rng([number, SISTERS])
+    return [source.of_sister(rng, tolerance) for source in sources]
 
 
 def rows_of(recording: Recording, names: Sequence[str]) -> Rows:

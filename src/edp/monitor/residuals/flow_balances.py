@@ -34,9 +34,12 @@ from edp.monitor.residuals.flow_curves import (
     doubts_of,
     lines_of,
     opened,
+    opening_later,
     paths_of,
+    slopes_of,
 )
-from edp.monitor.residuals.flow_fit import fit_chambers
+from edp.monitor.residuals.flow_fit import fit_chambers, fit_oil_range
+from edp.recording import Recording
 from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
 
 PREFIX = "flow:"
@@ -63,12 +66,43 @@ class ChamberCurves:
     lines: Singles
     doubts: Singles
 
+    def of_sister(self, rng: np.random.Generator, tolerance: float) -> ChamberCurves:
+        """The balance of another machine of the series; see `ResidualSource.of_sister`."""
+        paths, lines = len(self.values), len(self.lines)
+        later, wider = (rng.uniform(-tolerance, tolerance, paths) for _ in range(2))
+        values = opening_later(self.values.astype(np.float64), later) * (1.0 + wider[:, None])
+        scaled = self.lines * (1.0 + rng.uniform(-tolerance, tolerance, lines))
+        numbers = (one.astype(np.float32) for one in (values, slopes_of(values), scaled))
+        return ChamberCurves(self.spots, *numbers, self.doubts)
+
+
+@dataclass(frozen=True)
+class OilRange:
+    """Temperatures of the oil at which balances are known to hold: leaks and dead times go with its viscosity.
+
+    Attributes:
+        place: of the thermometer among the inputs.
+        low: lowest temperature, in the unit of the channel.
+        high: highest one.
+    """
+
+    place: int
+    low: float
+    high: float
+
+    def beyond(self, values: Singles) -> NDArray[np.bool_]:
+        """Which temperatures are outside."""
+        outside: NDArray[np.bool_] = (values < np.float32(self.low)) | (values > np.float32(self.high))
+        return outside
+
 
 class FlowBalances(ResidualSource):
     """Fitted balances, one a chamber: the velocity that is measured less the one that its flows make, over how far that
     usually is off in such a situation.
 
-    Everything is that of `BACK` ticks ago, since the rate of a pressure needs ticks on either side.
+    Everything is that of `BACK` ticks ago, since the rate of a pressure needs ticks on either side. Where the oil is
+    colder or hotter than it was learned, all are silent. A thermometer that fails silences nothing: its last value
+    stands in.
 
     Args:
         inputs: raw channels, SI units.
@@ -76,7 +110,10 @@ class FlowBalances(ResidualSource):
         spools: by their commands.
         chambers: the balances.
         rate_hz: ticks per second.
+        oil: temperatures at which they hold; None without a thermometer.
     """
+
+    delay = BACK
 
     def __init__(
         self,
@@ -85,6 +122,7 @@ class FlowBalances(ResidualSource):
         spools: SpoolModel,
         chambers: Sequence[ChamberCurves],
         rate_hz: float,
+        oil: OilRange | None = None,
     ) -> None:
         self.inputs, self.middle = tuple(inputs), np.asarray(middle, np.float32)
         self.spools, self.chambers, self.rate_hz = spools, tuple(chambers), rate_hz
@@ -93,6 +131,26 @@ class FlowBalances(ResidualSource):
         self.units = ("1",) * len(self.chambers)
         self.reads = tuple(self._read(chamber.spots) for chamber in self.chambers)
         self.per_tick = np.float32(rate_hz / 6.0)
+        self.oil = oil
+
+    def of_sister(self, rng: np.random.Generator, tolerance: float) -> FlowBalances:
+        """See `ResidualSource.of_sister`."""
+        spools = self.spools.of_sister(rng, tolerance, self.rate_hz)
+        chambers = [chamber.of_sister(rng, tolerance) for chamber in self.chambers]
+        return FlowBalances(self.inputs, self.middle, spools, chambers, self.rate_hz, self.oil)
+
+    def unlearned(self, recording: Recording) -> str:
+        """See `ResidualSource.unlearned`."""
+        if self.oil is None or self.inputs[self.oil.place] not in recording.channel_names:
+            return ""
+        name = self.inputs[self.oil.place]
+        share = float(self.oil.beyond(recording.column(name)).mean())
+        if not share:
+            return ""
+        return (
+            f"balances of flow are silent in {share:.0%} of it: '{name}' is outside {self.oil.low:.4g} to "
+            f"{self.oil.high:.4g} K, which healthy logs cover"
+        )
 
     def _read(self, spots: ChamberPlaces) -> tuple[str, ...]:
         places = [spots.velocity, spots.own, spots.other, spots.stroke, *spots.supplies]
@@ -116,7 +174,10 @@ class FlowBalances(ResidualSource):
         steps = [whole[:, end - ticks - back : end - back] for back in (0, 1, 3, 4)]
         rates = ((steps[0] - steps[3]) + (steps[1] - steps[2])) * self.per_tick
         out = [self._residual(chamber, then, rates, spools) for chamber in self.chambers]
-        return np.stack(out, axis=-1), (whole[:, end - memory :].copy(), state)
+        residuals = np.stack(out, axis=-1)
+        if self.oil is not None:
+            residuals[self.oil.beyond(rows[..., self.oil.place])] = np.nan
+        return residuals, (whole[:, end - memory :].copy(), state)
 
     @staticmethod
     def _residual(chamber: ChamberCurves, rows: Singles, rates: Singles, spools: Singles) -> Singles:
@@ -136,7 +197,8 @@ class FlowBalances(ResidualSource):
     def parts(self) -> SourceParts:
         """See `ResidualSource.parts`."""
         places = [asdict(chamber.spots) for chamber in self.chambers]
-        plain = {"inputs": list(self.inputs), "rate_hz": self.rate_hz, "chambers": places}
+        oil = None if self.oil is None else asdict(self.oil)
+        plain = {"inputs": list(self.inputs), "rate_hz": self.rate_hz, "chambers": places, "oil": oil}
         arrays: dict[str, NDArray[Any]] = {"middle": self.middle}
         arrays |= {f"spools.{one.name}": getattr(self.spools, one.name) for one in fields(self.spools)}
         for index, chamber in enumerate(self.chambers):
@@ -157,7 +219,18 @@ class FlowBalances(ResidualSource):
             _chamber_of(_place_of(entry, len(inputs), len(spools.gain)), parts.arrays, index)
             for index, entry in enumerate(entries)
         ]
-        return cls(inputs, middle, spools, chambers, rate_hz)
+        return cls(inputs, middle, spools, chambers, rate_hz, _oil_of(parts.plain.get("oil"), len(inputs)))
+
+
+def _oil_of(entry: Any, inputs: int) -> OilRange | None:
+    if entry is None:
+        return None
+    oil = OilRange(int(entry["place"]), float(entry["low"]), float(entry["high"]))
+    if not 0 <= oil.place < inputs:
+        raise ValueError("its thermometer is an input that there is not")
+    if not (np.isfinite(oil.low) and np.isfinite(oil.high) and oil.low <= oil.high):
+        raise ValueError("temperatures of its oil are not finite, or the lowest is above the highest")
+    return oil
 
 
 def _spools_of(arrays: Any, inputs: int) -> SpoolModel:
@@ -240,4 +313,8 @@ class FlowBalancesSpec(ResidualSpec):
             return None
         inputs, spools, fitted = balances
         chambers = [ChamberCurves(*one) for one in fitted]
-        return FlowBalances(inputs, mean_inputs(material, inputs), spools, chambers, material.rate_hz)
+        covered, oil = fit_oil_range(material), None
+        if covered is not None:
+            inputs = (*inputs, *(name for name in covered[:1] if name not in inputs))
+            oil = OilRange(inputs.index(covered[0]), *covered[1:])
+        return FlowBalances(inputs, mean_inputs(material, inputs), spools, chambers, material.rate_hz, oil)

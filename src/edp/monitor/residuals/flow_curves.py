@@ -27,6 +27,8 @@ CAVITY = np.float32(0.1)
 """MPa that are added where free air makes oil soft: the pressure of the atmosphere."""
 EMPTY = np.float32(0.8)
 """MPa below which a chamber may be drawn empty."""
+BEGUN = 0.01
+"""Share of its largest opening at which a path counts as open."""
 DOUBTS = 8
 """Terms of the width; see `doubts_of`."""
 LINES = 9 + len(RELIEFS)
@@ -54,6 +56,20 @@ class SpoolModel:
     dead: Array
     stages: Singles
     play: Singles
+
+    def of_sister(self, rng: np.random.Generator, tolerance: float, rate_hz: float) -> SpoolModel:
+        """Spools of another machine of the series; see `ResidualSource.of_sister`."""
+        gain, dead, play = (
+            values * (1.0 + rng.uniform(-tolerance, tolerance, values.shape))
+            for values in (self.gain, self.dead, self.play)
+        )
+        # The last number of a stage is exp(-2 DAMPING w / rate).
+        turns = -np.log(np.maximum(self.stages[..., 3].astype(np.float64), 1e-30)) / (4.0 * np.pi * DAMPING)
+        frequencies = turns * rate_hz * (1.0 + rng.uniform(-tolerance, tolerance, turns.shape))
+        stages = np.array([[stage_of(float(one), rate_hz) for one in spool] for spool in frequencies])
+        single = (values.astype(np.float32) for values in (gain, stages, play))
+        gains, both, plays = single
+        return SpoolModel(self.extend, self.retract, gains, dead, both, plays)
 
     @property
     def memory(self) -> int:
@@ -263,6 +279,23 @@ def hats(travel: Singles) -> Array:
     knots = KNOTS.astype(np.float64)
     inside = np.clip(np.asarray(travel, np.float64), knots[0], knots[-1])
     return np.stack([np.interp(inside, knots, column) for column in np.eye(len(knots))[1:]], axis=-1)
+
+
+def slopes_of(values: Array) -> Array:
+    """Slopes of curves from each knot on, the last one zero, shape (paths, knots)."""
+    slopes = np.zeros_like(values)
+    slopes[:, :-1] = np.diff(values, axis=1) / np.diff(KNOTS.astype(np.float64))
+    return slopes
+
+
+def opening_later(values: Array, shares: Array) -> Array:
+    """Curves that begin to open later by shares of where they begin, shape (paths, knots); see `BEGUN`."""
+    knots, later = KNOTS.astype(np.float64), np.empty_like(values)
+    for path, (curve, share) in enumerate(zip(values, shares, strict=True)):
+        begun = np.abs(curve) > BEGUN * np.abs(curve).max()
+        first = knots[int(begun.argmax())] if begun.any() else 0.0
+        later[path] = np.interp(knots - share * first, knots, curve)
+    return later
 
 
 def opened(travel: Singles, values: Singles, slopes: Singles) -> Singles:

@@ -22,6 +22,7 @@ from edp.monitor.residuals.flow_curves import (
     hats,
     lines_of,
     paths_of,
+    slopes_of,
     stage_of,
 )
 from edp.signals import Kind
@@ -42,6 +43,11 @@ GROSS = 8.0
 """Median sizes beyond which a tick does not count in the second round: at end stops nothing of this holds."""
 CUSHION = 0.06
 """Length of a cushion as a share of the stroke that was seen."""
+OIL = "OilTemperature"
+COVERED = (0.01, 0.99)
+"""Quantiles of a session's temperature: a thermometer has single values that are wrong."""
+BEYOND_K = 5.0
+"""Kelvin beyond the learned temperatures within which balances still hold."""
 LEAST_TANK = 0.005
 """Share of all pressures below which that of the return line is taken: a chamber that is drawn empty stands there."""
 
@@ -250,10 +256,23 @@ def _curves(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles]
         width = terms @ doubts
     heights = factors[: spots.paths * own].reshape(spots.paths, own)
     values = np.concatenate([np.zeros((spots.paths, 1)), heights], axis=1)
-    slopes = np.zeros_like(values)
-    slopes[:, :-1] = np.diff(values, axis=1) / np.diff(KNOTS.astype(np.float64))
     lines = factors[spots.paths * own :]
-    return values.astype(np.float32), slopes.astype(np.float32), lines.astype(np.float32), doubts.astype(np.float32)
+    numbers = (one.astype(np.float32) for one in (values, slopes_of(values), lines, doubts))
+    return tuple(numbers)  # type: ignore[return-value]
+
+
+def fit_oil_range(material: FitMaterial) -> tuple[str, float, float] | None:
+    """The thermometer of the oil, and the temperatures that healthy sessions cover; None without one.
+
+    A channel of the vocabulary's name, or the only temperature there is.
+    """
+    names = [channel.name for channel in material.channels if channel.kind is Kind.TEMPERATURE]
+    chosen = OIL if OIL in names else names[0] if len(names) == 1 else ""
+    if not chosen:
+        return None
+    ends = [np.quantile(s.column(chosen), COVERED) for s in (*material.train, *material.validation)]
+    low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
+    return chosen, float(low) - BEYOND_K, float(high) + BEYOND_K
 
 
 def _doubts(columns: Array, off: Array) -> Array:

@@ -45,6 +45,7 @@ class MonitorRun:
         recordings: names of them.
         silent: by recording, channels that it lacks.
         traces: statistics and levels of residual groups, block by block.
+        unlearned: by recording, sentences on residuals that are silent where healthy logs were never.
     """
 
     monitor: Monitor
@@ -53,6 +54,7 @@ class MonitorRun:
     recordings: tuple[str, ...]
     silent: dict[str, tuple[str, ...]]
     traces: RunTraces
+    unlearned: dict[str, tuple[str, ...]]
 
     @property
     def changes(self) -> list[list[MonitorAlarm]]:
@@ -65,6 +67,7 @@ class MonitorRun:
             "hours": self.hours,
             "recordings": list(self.recordings),
             "silent": {name: list(channels) for name, channels in self.silent.items()},
+            "unlearned": {name: list(reasons) for name, reasons in self.unlearned.items()},
             "promise": self.monitor.limit.sentence(),
             "alarms": [alarm.to_json() for alarm in self.alarms],
         }
@@ -90,6 +93,7 @@ def run_monitor(
     monitor, hours = load_monitor(folder), 0.0
     alarms: list[MonitorAlarm] = []
     silent: dict[str, tuple[str, ...]] = {}
+    unlearned: dict[str, tuple[str, ...]] = {}
     traces: list[RecordingTrace] = []
     if out is not None:
         check_writable(out)
@@ -101,6 +105,9 @@ def run_monitor(
         lacking = monitor.check(recording)
         if lacking:
             silent[recording.name] = lacking
+        reasons = monitor.unlearned(recording)
+        if reasons:
+            unlearned[recording.name] = reasons
         start = str(recording.meta.get(START, ""))
         watched = monitor.watch(recording, start_time(start))
         alarms += watched.alarms
@@ -110,7 +117,7 @@ def run_monitor(
     names = tuple(recording.name for recording in recordings)
     run = MonitorRun(
         monitor, tuple(alarms), hours, names, silent,
-        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)),
+        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)), unlearned,
     )  # fmt: skip
     if out is not None:
         _write(run, Path(out), str(folder))
@@ -162,6 +169,7 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
         "edp_version": __version__,
         "recordings": len(run.recordings),
         "silent": {name: list(channels) for name, channels in run.silent.items()},
+        "unlearned": {name: list(reasons) for name, reasons in run.unlearned.items()},
         "classes": 0 if dictionary is None else len(dictionary.classes),
         "confusions": [] if dictionary is None else [asdict(pair) for pair in dictionary.confusions],
     }
