@@ -72,8 +72,8 @@ class ChamberCurves:
         later, wider = (rng.uniform(-tolerance, tolerance, paths) for _ in range(2))
         values = opening_later(self.values.astype(np.float64), later) * (1.0 + wider[:, None])
         scaled = self.lines * (1.0 + rng.uniform(-tolerance, tolerance, lines))
-        numbers = (one.astype(np.float32) for one in (values, slopes_of(values), scaled))
-        return ChamberCurves(self.spots, *numbers, self.doubts)
+        curves, slopes, factors = (one.astype(np.float32) for one in (values, slopes_of(values), scaled))
+        return ChamberCurves(self.spots, curves, slopes, factors, self.doubts)
 
 
 @dataclass(frozen=True)
