@@ -126,7 +126,7 @@ def test_a_damaged_file_is_refused(source):
             FlowBalances.of_parts(SourceParts(parts.plain, dict(parts.arrays) | {name: np.array(values)}))
     with pytest.raises(ValueError, match="rate"):
         FlowBalances.of_parts(SourceParts(dict(parts.plain) | {"rate_hz": -1.0}, parts.arrays))
-    for change in ({"place": 99}, {"low": float("nan")}, {"low": 90.0, "high": 80.0}):
+    for change in ({"column": 99}, {"low": float("nan")}, {"low": 90.0, "high": 80.0}):
         oil = parts.plain["oil"] | change
         with pytest.raises(ValueError, match=r"thermometer|temperatures"):
             FlowBalances.of_parts(SourceParts(dict(parts.plain) | {"oil": oil}, parts.arrays))

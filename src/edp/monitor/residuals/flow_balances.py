@@ -81,12 +81,12 @@ class OilRange:
     """Temperatures of the oil at which balances are known to hold: leaks and dead times go with its viscosity.
 
     Attributes:
-        place: of the thermometer among the inputs.
+        column: of the thermometer among the inputs.
         low: lowest temperature, in the unit of the channel.
         high: highest one.
     """
 
-    place: int
+    column: int
     low: float
     high: float
 
@@ -141,9 +141,9 @@ class FlowBalances(ResidualSource):
 
     def unlearned(self, recording: Recording) -> str:
         """See `ResidualSource.unlearned`."""
-        if self.oil is None or self.inputs[self.oil.place] not in recording.channel_names:
+        if self.oil is None or self.inputs[self.oil.column] not in recording.channel_names:
             return ""
-        name = self.inputs[self.oil.place]
+        name = self.inputs[self.oil.column]
         share = float(self.oil.beyond(recording.column(name)).mean())
         if not share:
             return ""
@@ -176,7 +176,7 @@ class FlowBalances(ResidualSource):
         out = [self._residual(chamber, then, rates, spools) for chamber in self.chambers]
         residuals = np.stack(out, axis=-1)
         if self.oil is not None:
-            residuals[self.oil.beyond(rows[..., self.oil.place])] = np.nan
+            residuals[self.oil.beyond(rows[..., self.oil.column])] = np.nan
         return residuals, (whole[:, end - memory :].copy(), state)
 
     @staticmethod
@@ -225,8 +225,8 @@ class FlowBalances(ResidualSource):
 def _oil_of(entry: Any, inputs: int) -> OilRange | None:
     if entry is None:
         return None
-    oil = OilRange(int(entry["place"]), float(entry["low"]), float(entry["high"]))
-    if not 0 <= oil.place < inputs:
+    oil = OilRange(int(entry["column"]), float(entry["low"]), float(entry["high"]))
+    if not 0 <= oil.column < inputs:
         raise ValueError("its thermometer is an input that there is not")
     if not (np.isfinite(oil.low) and np.isfinite(oil.high) and oil.low <= oil.high):
         raise ValueError("temperatures of its oil are not finite, or the lowest is above the highest")

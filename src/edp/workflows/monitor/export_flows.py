@@ -47,5 +47,5 @@ def flow_part(source: FlowBalances, columns: Mapping[str, int]) -> FlowPart:
         doubtful=1,
         per_tick=float(source.per_tick),
         chambers=tuple(chambers),
-        oil=None if source.oil is None else (source.oil.place, source.oil.low, source.oil.high),
+        oil=None if source.oil is None else (source.oil.column, source.oil.low, source.oil.high),
     )
