@@ -125,7 +125,7 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     lame = twin.numbers.copy()
     names = [number.name for number in twin.table.numbers]
     for name in ("into_extend_45", "into_retract_45", "viscous"):
-        lame[names.index(name)] *= 2.0
+        lame[names.index(name)] *= 3.0
     start = twin.with_numbers(lame).without_network()
     # Long enough for velocities and strokes, which choose the weights together.
     spec = replace(SPEC, updates=(200,))
