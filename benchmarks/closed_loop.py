@@ -11,7 +11,8 @@ o4 asks whether gains that are better on that twin, a one-step network, a static
 plant; part o4_other the same for C14 in loam. Part grey asks parts nmpc, but for C14, and o4 of a grey box with a known
 linkage, fitted to 45 min of logs in free air, in place of the network. Part grey_other does so for C14: predictive
 control on a grey box of 20 min of its logs in free air; o4_grey_other asks gains in loam of grey boxes of 5, 20 and 45
-min. Their models are trained where --data has none: 3 h of recordings, some ten processor minutes.
+min, o4_ground of the one of 20 min with a ground that it learned from as many minutes in loam. Their models are trained
+where --data has none: 3 h of recordings, some ten processor minutes.
 
 Results are kept part by part, `closed_loop_PART.json`.
 """
@@ -21,7 +22,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,15 +41,14 @@ from edp.control.tasks import TASKS
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.sim.machine.machine_files import load_machine
+from edp.training.twin_bundle import load_twin
 from edp.workflows.control import ControlBench, ControlSources
 from edp.workflows.train_evaluate import train
 from edp.workflows.twin import train_twin
 
 MACHINE = "M22"
 LEAD_TICKS = 20
-PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_other", "o4_grey_other")
-QUICK_PARTS = ("lines",)
-"""Of all: each other part trains further models. With --part they run on models that are too small to be judged."""
+PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_other", "o4_grey_other", "o4_ground")
 
 
 @dataclass(frozen=True)
@@ -77,9 +76,14 @@ def main() -> None:
     arguments_of.add_argument("--part", choices=["all", *PARTS], default="all")
     arguments_of.add_argument("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines, in part nmpc")
     arguments = arguments_of.parse_args()
-    every = QUICK_PARTS if arguments.quick else PARTS
-    for part in every if arguments.part == "all" else (arguments.part,):
-        in_folder(arguments.data, partial(measured, part, arguments))
+    chosen = PARTS if arguments.part == "all" else (arguments.part,)
+
+    def run(folder: Path) -> None:
+        # One folder: parts share recordings and models.
+        for part in chosen:
+            measured(part, arguments, folder)
+
+    in_folder(arguments.data, run)
 
 
 def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
@@ -106,6 +110,8 @@ def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
         details[part], verdicts = grey_other(models, of_loops, quick, seed)
     elif part == "o4_grey_other":
         details[part], verdicts = o4_grey_other(models, of_tuning, quick, seed)
+    elif part == "o4_ground":
+        details[part], verdicts = o4_ground(models, of_tuning, quick, seed)
     elif part == "o4":
         details[part] = tuning_of.tuning(models, of_tuning, seed)
         verdicts = tuning_of.tuning_verdicts(details[part], quick)
@@ -149,6 +155,14 @@ def o4_grey_other(models: Models, size: tuning_of.TuningSize, quick: bool, seed:
     for name in runs:
         verdicts += tuning_of.tuning_verdicts({"twin": rows[name]}, quick, f", C14 in loam, {name}")
     return rows, verdicts
+
+
+def o4_ground(models: Models, size: tuning_of.TuningSize, quick: bool, seed: int) -> tuple[Any, list[Verdict]]:
+    """C14: gains in loam on a grey box with a ground, beside what its ground explains of forces along logs."""
+    run = models.other_grounded(models.size.other[0], _grey_fit(quick))
+    rows = tuning_of.tuning_in_soil({"twin": run}, size, seed)
+    facts = {"ground": load_twin(run).provenance["ground"], "settings": asdict(size)}
+    return rows | facts, tuning_of.tuning_verdicts(rows, quick, ", C14 in loam, grey box with a ground")
 
 
 def _grey_fit(quick: bool) -> tuple[str, ...]:

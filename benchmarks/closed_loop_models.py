@@ -14,11 +14,11 @@ import tomli_w
 
 from common import table
 from edp.config.twin import load_twin_experiment
-from edp.control.nmpc.load import LoadEstimate
 from edp.data.series import Series
 from edp.evaluation.ahead import EACH, look_ahead
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
+from edp.networks.twin.load import LoadEstimate
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training.twin_bundle import load_twin
 from edp.workflows.twin import train_twin
@@ -152,6 +152,21 @@ class Models:
         )
         source, guess = self._simulated(f"c14_air_{minutes}", order), self.folder / "guess_c14.toml"
         return self._grey(source, "c14", guess, f"c14_grey_{minutes}", fit)
+
+    def other_grounded(self, minutes: int, fit: Sequence[str]) -> Path:
+        """That of C14 with a ground, which it learned from as many minutes of grading and digging in loam."""
+        order = SimulationOrder(
+            machine="C14",
+            minutes=float(minutes),
+            recordings=max(5, minutes // 2),
+            seed=self.seed + 61,
+            mix={"grading": 0.5, "dig": 0.5},
+            materials={"sandy_loam": 1.0},
+        )
+        start, source = self.other_grey(minutes, fit), self._simulated(f"c14_loam_{minutes}", order)
+        name = f"c14_grounded_{minutes}"
+        train_twin(source, load_twin_experiment(None, ("ground=drag",)), self.folder / name, start=start)
+        return self.folder / name
 
     def _grey(self, source: DataSource, machine: str, guess: Path, name: str, fit: Sequence[str]) -> Path:
         told = tomllib.loads((resources.files("edp.sim") / "machines" / f"{machine}.toml").read_text(encoding="utf-8"))

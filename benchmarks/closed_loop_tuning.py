@@ -16,6 +16,7 @@ from edp.config.control import ControlExperiment
 from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.control.models import ControlModels
 from edp.control.tasks import TASKS
+from edp.training.twin_bundle import load_twin
 from edp.workflows.control import ControlBench, ControlSources
 from edp.workflows.control.transfer_of_tuning import TransferSpec, TuningTransfer, costs_of, drawn_settings
 
@@ -72,7 +73,7 @@ def tuning_other(models: Models, size: TuningSize, seed: int) -> dict[str, dict[
 
 
 def tuning_in_soil(runs: Mapping[str, Path], size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
-    """C14 in soil, on twins of it, which know no soil but that of their logs."""
+    """C14 in soil, on twins of it, which know no soil but that of their logs, or a ground of their own."""
     experiment = ControlExperiment(
         task=TASKS["grade"](material=SOIL), controller=CONTROLLERS["pi"](), machine=OTHER, loops=size.lines, seed=SEED
     )
@@ -82,7 +83,9 @@ def tuning_in_soil(runs: Mapping[str, Path], size: TuningSize, seed: int) -> dic
     air = without_soil(ControlBench(experiment, ControlSources(), plant.models))
     rows = {"the plant, in free air": _row(costs_of(air, settings), on_plant)}
     for name, run in runs.items():
-        bench = without_soil(ControlBench(experiment, ControlSources(plant=run), plant.models))
+        bench = ControlBench(experiment, ControlSources(plant=run), plant.models)
+        if load_twin(run).ground is None:
+            bench = without_soil(bench)
         rows[name] = _row(costs_of(bench, settings), on_plant)
     show("gains of pi, C14 in loam", rows)
     return rows

@@ -65,7 +65,9 @@ def test_a_second_save_leaves_no_old_weights(folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h: h.update(schema=3), "has schema 3, this EDP"),
+        (lambda h: h.update(schema=4), "has schema 4, this EDP"),
+        (lambda h: h.update(schema=3), "ground"),
+        (lambda h: h.update(schema=3, ground={"kind": "drag"}), "a ground acts on a grey box"),
         (lambda h: h.update(schema=True), "has schema True"),
         (lambda h: h.update(rate_hz=0.0), "rate_hz is 0.0"),
         (lambda h: h.update(rate_hz="50"), "rate_hz is 50"),

@@ -23,9 +23,7 @@ def twin(
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.kind=recurrent.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
-    start: Annotated[
-        Path | None, typer.Option(help="Run folder of a recurrent twin that goes on with these recordings.")
-    ] = None,
+    start: Annotated[Path | None, typer.Option(help="Run folder of a twin that goes on with these recordings.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Parallel trainings; 0: one for each core.")] = 0,
     minutes: Annotated[
         float | None,
@@ -40,7 +38,8 @@ def twin(
     diverged.
 
     With --start a recurrent twin goes on, such as with minutes of another machine's logs; free runs of the validation
-    part say for how long, or that it is better as it is.
+    part say for how long, or that it is better as it is. With --set ground=drag it is a grey box of free air that
+    learns the resistance of the ground from logs in soil.
 
     Example: `edp twin data/m22 --out runs/twin`
     """
@@ -48,6 +47,7 @@ def twin(
     from edp.evaluation.guard import twin_beaten_by
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
+    from edp.workflows.twin.ground_twin import ground_sentence
 
     experiment = load_twin_experiment(config, changes)
     if minutes is not None:
@@ -62,9 +62,14 @@ def twin(
     facts["beaten_by"] = None if beaten is None else beaten.label
     facts["candidates"] = candidates = read_candidates(folder)
 
+    if trained.bundle.ground is not None:
+        facts["ground"] = trained.bundle.provenance.get("ground")
+
     def show() -> None:
         if beaten is not None:
             out.print(beaten.sentence(), style="bold red")
+        if trained.bundle.ground is not None:
+            out.print(ground_sentence(trained.bundle))
         if candidates:
             candidate_table(candidates)
             out.print(f"chosen: {choice_sentence(candidates)}")

@@ -11,9 +11,10 @@ import tomli_w
 from edp.data.frozen import SPLITS
 from edp.data.splits import ByRecording, SplitSpec
 from edp.data.twin_channels import TwinChannelSettings
-from edp.errors import ConfigError
+from edp.errors import ConfigError, closest
 from edp.evaluation.free_run import FreeRunJudgeSpec
 from edp.networks.twin import TWINS, TwinSpec
+from edp.networks.twin.grey.ground import GROUNDS
 from edp.networks.twin.kinds import KINDS, AutoTwin
 from edp.settings.tree import SettingsTree
 from edp.training.free_run import FreeRunSpec
@@ -35,6 +36,7 @@ class TwinExperiment:
         twin: the formulation, or the choice among several.
         training: how it is trained, where it is trained on free runs.
         judge: how it is judged.
+        ground: law of the ground that a grey box of free air learns from recordings in soil; empty: none.
     """
 
     channels: TwinChannelSettings = field(default_factory=TwinChannelSettings)
@@ -42,6 +44,7 @@ class TwinExperiment:
     twin: TwinSpec | AutoTwin = field(default_factory=AutoTwin)
     training: FreeRunSpec = field(default_factory=FreeRunSpec)
     judge: FreeRunJudgeSpec = field(default_factory=FreeRunJudgeSpec)
+    ground: str = ""
 
     def __post_init__(self) -> None:
         for name in self.judge.floors:
@@ -49,6 +52,11 @@ class TwinExperiment:
                 _ = TWINS[name]
             except ConfigError as error:
                 raise ConfigError(f"judge.floors: {error}") from None
+        if self.ground and self.ground not in GROUNDS:
+            raise ConfigError(
+                f"ground = '{self.ground[:80]}'{closest(self.ground, GROUNDS)}; any of {', '.join(GROUNDS)}, or none, "
+                "must hold"
+            )
 
 
 def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str] = ()) -> TwinExperiment:

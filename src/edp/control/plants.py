@@ -14,7 +14,7 @@ from edp.networks.twin import Twin
 from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
-from edp.training.twin_bundle import STROKES, load_twin
+from edp.training.twin_bundle import STROKES, TwinBundle, load_twin
 
 FMU = ".fmu"
 SAME_STROKE = 0.01
@@ -47,11 +47,17 @@ def plant_of(
         if not trusted:
             raise ConfigError(f"FMU '{plant}' is native code, which runs with your rights; pass trusted=True if you do")
         return FmuEnvironment(plant, machine, duration_s, rate_hz)
-    return TwinEnvironment(twin_of(plant, load_machine(machine), rate_hz), machine, duration_s)
+    bundle = bundle_of(plant, load_machine(machine), rate_hz)
+    return TwinEnvironment(bundle.twin, machine, duration_s, bundle.ground)
 
 
 def twin_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -> Twin:
-    """The twin of a run folder.
+    """The twin of a run folder; arguments and errors are those of `bundle_of`."""
+    return bundle_of(run, machine, rate_hz).twin
+
+
+def bundle_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -> TwinBundle:
+    """The twin of a run folder, with its ground where it has one.
 
     Args:
         run: folder.
@@ -73,7 +79,9 @@ def twin_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -> 
                 f"{machine.name} have {texts[1]} m; name its machine with --machine, or let it go on with "
                 "recordings of this one: edp twin LOGS --start RUN"
             )
-    return bundle.twin if rate_hz is None else of_rate(bundle.twin, f"twin '{run}'", rate_hz)
+    if rate_hz is not None:
+        of_rate(bundle.twin, f"twin '{run}'", rate_hz)
+    return bundle
 
 
 def of_rate(twin: Twin, what: str, rate_hz: float) -> Twin:

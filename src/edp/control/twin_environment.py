@@ -12,12 +12,13 @@ from edp.control.plant import PILOTS, STROKES
 from edp.control.rest import RestingMachine, check_plant_channels
 from edp.errors import ConfigError, closest
 from edp.networks.twin import Twin, TwinState
+from edp.networks.twin.grey.ground import GroundedRunner, GroundLaw
 from edp.signals import Channel
 from edp.sim.environment.library import gymnasium
 
 Array = NDArray[np.float64]
 OPTIONS = ("strokes", "material")
-"""Options of a reset; a twin knows no soil, so that ``material`` must be empty."""
+"""Options of a reset; ``material`` must be empty but for a twin with a ground."""
 MIDDLE = (0.5, 0.5, 0.5)
 TIP = ("TipX", "TipY", "TipAngle")
 
@@ -72,6 +73,7 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         twin: of an excavator, with the channels of Table A.1 and strokes.
         machine: name or file of the machine whose kinematics, nominal commands and pressures at rest are used.
         duration_s: length of an episode.
+        ground: law of the ground that acts where a reset names a material; it stands for any.
 
     Attributes:
         channels: of an observation, in its order.
@@ -79,13 +81,13 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         machine: its numbers.
 
     Raises:
-        ConfigError: the twin has no strokes, or channels that no excavator has.
+        ConfigError: the twin has no strokes, channels that no excavator has, or cannot stand on a ground.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  as Gymnasium declares it
     source = "the twin"
 
-    def __init__(self, twin: Twin, machine: str, duration_s: float = 60.0) -> None:
+    def __init__(self, twin: Twin, machine: str, duration_s: float = 60.0, ground: GroundLaw | None = None) -> None:
         self._start = TwinStart(twin, machine)
         self.twin, self.machine, self.commands = twin, self._start.machine, self._start.commands
         self.rate_hz, self.render_mode = twin.channels.rate_hz, None
@@ -95,6 +97,8 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._geometry = TipGeometry(self.machine)
         self._ticks, self._tick = round(duration_s * self.rate_hz), 0
         self._state: Any = None
+        self._grounded = None if ground is None else GroundedRunner(twin, ground)
+        self._digs, self._free = False, np.full(len(twin.channels.answers), np.nan, np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -103,17 +107,22 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
         Args:
             seed: of the environment's own generator; a twin draws nothing.
-            options: ``strokes``, shares of full to start from.
+            options: ``strokes``, shares of full to start from; ``material``: of a twin with a ground, any name lets
+                it act, uncut.
 
         Raises:
-            ConfigError: an option is unknown, or a soil.
+            ConfigError: an option is unknown, or a soil where the twin has no ground.
         """
         super().reset(seed=seed)
         chosen = dict(options or {})
         for name in chosen:
             if name not in OPTIONS:
                 raise ConfigError(f"reset of a twin: option '{name}' is unknown{closest(name, OPTIONS)}")
-        check_air(chosen.get("material"))
+        if self._grounded is None:
+            check_air(chosen.get("material"))
+        else:
+            self._digs = bool(chosen.get("material"))
+            self._grounded.begin()
         self._state, row = self._start.begin(chosen.get("strokes") or MIDDLE)
         self._tick = 0
         return row, self._info(row)
@@ -130,10 +139,18 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._state is None:
             raise ConfigError("the environment has no episode under way; call reset() before step()")
         command = self._start.pilots(levers)
-        answer, self._state = self.twin.step(command[None], self._state)
+        answer = self._moved(command)
         self._tick += 1
-        row = np.concatenate([answer[0], command]).astype(np.float32)
+        row = np.concatenate([answer, command]).astype(np.float32)
         return row, 0.0, False, self._tick >= self._ticks, self._info(row)
+
+    def _moved(self, command: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Answer to a command, which brings the state on."""
+        if self._grounded is not None and self._digs:
+            self._state = self._grounded.step(command, self._state, self._free)
+            return np.asarray(self._state["answer"][0], np.float32)
+        answer, self._state = self.twin.step(command[None], self._state)
+        return np.asarray(answer[0], np.float32)
 
     def _info(self, row: NDArray[np.float32]) -> dict[str, Any]:
         strokes = row[self._start.strokes].astype(float)

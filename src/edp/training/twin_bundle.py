@@ -14,8 +14,9 @@ from safetensors.numpy import save as save_arrays
 
 from edp import __version__
 from edp.data.twin_channels import TwinChannels
-from edp.errors import BundleError
+from edp.errors import BundleError, ConfigError, ExportError
 from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinPlant, TwinScales, TwinSpec
+from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
 from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel, Kind
@@ -24,7 +25,9 @@ from edp.storage.memory import check_setting
 from edp.training.bundle import HASH, Bundle, as_damage, check_hash, header_digest, read_arrays, write_arrays
 
 SCHEMA = 2
-READABLE = (1, 2)
+GROUNDED = 3
+"""Of a twin with a ground: an EDP that knows of none must not run it without."""
+READABLE = (1, SCHEMA, GROUNDED)
 """Schema 1 had no intervals."""
 HEADER = "twin.json"
 PARTS = ("commands", "velocities", "strokes", "pressures")
@@ -49,6 +52,7 @@ class TwinBundle:
         provenance: data digest, environment, settings, training time.
         scores: held-out scores; empty before they are known.
         intervals: of free runs, where they were calibrated.
+        ground: law of the ground on which loops with a material stand; None: the twin knows free air alone.
     """
 
     spec: TwinSpec
@@ -56,10 +60,20 @@ class TwinBundle:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     scores: Mapping[str, Any] = field(default_factory=dict)
     intervals: FreeRunIntervals | None = None
+    ground: GroundLaw | None = None
 
 
 def plant_bundle(bundle: TwinBundle) -> Bundle:
-    """A twin as exported forms take it: see `TwinPlant`."""
+    """A twin as exported forms take it: see `TwinPlant`.
+
+    Raises:
+        ExportError: it has a ground, of which no exported form knows.
+    """
+    if bundle.ground is not None:
+        raise ExportError(
+            f"the twin has a ground ('{GROUNDS.name_of(bundle.ground)}'), which exported forms do not have; export the "
+            "run in free air that it was started from"
+        )
     plant, answers = TwinPlant(bundle.twin, f"{TWINS.name_of(bundle.spec)} twin"), bundle.twin.channels.answers
     kinds, texts = tuple(c.kind for c in answers), tuple(c.description for c in answers)
     return Bundle(plant, plant.inputs, kinds, texts, bundle.provenance, bundle.scores)
@@ -75,7 +89,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     arrays = {name: np.ascontiguousarray(values) for name, values in bundle.twin.arrays().items()}
     entry = write_arrays(path, "weights", save_arrays(arrays))
     header = {
-        "schema": SCHEMA,
+        "schema": SCHEMA if bundle.ground is None else GROUNDED,
         "edp": __version__,
         "twin": _TREE.plain(bundle.spec, "twin"),
         "rate_hz": channels.rate_hz,
@@ -85,6 +99,8 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
         "provenance": dict(bundle.provenance),
         "scores": dict(bundle.scores),
     }
+    if bundle.ground is not None:
+        header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
     write_json(path / HEADER, header | {HASH: header_digest(header)})
     # Old files go only after the rename; a kill in between leaves spare files, not a broken twin.
     for old in path.glob("weights-*.safetensors"):
@@ -137,7 +153,7 @@ def load_twin(folder: str | Path) -> TwinBundle:
         schema = header["schema"]
         if isinstance(schema, bool) or schema not in READABLE:
             raise BundleError(
-                f"twin '{path}' has schema {str(schema)[:40]}, this EDP ({__version__}) reads 1 to {SCHEMA}; "
+                f"twin '{path}' has schema {str(schema)[:40]}, this EDP ({__version__}) reads 1 to {GROUNDED}; "
                 "install a newer one, or train again"
             )
         check_hash(header, path / HEADER)
@@ -166,7 +182,20 @@ def _assembled(header: Mapping[str, Any], path: Path) -> TwinBundle:
     scores = object_with(header["scores"], (), "its scores")
     widths = header.get("intervals") if header["schema"] > 1 else None
     intervals = None if widths is None else FreeRunIntervals.from_plain(widths, channels)
-    return TwinBundle(spec, spec.build(channels, TwinScales.of(arrays), arrays), provenance, scores, intervals)
+    twin = spec.build(channels, TwinScales.of(arrays), arrays)
+    return TwinBundle(spec, twin, provenance, scores, intervals, _ground(header, twin))
+
+
+def _ground(header: Mapping[str, Any], twin: Twin) -> GroundLaw | None:
+    """The law of a header that has one."""
+    if header["schema"] < GROUNDED:
+        return None
+    plain = object_with(header["ground"], ("kind",), "its ground")
+    try:
+        check_grounded(twin)
+        return GROUNDS[str(plain["kind"])[:80]].of(plain)
+    except ConfigError as error:
+        raise ValueError(f"its ground: {error}") from None
 
 
 def _plain(channel: Channel) -> dict[str, str]:

@@ -6,20 +6,20 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from grey_front import ORDER, PREFIX, front, front_channels, series_of
 
 from edp.config.twin import load_twin_experiment, twin_toml
-from edp.control.nmpc.load import LoadEstimate
 from edp.data.series import Series
-from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
-from edp.networks.twin.grey.elements import CylinderElement, MotorElement, PumpElement, ValveElement
+from edp.networks.twin.grey.elements import MotorElement, ValveElement
 from edp.networks.twin.grey.known_linkage import BODY_NAMES
 from edp.networks.twin.grey.linkage import balance_by_base, base_of, load_at
 from edp.networks.twin.grey.runner import SINGLE_TICKS
-from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
+from edp.networks.twin.greybox import RunTarget
+from edp.networks.twin.load import LoadEstimate
 from edp.signals import Channel, Kind
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine_files import load_machine
@@ -28,64 +28,13 @@ from edp.sim.physics import dynamics, linkage
 from edp.training.grey_fit import fit_grey_box
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
-PREFIX = 30
-ORDER = ("arm", "boom", "bucket")
-"""Not that of the bodies: a log may have its cylinders in any order."""
-
-
-def front_channels():
-    """Levers, speeds, strokes and both chambers of a front, and its pump."""
-    return TwinChannels(
-        tuple(Channel(f"{name}_lever", Kind.RATIO) for name in ORDER),
-        tuple(Channel(f"{name}_speed", Kind.VELOCITY) for name in ORDER),
-        tuple(Channel(f"{name}_place", Kind.POSITION) for name in ORDER),
-        (*(Channel(f"{name}_{side}", Kind.PRESSURE) for name in ORDER for side in ("head", "rod")),
-         Channel("line", Kind.PRESSURE)),
-        100.0,
-    )  # fmt: skip
-
-
-def front(**changes):
-    """A grey box of a front with M22's linkage."""
-    cylinders = tuple(
-        CylinderElement(
-            name=name, velocity=f"{name}_speed", head=f"{name}_head", rod=f"{name}_rod", bore=0.13, rod_diameter=0.09
-        )
-        for name in ORDER
-    )
-    valves = tuple(
-        ValveElement(name=f"{name} spool", actuator=name, extend=f"{name}_lever", supply="pump") for name in ORDER
-    )
-    options = {
-        "cylinders": cylinders,
-        "valves": valves,
-        "pumps": (PumpElement(name="pump", pressure="line"),),
-        "linkage": "m22",
-        "prefix_ticks": PREFIX,
-        "fit": GreyFitSpec(
-            lengths_s=(0.1,), rounds=(1,), final_rounds=0, starts=1, lanes=8, ticks=200, validation_s=1.0
-        ),
-    }
-    return GreyBox(**(options | changes))
-
-
-def series_of(seed=0, ticks=600, strokes=1.0):
-    """Levers of a front, and plausible values that set the scales."""
-    rng = np.random.default_rng(seed)
-    levers = np.repeat(rng.uniform(-1, 1, (ticks // 40 + 1, 3)), 40, axis=0)[:ticks]
-    full = strokes * np.array([1.504, 1.26, 1.104])
-    low = np.concatenate([[-0.3] * 3, 0.02 * full, [0.0] * 7])
-    high = np.concatenate([[0.3] * 3, 0.98 * full, [2e7] * 7])
-    return Series("levers", levers.astype(np.float32), rng.uniform(low, high, (ticks, 13)).astype(np.float32))
-
 
 @pytest.fixture(scope="module")
 def twin():
     """Its load is that of M22; everything else plausible."""
     channels, series = front_channels(), [series_of()]
     made = front().start(channels, fit_scales(channels, series), series, 0)
-    numbers = made.table.nominal
-    return made.with_numbers(numbers)
+    return made.with_numbers(made.table.nominal)
 
 
 def strokes_and_angles(count, seed=0):

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.control.geometry import AXES
-from edp.control.nmpc.load import LoadEstimate
 from edp.control.plant import PILOTS, STROKES, VELOCITIES, PlantInterface
 from edp.errors import ConfigError, closest
 from edp.networks.twin import Twin
 from edp.networks.twin.base import TwinState
+from edp.networks.twin.load import LoadEstimate
 
 Array = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ from edp.networks.twin import (  # noqa: F401  registers the formulations
     static_map,
 )
 from edp.networks.twin.base import TWINS, Twin, TwinSpec, TwinState, even_starts
+from edp.networks.twin.grey import ground_drag  # noqa: F401  registers the grounds
 from edp.networks.twin.intervals import FreeRunIntervals, calibrate
 from edp.networks.twin.plant import IntegerTwinPlant, TwinPlant
 from edp.networks.twin.scales import TwinScales, fit_scales

@@ -7,7 +7,7 @@ measures, and a stretch of the first loop with which exported code is compared.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +95,8 @@ def keep_controller(
     if models.valve_map is not None:
         arrays |= {"map_levers": models.valve_map.levers, "map_speeds": models.valve_map.speeds}
     if twin is not None:
-        save_twin(load_twin(twin), folder / TWIN)
+        # A controller plans in free air, and estimates what soil does.
+        save_twin(replace(load_twin(twin), ground=None), folder / TWIN)
     machine = MACHINE_FILE.plain(plant.geometry.machine)
     write_bytes(folder / MACHINE, tomli_w.dumps(machine).encode())
     header = {

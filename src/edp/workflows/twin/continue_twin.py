@@ -76,7 +76,7 @@ class BaseTwin:
         Raises:
             ConfigError: they name others.
         """
-        channels = self.twin.channels
+        channels = self.bundle.twin.channels
         parts = ("commands", "velocities", "strokes", "pressures")
         names = TwinChannelSettings(**{part: tuple(c.name for c in getattr(channels, part)) for part in parts})
         if experiment.twin not in (AutoTwin(), self.bundle.spec):
@@ -96,7 +96,7 @@ class BaseTwin:
         Raises:
             DataError: another rate or kind of a channel, or values of another order of magnitude.
         """
-        before = self.twin.channels
+        before = self.bundle.twin.channels
         if channels.rate_hz != before.rate_hz:
             raise DataError(
                 f"the recordings have {channels.rate_hz:g} Hz, that of --start {self.folder} {before.rate_hz:g} Hz; "
@@ -112,7 +112,7 @@ class BaseTwin:
 
     def _check_sizes(self, channels: TwinChannels, train: Sequence[Series]) -> None:
         """Refuse values of another order of magnitude."""
-        scales = self.twin.scales
+        scales = self.bundle.twin.scales
         commands = np.max([np.abs(series.inputs).max(axis=0) for series in train], axis=0)
         answers = np.max([np.abs(series.targets).max(axis=0) for series in train], axis=0)
         largest = np.maximum(np.abs(scales.low), np.abs(scales.high))

@@ -32,6 +32,7 @@ from edp.training.twin_bundle import STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
+from edp.workflows.twin.ground_twin import ground_twin
 from edp.workflows.twin.judge_twin import SCORES, STEPS, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
@@ -76,12 +77,16 @@ def train_twin(
         on_step: called with what begins.
         workers: processes that train the networks of an average side by side; 0 for one a core. The twin has the same
             bits with any number.
-        start: run folder of a recurrent twin that goes on with these recordings; None: a new one.
+        start: run folder of a recurrent twin that goes on with these recordings, or with a `ground` of a grey box
+            that learns it from them; None: a new one.
 
     Raises:
         EdpError: the recordings, settings or folder cannot be used; what was on disk stays.
     """
     tell = on_step or (lambda text: None)
+    if experiment.ground:
+        grounded, finished = ground_twin(source, experiment, out, start, tell)
+        return TrainedTwin(grounded, dict(grounded.scores), finished)
     tell("reading recordings")
     base = None if start is None else BaseTwin.of(start)
     if base is not None:
@@ -92,7 +97,9 @@ def train_twin(
     if base is not None:
         base.check(channels, data.train)
         begun = {"from": base.digest}
-    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)} | begun | _linkage(experiment), data.digest)
+    # Runs of versions that knew no ground are the same ones.
+    settings = {name: value for name, value in TWIN_SETTINGS.plain(experiment).items() if name != "ground"}
+    key = run_key({"twin": settings} | begun | _linkage(experiment), data.digest)
     with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)

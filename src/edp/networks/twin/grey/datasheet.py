@@ -117,11 +117,11 @@ def _inertia_row(
     }
 
 
-def datasheet_text(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as a table for readers."""
+def datasheet_text(rows: Sequence[dict[str, Any]], basis: str = BASIS) -> str:
+    """The rows as a table for readers, under what their intervals rest on."""
     width = max(len(f"{row['element']}.{row['name']}") for row in rows)
     lines = [
-        BASIS + ".",
+        basis + ".",
         "A number in brackets is one that the data do not excite: what was plausible before stands.",
         "",
     ]

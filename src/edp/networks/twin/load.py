@@ -12,8 +12,36 @@ PROBE_N = 1e4
 """By which a force is changed to see its effect on the velocities a tick later."""
 RENEWED_TICKS = 10
 """After how many ticks that effect is asked for anew: it changes with pose and opening of the valves."""
+LOG_SHARE = 0.3
+"""Of a new error, where forces along a log are wanted: nothing waits for them, so they may be rougher."""
 MOST_N = 5e5
 """Of an estimate: about what a cylinder of a 22 t excavator can hold."""
+
+
+def force_slopes(
+    runner: TwinRunner,
+    velocities: NDArray[np.int64],
+    tick: tuple[NDArray[np.float32], NDArray[np.float32], TwinState],
+    expected: Array,
+) -> Array:
+    """Slopes of velocities after a tick by forces against them, m/s by N ``(velocity, velocity)``.
+
+    Args:
+        runner: of a model with a load; its `resistance` is left as it was.
+        velocities: columns of its answers.
+        tick: command, row that its ports read, and state before it.
+        expected: the velocities with its present resistance.
+    """
+    (command, row, before), resistance = tick, runner.resistance
+    slopes = np.zeros((len(velocities), len(velocities)))
+    if resistance is None:
+        return slopes
+    for axis, which in enumerate(velocities):
+        runner.resistance = resistance + PROBE_N * (np.arange(len(resistance)) == which)
+        moved = runner.step(command, before, row)["answer"][0, velocities]
+        slopes[:, axis] = (moved - expected) / PROBE_N
+    runner.resistance = resistance
+    return slopes
 
 
 class LoadEstimate:
@@ -57,11 +85,7 @@ class LoadEstimate:
             return
         self._expected = np.asarray(after["answer"][0, self._velocities], float)
         if self._age % RENEWED_TICKS == 0:
-            for axis, which in enumerate(self._velocities):
-                self._runner.resistance = resistance + PROBE_N * (np.arange(len(resistance)) == which)
-                moved = self._runner.step(command, before, row)["answer"][0, self._velocities]
-                self._slopes[:, axis] = (moved - self._expected) / PROBE_N
-            self._runner.resistance = resistance
+            self._slopes = force_slopes(self._runner, self._velocities, (command, row, before), self._expected)
         self._age += 1
 
     def update(self, measured: Array) -> None:

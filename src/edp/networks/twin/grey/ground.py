@@ -1,0 +1,172 @@
+"""Laws of the ground under a grey box with a known linkage: what resists the tip of the bucket below the surface.
+
+A law is one file and one registration in `GROUNDS`. It is fitted to forces that logs in soil show (see
+`edp.training.ground_fit`); it belongs to the bundle of a twin and acts where a loop asks for a material.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError
+from edp.networks.twin.base import Twin, TwinRunner, TwinState
+from edp.networks.twin.load import force_slopes
+from edp.registry import Registry
+
+if TYPE_CHECKING:
+    from edp.networks.twin.greybox import GreyTwin
+
+Array = NDArray[np.float64]
+RENEWED_TICKS = 5
+"""After how many ticks in the ground the effect of a force on the velocities is asked for anew."""
+NORMAL = 1.96
+"""Deviations on either side of an interval of 95 % of a normal distribution."""
+
+
+class GroundContact(ABC):
+    """The ground of one run: it remembers what was cut."""
+
+    @abstractmethod
+    def forces(self, strokes: Array, free: Array, slopes: Array) -> Array:
+        """Forces against the actuators (N) in the coming tick.
+
+        Args:
+            strokes: before it, of each actuator, m.
+            free: velocities after it without any ground, m/s.
+            slopes: of these by a force against each actuator ``(actuator, actuator)``, m/s by N.
+        """
+
+    @abstractmethod
+    def touches(self, strokes: Array, free: Array) -> bool:
+        """Whether there would be any force; arguments are those of `forces`."""
+
+
+class GroundLaw(ABC):
+    """A law with its numbers.
+
+    Attributes:
+        numbers: of the law, SI units.
+        deviations: standard errors of these; an infinite one says that the logs do not tell.
+    """
+
+    numbers: Array
+    deviations: Array
+
+    @classmethod
+    @abstractmethod
+    def fitted(cls, twin: GreyTwin, logs: Sequence[tuple[Array, Array, Array]], machine: str) -> GroundLaw:
+        """The law of logs.
+
+        Args:
+            twin: with a known linkage.
+            logs: strokes, velocities and estimated forces against each actuator, ``(tick, actuator)`` each, SI units.
+            machine: name or file of the machine, which says where the surface is.
+
+        Raises:
+            DataError: the logs are hardly ever in the ground.
+        """
+
+    @abstractmethod
+    def explained(self, twin: GreyTwin, logs: Sequence[tuple[Array, Array, Array]]) -> float:
+        """Share of the squares of the forces that the law explains where the tip moves in the ground; NaN: nowhere."""
+
+    @abstractmethod
+    def contact(self, twin: GreyTwin) -> GroundContact:
+        """The ground before a run, uncut."""
+
+    @abstractmethod
+    def plain(self) -> dict[str, Any]:
+        """All of it as JSON takes it."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, plain: Mapping[str, Any]) -> GroundLaw:
+        """From what `plain` gave.
+
+        Raises:
+            ValueError: it is damaged; likewise KeyError and TypeError.
+        """
+
+    @abstractmethod
+    def names(self) -> list[tuple[str, str]]:
+        """Name and unit of each number."""
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of the datasheet, as those of `edp.networks.twin.grey.datasheet.datasheet`."""
+        rows = []
+        for (name, unit), value, deviation in zip(self.names(), self.numbers, self.deviations, strict=True):
+            excited = bool(np.isfinite(deviation))
+            reach = NORMAL * float(deviation) if excited else 0.0
+            row = {"element": "ground", "name": name, "unit": unit, "value": float(value)}
+            rows.append(row | {"low": float(value) - reach, "high": float(value) + reach, "excited": excited})
+        return rows
+
+
+GROUNDS: Registry[type[GroundLaw]] = Registry("ground")
+
+
+class GroundedRunner(TwinRunner):
+    """A runner whose machine stands on a ground.
+
+    What the ground does in a tick belongs to the velocity at its end, as a stage of the grey box does: an explicit
+    force of some 10 kN that turns with the velocity would swing from tick to tick.
+
+    Args:
+        twin: a grey box with a known linkage.
+        law: of the ground.
+
+    Raises:
+        ConfigError: the twin has no load that forces could act on, or no linkage.
+    """
+
+    def __init__(self, twin: Twin, law: GroundLaw) -> None:
+        super().__init__(twin)
+        self._runner = twin.runner()
+        self._grey = check_grounded(twin)
+        self._law, self._contact = law, law.contact(self._grey)
+        columns = self._grey.wiring.columns
+        self._speeds, self._strokes = (np.array([column[k] for column in columns]) for k in (0, 1))
+        self.resistance = np.zeros(len(columns))
+        self._slopes, self._age = np.zeros((len(columns), len(columns))), 0
+
+    def begin(self) -> None:
+        """A ground that nothing has cut."""
+        self._contact, self._age = self._law.contact(self._grey), 0
+
+    def step(self, command: NDArray[np.float32], state: TwinState, measured: NDArray[np.float32]) -> TwinState:
+        """See `TwinRunner.step`; the ground is cut."""
+        self._runner.resistance = self.resistance
+        after = self._runner.step(command, state, measured)
+        before = np.where(np.isfinite(measured), measured, state["answer"][0]).astype(float)[self._strokes]
+        free = np.asarray(after["answer"][0, self._speeds], float)
+        if not self._contact.touches(before, free):
+            self._age = 0
+            return after
+        if self._age % RENEWED_TICKS == 0:
+            self._slopes = force_slopes(self._runner, self._speeds, (command, measured, state), free)
+        self._age += 1
+        forces = np.zeros(len(self._speeds)) if self.resistance is None else self.resistance.copy()
+        forces[self._speeds] += self._contact.forces(before, free, self._slopes)
+        self._runner.resistance = forces
+        return self._runner.step(command, state, measured)
+
+
+def check_grounded(twin: Twin) -> GreyTwin:
+    """The grey box on which a ground can act.
+
+    Raises:
+        ConfigError: it is none, has no known linkage, or has a network on top.
+    """
+    from edp.networks.twin.greybox import GreyTwin
+
+    if not isinstance(twin, GreyTwin) or twin.table.front is None or twin.runner().resistance is None:
+        raise ConfigError(
+            "a ground acts on a grey box with a known linkage and without a network on top; this twin is none: train "
+            "one in free air with --set twin.kind=greybox --set twin.linkage=MACHINE"
+        )
+    return twin

@@ -1,0 +1,206 @@
+"""Ground law `drag`: forces against the edge of the bucket by direction and depth, in ground that the edge cuts down.
+
+At a mean depth d below uneven ground that the edge has not cut yet, and a velocity w of the tip::
+
+    F_x = -w_x / |w| A_x(d) - w_y / |w| c d,  F_y = -w_y / |w| A_y(d) + w_x / |w| c d
+    A(d) = a min(d / 5 cm, 1) + b d + e d^2
+
+A has numbers of its own inwards, outwards, downwards and upwards, none below zero; c acts inwards only. The first part
+is the edge, which meets the same strength wherever it is, the others are what is cut loose (the earthmoving equation is
+quadratic in the depth). |w| is smoothed over `CREEP`. Heights of the ground have a deviation about its level, which no
+log tells place by place: d is the mean over them, so that forces begin softly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
+
+from edp.errors import DataError
+from edp.networks.twin.grey import ground_contact as contact
+from edp.networks.twin.grey.ground import GROUNDS, GroundContact, GroundLaw
+from edp.networks.twin.load import LOG_SHARE
+from edp.settings.bounds import above, span
+
+if TYPE_CHECKING:
+    from edp.networks.twin.greybox import GreyTwin
+
+Array = NDArray[np.float64]
+Logs = Sequence[tuple[Array, Array, Array]]
+DIRECTIONS = ("inwards", "outwards", "downwards", "upwards")
+PLAUSIBLE = np.array([2e4, 1e5, 1e5] * len(DIRECTIONS) + [5e4])
+"""Deviations of the numbers before logs are seen: edge (N), by depth (N/m) and by its square (N/m^2); across (N/m)."""
+LEAST_DEPTH, LEAST_SPEED = -0.1, 0.03
+"""Rows of a fit are at least as deep (m), and at least as fast (m/s): at rest friction answers, whatever the ground."""
+CLEAR_M = 0.3
+"""Above the surface; forces that the logs show there are errors of the equations, and are taken off."""
+BLOCK = 200
+"""Ticks whose errors are taken as one: they lie close together."""
+ROUNDS, HUBER = 4, 1.345
+LEAST_ROWS = 500
+METRES, BUCKET, HEIGHT = span(-20.0, 20.0), above(0.0, 20.0), span(0.0, 1.0)
+UNEVEN_M = (0.0, 0.02, 0.04, 0.06)
+"""Deviations of the ground among which logs choose."""
+
+
+class DragContact(GroundContact):
+    """See `GroundContact`.
+
+    Args:
+        front: linkage and length of the bucket.
+        law: its numbers and the deviation of the ground.
+        profile: heights of the ground, level.
+    """
+
+    def __init__(self, front: tuple[Array, float], law: tuple[Array, float], profile: Array) -> None:
+        self._front, self._law, self._profile = front, law, profile
+        self._last = np.full(1, -np.inf)
+
+    def touches(self, strokes: Array, free: Array) -> bool:
+        return bool(contact.touches(self._front, strokes, free, self._law[1], self._profile))
+
+    def forces(self, strokes: Array, free: Array, slopes: Array) -> Array:
+        forces = np.empty(len(strokes))
+        memory = (self._profile, self._last)
+        contact.hold(self._front, strokes, free, slopes, self._law, memory, forces)
+        return forces
+
+
+@GROUNDS.register("drag")
+@dataclass(frozen=True, eq=False)
+class DragLaw(GroundLaw):
+    """The law of this file.
+
+    Attributes:
+        numbers: ``(contact.NUMBERS,)``, as `contact` orders them.
+        deviations: their standard errors.
+        bucket_m: from the bucket's pin to the edge.
+        surface_m: of level ground in the frame of the boom foot.
+        uneven_m: deviation of its heights.
+    """
+
+    numbers: Array
+    deviations: Array
+    bucket_m: float
+    surface_m: float
+    uneven_m: float
+
+    @classmethod
+    def fitted(cls, twin: GreyTwin, logs: Logs, machine: str) -> DragLaw:
+        """See `GroundLaw.fitted`."""
+        # Here: a simulator compiles its own code.
+        from edp.sim.machine.machine_files import load_machine
+
+        own = load_machine(machine)
+        blank = np.zeros(contact.NUMBERS)
+        empty = cls(blank, blank, float(own.bodies.length[-1]), -own.chassis.boom_foot_height, 0.0)
+        tried = [replace(empty, uneven_m=uneven)._with_numbers(twin, logs) for uneven in UNEVEN_M]
+        return max(tried, key=lambda law: law.explained(twin, logs))
+
+    def _with_numbers(self, twin: GreyTwin, logs: Logs) -> DragLaw:
+        """The law with numbers that suit its unevenness."""
+        terms, forces, blocks = self._rows_of(twin, logs)
+        if len(forces) < LEAST_ROWS:
+            raise DataError(
+                f"the tip of the bucket moves below the surface ({self.surface_m:.2f} m from the boom foot) in "
+                f"{len(forces)} ticks of the training part; {LEAST_ROWS} must hold: give logs of work in the ground, "
+                "or another machine in twin.linkage"
+            )
+        numbers, deviations = _solved(terms, forces, blocks)
+        return replace(self, numbers=numbers, deviations=deviations)
+
+    def explained(self, twin: GreyTwin, logs: Logs) -> float:
+        terms, forces, _ = self._rows_of(twin, logs)
+        if not len(forces):
+            return float("nan")
+        left = forces - np.einsum("nka,k->na", terms, self.numbers)
+        return float(1.0 - np.sum(left**2) / np.sum(forces**2))
+
+    def contact(self, twin: GreyTwin) -> DragContact:
+        return DragContact(self._front(twin), (self.numbers, self.uneven_m), self._level(twin))
+
+    def plain(self) -> dict[str, Any]:
+        # JSON has no infinity.
+        deviations = [float(value) if np.isfinite(value) else None for value in self.deviations]
+        return {
+            "numbers": self.numbers.tolist(),
+            "deviations": deviations,
+            "bucket_m": self.bucket_m,
+            "surface_m": self.surface_m,
+            "uneven_m": self.uneven_m,
+        }
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> DragLaw:
+        numbers = np.array(plain["numbers"], float)
+        deviations = np.array([np.inf if value is None else value for value in plain["deviations"]], float)
+        bucket, surface, uneven = plain["bucket_m"], plain["surface_m"], plain["uneven_m"]
+        if numbers.shape != (contact.NUMBERS,) or deviations.shape != numbers.shape:
+            raise ValueError(f"its ground has not {contact.NUMBERS} numbers")
+        if not np.isfinite(numbers).all() or (numbers[: contact.ACROSS] < 0.0).any() or not (deviations >= 0.0).all():
+            raise ValueError("its ground has a number that is negative or not finite")
+        if not BUCKET.holds(bucket) or not METRES.holds(surface) or not HEIGHT.holds(uneven):
+            raise ValueError("its ground has a bucket or a surface that no machine has")
+        return cls(numbers, deviations, float(bucket), float(surface), float(uneven))
+
+    def names(self) -> list[tuple[str, str]]:
+        parts = (("edge", "N"), ("by_depth", "N/m"), ("by_depth_squared", "N/m^2"))
+        rows = [(f"{direction}_{part}", unit) for direction in DIRECTIONS for part, unit in parts]
+        return [*rows, ("across_by_depth", "N/m")]
+
+    def _front(self, twin: GreyTwin) -> tuple[Array, float]:
+        return twin.table.linkage, self.bucket_m
+
+    def _level(self, twin: GreyTwin) -> Array:
+        reach = float(np.sum(twin.table.linkage[1:3])) + self.bucket_m
+        return np.full(int(reach / contact.CELL_M) + 3, self.surface_m)
+
+    def _rows_of(self, twin: GreyTwin, logs: Logs) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Terms ``(row, number, actuator)``, forces ``(row, actuator)`` and block of each row that a fit reads."""
+        kept: list[tuple[Array, Array, NDArray[np.int64]]] = []
+        for number, (strokes, velocities, forces) in enumerate(logs):
+            tips, terms = np.empty((len(strokes), 2)), np.empty((len(strokes), contact.NUMBERS, strokes.shape[1]))
+            contact.follow(self._front(twin), strokes, velocities, self.uneven_m, self._level(twin), tips, terms)
+            depths, speeds = tips.T
+            # Estimates follow what acts with a lag; so do the terms.
+            terms = lfilter([LOG_SHARE], [1.0, LOG_SHARE - 1.0], terms, axis=0)
+            clear = depths < -CLEAR_M
+            bias = np.median(forces[clear], axis=0) if clear.sum() > BLOCK else np.zeros(strokes.shape[1])
+            rows = np.flatnonzero((depths > LEAST_DEPTH) & (speeds > LEAST_SPEED))
+            kept.append((terms[rows], forces[rows] - bias, 1_000_000 * number + rows // BLOCK))
+        terms, forces, blocks = (np.concatenate(part) for part in zip(*kept, strict=True))
+        return terms, forces, blocks
+
+
+def _solved(terms: Array, forces: Array, blocks: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Numbers by least squares with Huber's weights, those of directions not below zero, and their standard errors."""
+    scaled = terms * PLAUSIBLE[None, :, None]
+    lowest = np.where(np.arange(contact.NUMBERS) < contact.ACROSS, 0.0, -np.inf)
+    weight, x = np.ones(len(forces)), np.zeros(contact.NUMBERS)
+    prior = np.eye(contact.NUMBERS)
+    left = forces
+    for _ in range(ROUNDS):
+        size = np.sqrt(np.sum(left**2, axis=1))
+        middle = max(float(np.median(size)), 1.0)
+        weight = np.minimum(1.0, HUBER * middle / np.maximum(size, 1e-9))
+        root = np.sqrt(weight) / middle
+        a = (scaled * root[:, None, None]).transpose(0, 2, 1).reshape(-1, contact.NUMBERS)
+        b = (forces * root[:, None]).ravel()
+        # A plausible deviation weighs as much as one row.
+        x = lsq_linear(np.vstack([a, prior]), np.concatenate([b, np.zeros(len(prior))]), (lowest, np.inf)).x
+        left = forces - np.einsum("nka,k->na", scaled, x)
+    information = np.einsum("nka,nla,n->kl", scaled, scaled, root**2) + prior
+    slopes = np.einsum("nka,na,n->nk", scaled, left, root**2)
+    sums = np.zeros((int(np.unique(blocks).size), contact.NUMBERS))
+    np.add.at(sums, np.unique(blocks, return_inverse=True)[1], slopes)
+    inverse = np.linalg.inv(information)
+    spread = np.sqrt(np.diag(inverse @ (sums.T @ sums) @ inverse))
+    # Without a tick in which the number acts, the logs say nothing of it.
+    seen = np.abs(terms).sum(axis=(0, 2)) > 0.0
+    return x * PLAUSIBLE, np.where(seen, spread * PLAUSIBLE, np.inf)

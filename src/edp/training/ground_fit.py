@@ -1,0 +1,87 @@
+"""Fits a law of the ground to logs in soil: to the forces by which a machine lags behind its grey box of free air."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
+from edp.networks.twin.greybox import GreyTwin
+from edp.networks.twin.load import LOG_SHARE, LoadEstimate
+
+Array = NDArray[np.float64]
+Log = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class FittedGround:
+    """A law, and how much of the forces it explains.
+
+    Attributes:
+        law: of the ground.
+        explained: share of the squares of the forces where the tip moves in the ground, by part of the recordings;
+            None where a part has no such tick.
+        seconds: processor time.
+    """
+
+    law: GroundLaw
+    explained: dict[str, float | None]
+    seconds: float
+
+    def facts(self) -> dict[str, Any]:
+        """What provenance says of it."""
+        return {"ground": {"explained": self.explained, "seconds": round(self.seconds, 2)}}
+
+
+def fit_ground(
+    kind: str, twin: GreyTwin, train: Sequence[Series], validation: Sequence[Series], machine: str
+) -> FittedGround:
+    """The law of the training part.
+
+    Args:
+        kind: name in `GROUNDS`.
+        twin: of free air; it stays as it is.
+        train: recordings in soil.
+        validation: the law's share is asked of them, too.
+        machine: that the twin's linkage is of.
+
+    Raises:
+        EdpError: the twin can carry no ground, or the recordings are hardly ever in one.
+    """
+    started = time.process_time()
+    check_grounded(twin)
+    parts = {"train": [logged_forces(twin, one) for one in train]}
+    parts["validation"] = [logged_forces(twin, one) for one in validation]
+    law = GROUNDS[kind].fitted(twin, parts["train"], machine)
+    shares = {part: law.explained(twin, logs) if logs else float("nan") for part, logs in parts.items()}
+    explained = {part: share if np.isfinite(share) else None for part, share in shares.items()}
+    return FittedGround(law, explained, time.process_time() - started)
+
+
+def logged_forces(twin: GreyTwin, series: Series) -> Log:
+    """Strokes (m), velocities (m/s) and forces (N) against each actuator ``(tick, actuator)`` along a log.
+
+    Forces are `LoadEstimate`'s, told all channels tick by tick; ticks of the prefix have no row.
+    """
+    columns, prefix = twin.wiring.columns, twin.prefix_ticks
+    speeds, strokes = (np.array([column[k] for column in columns]) for k in (0, 1))
+    runner = twin.runner()
+    estimate = LoadEstimate(runner, np.arange(len(columns)), LOG_SHARE)
+    state = twin.reset(series.inputs[None, :prefix], series.targets[None, :prefix])
+    forces = np.zeros((max(series.samples - prefix, 0), len(columns)))
+    for row, tick in enumerate(range(prefix, series.samples)):
+        measured = series.targets[tick]
+        estimate.update(measured[: len(columns)].astype(float))
+        if runner.resistance is not None:
+            forces[row] = runner.resistance[speeds]
+        before, state = state, runner.step(series.inputs[tick], state, measured)
+        estimate.expect(series.inputs[tick], measured, before, state)
+    rows = series.targets[prefix:].astype(float)
+    known = np.isfinite(rows[:, [*speeds, *strokes]]).all(axis=1)
+    return rows[known][:, strokes], rows[known][:, speeds], forces[known]

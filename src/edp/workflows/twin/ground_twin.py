@@ -1,0 +1,118 @@
+"""``edp twin LOGS --start RUN --set ground=NAME``: a grey box of free air learns the ground from logs in soil."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
+from edp.errors import ConfigError
+from edp.logs.source import DataSource
+from edp.networks.twin import TWINS
+from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
+from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
+from edp.networks.twin.greybox import GreyBox
+from edp.storage import object_with, read_json, write_bytes, write_json
+from edp.storage.runs import RunFolder, run_key
+from edp.training.ground_fit import fit_ground
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
+from edp.workflows.twin.continue_twin import BaseTwin
+from edp.workflows.twin.prepare_twin import prepared_twin
+
+FOLDER, DATASHEET = "twin", "datasheet"
+GROUND_BASIS = (
+    "those of the ground from least squares on forces along logs in soil, errors of 2 s taken as one; numbers of a "
+    "direction are not below zero, whatever their intervals say"
+)
+
+
+def ground_twin(
+    source: DataSource,
+    experiment: TwinExperiment,
+    out: str | Path,
+    start: str | Path | None,
+    tell: Callable[[str], None],
+) -> tuple[TwinBundle, bool]:
+    """Fit a law of the ground and write a run folder: the twin of `start` with it, settings, datasheet.
+
+    Equations, scores and intervals stay those of free air.
+
+    Args:
+        source: recordings in soil.
+        experiment: settings that name a ground.
+        out: run folder; a finished one is read.
+        start: run folder of a grey box with a known linkage.
+        tell: called with what begins.
+
+    Returns:
+        The twin, and whether it was finished before.
+
+    Raises:
+        EdpError: no such start, or recordings, settings or folder cannot be used.
+    """
+    base, linkage = _base(start)
+    experiment = base.settled(experiment)
+    tell("reading recordings")
+    channels, data = prepared_twin(source.read(), experiment)
+    base.check(channels, data.train)
+    key = run_key({"twin": TWIN_SETTINGS.plain(experiment), "from": base.digest}, data.digest)
+    with RunFolder(out) as run:
+        if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
+            return load_twin(run.path), True
+        run.write_status("running")
+        tell(f"fitting the ground '{experiment.ground}' to forces along the logs")
+        twin = check_grounded(base.bundle.twin)
+        fitted = fit_ground(experiment.ground, twin, data.train, data.validation, linkage)
+        rows = [*_known_rows(base.folder), *fitted.law.rows()]
+        basis = f"{BASIS}; {GROUND_BASIS}"
+        write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": basis, "numbers": rows})
+        write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows, basis).encode())
+        facts = (
+            fitted.facts() | base.provenance() | {"ground_data": {"source": str(source.path), "digest": data.digest}}
+        )
+        bundle = replace(base.bundle, ground=fitted.law, provenance={**base.bundle.provenance, **facts})
+        save_twin(bundle, run.file(FOLDER))
+        run.write_status("finished")
+    return bundle, False
+
+
+def ground_sentence(bundle: TwinBundle) -> str:
+    """What a law explains, in a sentence."""
+    facts = object_with(bundle.provenance.get("ground", {}), (), "its ground")
+    parts = object_with(facts.get("explained", {}), (), "its ground")
+    texts = [f"{share:.0%} ({part})" for part, share in parts.items() if isinstance(share, float)]
+    law: GroundLaw | None = bundle.ground
+    name = "none" if law is None else GROUNDS.name_of(law)
+    return f"ground '{name}': explains {', '.join(texts) or 'nothing'} of the squares of the forces where the tip digs"
+
+
+def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
+    """The twin to begin with, and the machine of its linkage.
+
+    Raises:
+        EdpError: none is named, or it can carry no ground.
+    """
+    if start is None:
+        raise ConfigError(
+            "ground: a grey box of logs in free air comes first; name its run with --start, or leave ground out"
+        )
+    bundle = load_twin(start)
+    if not isinstance(bundle.spec, GreyBox):
+        raise ConfigError(
+            f"ground with --start {start}: the twin is of kind '{TWINS.name_of(bundle.spec)}'; a grey box with "
+            "twin.linkage must hold"
+        )
+    check_grounded(bundle.twin)
+    return BaseTwin(Path(start), bundle, twin_hash(start)), bundle.spec.linkage
+
+
+def _known_rows(run: Path) -> list[dict[str, Any]]:
+    """Rows of the datasheet of a run; none where it has none."""
+    file = run / f"{DATASHEET}.json"
+    if not file.is_file():
+        return []
+    rows = object_with(read_json(file), ("numbers",), f"'{file}'")["numbers"]
+    # A ground that is fitted anew replaces the one before.
+    return [row for row in rows if isinstance(row, dict) and row.get("element") != "ground"]
