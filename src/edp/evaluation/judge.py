@@ -159,7 +159,7 @@ class JudgedModel:
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkPart:
+class JudgedPart:
     """What a network measures on a part of the test recordings, and what pictures show of it.
 
     Attributes:
@@ -213,7 +213,7 @@ class ModelBench:
         """Run the network along the test part; its label and training time are those of reports."""
         return self.network_of(map(self.network_part, range(network_parts(self.data))), label, seconds)
 
-    def network_part(self, number: int) -> NetworkPart:
+    def network_part(self, number: int) -> JudgedPart:
         """Run the network along one of the `network_parts` of the test part."""
         net, test, pictures = self.predictor, self.data.test, _Kept(self.data.test)
         groups, coverages = _groups_of_part(self.data, number), net.spec.output.coverages
@@ -222,9 +222,9 @@ class ModelBench:
         if coverages:
             bounds = pictures.bounds(streamed(net, net.intervals, test, groups=groups), nearest_to_shown(coverages))
             within = self.ruler.gathered_intervals(bounds, coverages).state()
-        return NetworkPart(measured, within, pictures.tensors)
+        return JudgedPart(measured, within, pictures.tensors)
 
-    def network_of(self, parts: Iterable[NetworkPart], label: str, seconds: float) -> JudgedModel:
+    def network_of(self, parts: Iterable[JudgedPart], label: str, seconds: float) -> JudgedModel:
         """The network's entry from its parts, in their order; its label and training time are those of reports."""
         coverages = self.predictor.spec.output.coverages
         measured, within = self.ruler.unmeasured(), self.ruler.unmeasured_intervals(coverages)

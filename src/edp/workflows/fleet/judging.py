@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import build, plain_tree
-from edp.evaluation.judge import JudgedModel, JudgeSpec, ModelBench, NetworkPart, by_effort, network_parts
+from edp.evaluation.judge import JudgedModel, JudgeSpec, ModelBench, JudgedPart, by_effort, network_parts
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -67,7 +67,7 @@ def evaluate_with(
             name: unpacked(result.content or b"", JudgedModel)
             for name, result in zip(names, results[: len(models)], strict=True)
         }
-        measured = (unpacked(result.content or b"", NetworkPart) for result in results[len(models) :])
+        measured = (unpacked(result.content or b"", JudgedPart) for result in results[len(models) :])
         label, seconds = describe(bench.predictor.spec), float(read_provenance(folder)["seconds"])
         judged[NETWORK] = bench.network_of(measured, label, seconds)
         return {name: judged[name] for name in [NETWORK, *by_effort(spec.baselines)]}
