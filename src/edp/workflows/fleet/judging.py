@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import build, plain_tree
-from edp.evaluation.judge import JudgedModel, JudgeSpec, ModelBench, JudgedPart, by_effort, network_parts
+from edp.evaluation.judge import JudgedModel, JudgedPart, JudgeSpec, ModelBench, by_effort, network_parts
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
