@@ -102,7 +102,7 @@ def test_who_gave_the_preset_auto_too_little_time_is_told_to_give_it_more(tmp_pa
     judged = scores(1.0)
     judged["models"]["trees"] = {"label": "Trees", "overall": overall}
     judged |= {"task": {"horizons": [1]}, "targets": [{"name": "v"}]}
-    assert "more than 1 minutes" in beaten_by(judged, minutes_of(tmp_path)).sentence()
+    assert "more than 1 minute (" in beaten_by(judged, minutes_of(tmp_path)).sentence()
     assert "train with the preset auto" in beaten_by(judged, minutes_of(tmp_path / "none")).sentence()
 
 

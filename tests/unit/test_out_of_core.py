@@ -31,6 +31,7 @@ from edp.logs.store import read_store
 from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.stats.sketch import QuantileSketch
+from edp.workflows.executors.packing import packed, unpacked
 
 NAMES = ("a", "b", "c", "d", "e", "f")
 CHANNELS = tuple(Channel(name, Kind.VELOCITY if name in "bd" else Kind.GENERIC) for name in NAMES)
@@ -275,6 +276,24 @@ def test_scores_of_many_ticks_are_those_of_all_at_once(monkeypatch):
             expected = value if value is None else pytest.approx(value, rel=1e-3, abs=1e-9)
             assert ours[name][what] == expected, (name, what)
     assert ours["y"]["r2"] is None
+
+
+@pytest.mark.parametrize("most", [500, 100_000])
+def test_scores_of_parts_that_are_added_are_those_of_all_at_once(monkeypatch, most):
+    rng = np.random.default_rng(2)
+    truth = rng.normal(size=(6_000, 2)) * 40.0
+    predicted = truth + rng.normal(size=truth.shape)
+    for name in ("edp.evaluation.tally.MOST_EXACT", "edp.stats.sketch.MOST_EXACT"):
+        monkeypatch.setattr(name, most)
+    whole, added = Tally(("x", "y")), Tally(("x", "y"))
+    whole.update(predicted, truth)
+    for start, stop in ((0, 300), (300, 300), (300, 2_400), (2_400, 6_000)):  # kept, empty and summed parts
+        part = Tally(("x", "y"))
+        part.update(predicted[start:stop], truth[start:stop])
+        added.add(unpacked(packed(part.state()), dict))
+    for name, values in whole.scores().items():
+        exact = most > 6_000
+        assert added.scores()[name] == (values if exact else pytest.approx(values, rel=1e-9)), name
 
 
 @pytest.mark.parametrize(("lengths", "length"), [([100] * 50, 20), ([5_000], 30), ([3, 4_000, 7, 900], 50)])

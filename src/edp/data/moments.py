@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +41,17 @@ class Moments:
         """Take in what other rows gave."""
         if other.count:
             self._merge(other.count, other.low, other.high, other.mean, other.squares)
+
+    def state(self) -> dict[str, Any]:
+        """All that it holds, as plain values and arrays."""
+        return {
+            "count": self.count, "low": self.low, "high": self.high, "mean": self.mean, "squares": self.squares
+        }  # fmt: skip
+
+    def add(self, state: Mapping[str, Any]) -> None:
+        """As `merge`, by the `state` of the other."""
+        if state["count"]:
+            self._merge(state["count"], state["low"], state["high"], state["mean"], state["squares"])
 
     def _merge(self, count: int, low: Vector, high: Vector, mean: Vector, squares: Vector) -> None:
         total = self.count + count

@@ -169,6 +169,16 @@ class SituationTally:
                 self.ticks[row, target] += (ticks & scored).sum()
                 self.errors[row, target] += size[ticks & scored, target].sum()
 
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that it holds, as arrays."""
+        return {name: getattr(self, name) for name in ("ticks", "errors", "seen", "scored", "total")}
+
+    def add(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take in what another one held, by its `state`."""
+        for name in ("ticks", "errors", "scored", "total"):
+            getattr(self, name).__iadd__(state[name])
+        self.seen |= state["seen"]
+
     def rows(self) -> list[dict[str, Any]]:
         """By situation that occurs: ticks, shares of the time and of the error (means over the axes), error by target.
 

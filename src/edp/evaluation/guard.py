@@ -60,7 +60,8 @@ def beaten_by(scores: Mapping[str, Any], minutes: float | None = None) -> Beaten
     models = scores["models"]
     if NETWORK not in models:
         return None
-    advice = ADVICE if minutes is None else f"give it more than {minutes:g} minutes (--minutes), or more recordings"
+    unit = "minute" if minutes == 1 else "minutes"
+    advice = ADVICE if minutes is None else f"give it more than {minutes:g} {unit} (--minutes), or more recordings"
     better = []
     for name, model in models.items():
         if name == NETWORK:

@@ -20,7 +20,7 @@ from edp.evaluation.ruler import Numbered, Ruler
 from edp.evaluation.scores_file import nearest_to_shown
 from edp.evaluation.situation import situation_of
 from edp.networks.predictor import Predictor
-from edp.networks.running import streamed
+from edp.networks.running import stream_groups, streamed
 from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
 from edp.stats.metrics import weighted_interval_score
 from edp.stats.sketch import MOST_EXACT
@@ -33,6 +33,9 @@ KEPT_RECORDINGS, KEPT_TICKS = 6, 60_000
 SHOWN_MODELS = ("network", "ridge_arx")
 MOST_VALIDATED = 1 << 20
 """Ticks of the validation part that baselines are judged on, about; three hours at 100 Hz."""
+PART_TICKS, MOST_PARTS = 1 << 17, 64
+"""Ticks of a part of the test recordings that a worker judges the network on, 22 min at 100 Hz, which take far longer
+than to hand them out; and how many parts there are at most, as each brings back megabytes of what it measured."""
 SKIP = integer(0, MOST_ROWS)
 """Ticks that are not scored: a slice that begins with a negative one would score the last ticks alone."""
 
@@ -155,6 +158,36 @@ class JudgedModel:
     tensors: Mapping[str, NDArray[np.float32]]
 
 
+@dataclass(frozen=True, eq=False)
+class JudgedPart:
+    """What a network measures on a part of the test recordings, and what pictures show of it.
+
+    Attributes:
+        measured: a state of `edp.evaluation.measured.Measured`.
+        intervals: one of `edp.evaluation.measured.MeasuredIntervals`, where the network gives intervals.
+        tensors: by ``recording/name``.
+    """
+
+    measured: Mapping[str, Any]
+    intervals: Mapping[str, Any] | None
+    tensors: Mapping[str, NDArray[np.float32]]
+
+
+def network_parts(data: Prepared) -> int:
+    """Parts that a network is run along the test part in: by its size alone, whoever runs them."""
+    ticks = sum(part.samples for part in data.test)
+    return max(1, min(MOST_PARTS, ticks // PART_TICKS, len(stream_groups(data.test))))
+
+
+def _groups_of_part(data: Prepared, number: int) -> list[list[int]]:
+    """Groups of streams of one part: consecutive ones, by where the middle of their ticks lies in all."""
+    groups = stream_groups(data.test)
+    ticks = np.array([sum(data.test[i].samples for i in group) for group in groups], dtype=np.float64)
+    middles = np.cumsum(ticks) - ticks / 2
+    part_of = np.minimum(middles / ticks.sum() * network_parts(data), network_parts(data) - 1).astype(int)
+    return [group for group, part in zip(groups, part_of, strict=True) if part == number]
+
+
 class ModelBench:
     """Where models are measured one by one, on the same ticks: all here, or each in a process of its own.
 
@@ -178,15 +211,34 @@ class ModelBench:
 
     def network(self, label: str, seconds: float) -> JudgedModel:
         """Run the network along the test part; its label and training time are those of reports."""
+        return self.network_of(map(self.network_part, range(network_parts(self.data))), label, seconds)
+
+    def network_part(self, number: int) -> JudgedPart:
+        """Run the network along one of the `network_parts` of the test part."""
         net, test, pictures = self.predictor, self.data.test, _Kept(self.data.test)
-        measured = self.ruler.measure(pictures.seen(streamed(net, net.predict, test), "network"))
-        entry = {"label": label, "seconds": seconds, **measured}
-        coverages = net.spec.output.coverages
+        groups, coverages = _groups_of_part(self.data, number), net.spec.output.coverages
+        predictions = pictures.seen(streamed(net, net.predict, test, groups=groups), "network")
+        measured, within = self.ruler.gathered(predictions).state(), None
         if coverages:
-            bounds = pictures.bounds(streamed(net, net.intervals, test), nearest_to_shown(coverages))
-            entry["intervals"] = self.ruler.intervals(bounds, coverages)
+            bounds = pictures.bounds(streamed(net, net.intervals, test, groups=groups), nearest_to_shown(coverages))
+            within = self.ruler.gathered_intervals(bounds, coverages).state()
+        return JudgedPart(measured, within, pictures.tensors)
+
+    def network_of(self, parts: Iterable[JudgedPart], label: str, seconds: float) -> JudgedModel:
+        """The network's entry from its parts, in their order; its label and training time are those of reports."""
+        coverages = self.predictor.spec.output.coverages
+        measured, within = self.ruler.unmeasured(), self.ruler.unmeasured_intervals(coverages)
+        tensors: dict[str, NDArray[np.float32]] = {}
+        for part in parts:
+            measured.add(part.measured)
+            if part.intervals is not None:
+                within.add(part.intervals)
+            tensors |= part.tensors
+        entry = {"label": label, "seconds": seconds, **self.ruler.scores(measured)}
+        if coverages:
+            entry["intervals"] = self.ruler.intervals(within, coverages)
             entry["weighted_interval_score"] = _weighted(entry["overall"], entry["intervals"])
-        return JudgedModel(entry, pictures.tensors)
+        return JudgedModel(entry, tensors)
 
     def baseline(self, name: str) -> JudgedModel:
         """Fit a baseline on the training part, and run it along test and validation part."""

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from edp.data.prepared import Prepared
 from edp.errors import DataError
 from edp.evaluation.by_situation import Situations, SituationTally
-from edp.evaluation.tally import Tally, Values, named_scores
+from edp.evaluation.measured import SPEED_BINS, Measured, MeasuredIntervals
+from edp.evaluation.tally import Values, named_scores
 from edp.signals import KINDS
 from edp.stats.metrics import interval_score, interval_scores, score, spread
 from edp.stats.sketch import QuantileSketch
 
-# Six bins show where an error grows with speed and leave enough samples in each.
-SPEED_BINS = 6
 Numbered = Iterable[tuple[int, NDArray[np.float32]]]
 """Numbers of test series, in any order, and what belongs to each tick of them."""
 
@@ -85,63 +84,80 @@ class Ruler:
 
     def measure(self, predictions: Numbered) -> dict[str, Any]:
         """Scores of one model: overall, by recording with spread, by speed and situation, and of running integrals."""
-        tallies = [Tally(self.task.targets) for _ in self.task.horizons]
-        by_situation = [SituationTally(self.task.targets) for _ in self.task.horizons]
-        speeds = [_Speeds(self.edges) for _ in self.task.horizons]
-        integrals = {target: np.zeros(2) for target in self.task.integrate}
-        by_number: dict[int, dict[str, Any]] = {}
+        return self.scores(self.gathered(predictions))
+
+    def unmeasured(self) -> Measured:
+        """What no prediction has come to yet."""
+        return Measured(self.task.targets, len(self.task.horizons), self.edges, self.task.integrate)
+
+    def gathered(self, predictions: Numbered) -> Measured:
+        """What predictions of all recordings, or of a part of them, measure."""
+        measured = self.unmeasured()
         for number, values in predictions:
             truth = self.truth(number)
             predicted = values[: len(truth)] * self.factors
             for h, horizon in enumerate(self.task.horizons):
                 p, t = self._ticks(predicted[:, h], truth[:, h])
-                tallies[h].update(p, t)
-                speeds[h].update(p, t)
-                self._by_situation(by_situation[h], number, horizon, predicted[:, h], truth[:, h])
+                measured.tallies[h].update(p, t)
+                measured.speeds[h].update(p, t)
+                self._by_situation(measured.by_situation[h], number, horizon, predicted[:, h], truth[:, h])
                 if len(t):
-                    by_number.setdefault(number, {})[str(horizon)] = self._of_recording(p, t)
-            for target, sums in integrals.items():
+                    measured.recordings.setdefault(number, {})[str(horizon)] = self._of_recording(p, t)
+            for target, sums in measured.integrals.items():
                 sums += self._integrated(target, predicted, truth)
+        return measured
+
+    def scores(self, measured: Measured) -> dict[str, Any]:
+        """Scores of what all recordings measure together, as `measure` gives them."""
         names = [str(horizon) for horizon in self.task.horizons]
         recordings: dict[str, Any] = {}
-        for number in sorted(by_number):
-            recordings.setdefault(self.data.test[number].name, {}).update(by_number[number])
+        for number in sorted(measured.recordings):
+            recordings.setdefault(self.data.test[number].name, {}).update(measured.recordings[number])
         # Of each horizon by recording: `recordings` holds what was scored at all.
         errors = {name: [r[name]["mean"]["mae"] for r in recordings.values() if name in r] for name in names}
         scores = {
-            "overall": {name: tally.scores() for name, tally in zip(names, tallies, strict=True)},
+            "overall": {name: tally.scores() for name, tally in zip(names, measured.tallies, strict=True)},
             "recordings": recordings,
             "spread": {name: spread(values) for name, values in errors.items()},
-            "by_speed": {name: speed.rows() for name, speed in zip(names, speeds, strict=True)},
+            "by_speed": {name: speed.rows() for name, speed in zip(names, measured.speeds, strict=True)},
         }
         if self.situations.axes:
-            scores["by_situation"] = {name: tally.rows() for name, tally in zip(names, by_situation, strict=True)}
-        roots = {target: {"rmse": float(np.sqrt(sums[1] / sums[0]))} for target, sums in integrals.items()}
+            by_situation = zip(names, measured.by_situation, strict=True)
+            scores["by_situation"] = {name: tally.rows() for name, tally in by_situation}
+        roots = {target: {"rmse": float(np.sqrt(sums[1] / sums[0]))} for target, sums in measured.integrals.items()}
         return scores | ({"integrated": roots} if roots else {})
 
-    def intervals(self, bounds: Numbered, coverages: Sequence[float]) -> dict[str, Any]:
-        """Share of the truth that each interval holds, its mean width and score, by horizon, coverage and target."""
-        shape = (len(self.task.horizons), len(coverages), len(self.task.targets))
-        covered, wide, scored, ticks = np.zeros(shape), np.zeros(shape), np.zeros(shape), 0
+    def unmeasured_intervals(self, coverages: Sequence[float]) -> MeasuredIntervals:
+        """What no interval has come to yet."""
+        return MeasuredIntervals((len(self.task.horizons), len(coverages), len(self.task.targets)))
+
+    def gathered_intervals(self, bounds: Numbered, coverages: Sequence[float]) -> MeasuredIntervals:
+        """What intervals of all recordings, or of a part of them, measure."""
+        measured = self.unmeasured_intervals(coverages)
         for number, pairs in bounds:
             truth = self.truth(number)[self.skip :]
             if not len(truth):
                 continue
             within = pairs[self.skip : self.skip + len(truth)].astype(np.float64) * self.factors
-            ticks += len(truth)
-            for h, which, i in np.ndindex(*shape):
+            measured.ticks += len(truth)
+            for h, which, i in np.ndindex(*measured.covered.shape):
                 bounds_of = within[:, which, 0, h, i], within[:, which, 1, h, i], truth[:, h, i]
                 share, width = interval_scores(*bounds_of)
-                scored[h, which, i] += interval_score(*bounds_of, coverages[which]) * len(truth)
-                covered[h, which, i] += share * len(truth)
-                wide[h, which, i] += width * len(truth)
+                measured.scored[h, which, i] += interval_score(*bounds_of, coverages[which]) * len(truth)
+                measured.covered[h, which, i] += share * len(truth)
+                measured.wide[h, which, i] += width * len(truth)
+        return measured
+
+    def intervals(self, measured: MeasuredIntervals, coverages: Sequence[float]) -> dict[str, Any]:
+        """Share of the truth that each interval holds, its mean width and score, by horizon, coverage and target."""
+        ticks = measured.ticks
         return {
             str(horizon): [
                 {
                     "coverage": coverage,
-                    "covered": self._named(covered[h, which] / ticks),
-                    "width": self._named(wide[h, which] / ticks),
-                    "score": self._named(scored[h, which] / ticks),
+                    "covered": self._named(measured.covered[h, which] / ticks),
+                    "width": self._named(measured.wide[h, which] / ticks),
+                    "score": self._named(measured.scored[h, which] / ticks),
                 }
                 for which, coverage in enumerate(coverages)
             ]
@@ -185,29 +201,3 @@ class Ruler:
         # Ticks without a prediction add nothing to the integral; NaN would end it.
         errors = np.nancumsum(difference) / self.task.rate_hz
         return np.array([len(errors), float(np.square(errors).sum())])
-
-
-class _Speeds:
-    """Mean absolute error in bins of the target's magnitude, outputs pooled."""
-
-    def __init__(self, edges: Values) -> None:
-        self.edges = edges
-        self.count, self.total = np.zeros(SPEED_BINS, dtype=np.int64), np.zeros(SPEED_BINS)
-
-    def update(self, predicted: Values, truth: Values) -> None:
-        # Speeds beyond the last edge belong to the last bin.
-        places = np.clip(np.digitize(np.abs(truth), self.edges) - 1, 0, SPEED_BINS - 1).ravel()
-        self.count += np.bincount(places, minlength=SPEED_BINS)
-        self.total += np.bincount(places, weights=np.abs(predicted - truth).ravel(), minlength=SPEED_BINS)
-
-    def rows(self) -> list[dict[str, Any]]:
-        """By bin, from slow to fast."""
-        return [
-            {
-                "low": float(self.edges[i]),
-                "high": float(self.edges[i + 1]),
-                "count": int(self.count[i]),
-                "mae": float(self.total[i] / self.count[i]) if self.count[i] else None,
-            }
-            for i in range(SPEED_BINS)
-        ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,10 +36,31 @@ class Tally:
         self.count += len(truth)
         self._kept.append((predicted, truth))
         if self.count > MOST_EXACT or self._sums is not None:
-            self._sums = self._sums or _Sums(len(self.targets))
-            for part in self._kept:
-                self._sums.update(*part)
-            self._kept = []
+            self._sum_all()
+
+    def state(self) -> dict[str, Any]:
+        """All that it holds, as plain values and arrays."""
+        if self._sums is not None:
+            return {"count": self.count, "sums": self._sums.state()}
+        nothing = np.zeros((0, len(self.targets)))
+        predicted, truth = (np.concatenate([nothing, *(pair[i] for pair in self._kept)]) for i in range(2))
+        return {"predicted": predicted, "truth": truth}
+
+    def add(self, state: Mapping[str, Any]) -> None:
+        """Take in what another one held, by its `state`."""
+        if "sums" not in state:
+            self.update(state["predicted"], state["truth"])
+            return
+        self._sum_all().add(state["sums"])
+        self.count += state["count"]
+
+    def _sum_all(self) -> _Sums:
+        """The sums, with all ticks in them that were kept one by one."""
+        self._sums = self._sums or _Sums(len(self.targets))
+        for part in self._kept:
+            self._sums.update(*part)
+        self._kept = []
+        return self._sums
 
     def scores(self) -> dict[str, Any]:
         """By target, and their mean."""
@@ -66,6 +87,15 @@ class _Sums:
         self.errors += np.stack([error.sum(axis=0), np.square(error).sum(axis=0), size.sum(axis=0)])
         for sketch, column in zip(self.sizes, size.T, strict=True):
             sketch.update(column)
+
+    def state(self) -> dict[str, Any]:
+        return {"truth": self.truth.state(), "errors": self.errors, "sizes": [sketch.state() for sketch in self.sizes]}
+
+    def add(self, state: Mapping[str, Any]) -> None:
+        self.truth.add(state["truth"])
+        self.errors += state["errors"]
+        for sketch, size in zip(self.sizes, state["sizes"], strict=True):
+            sketch.add(size)
 
     def scores(self) -> list[Scores]:
         count, each = self.truth.count, []

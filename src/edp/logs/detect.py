@@ -69,6 +69,14 @@ def known_suffixes() -> tuple[str, ...]:
     return tuple(suffix for part in FORMATS.values() for suffix in part.suffixes)
 
 
+def is_text_log(path: Path) -> bool:
+    """Whether a file of an ending that measurement tools also give to files of bytes begins as text."""
+    try:
+        return FORMATS["csv"].claims(_begin(path)[0])
+    except (OSError, DataError):
+        return False
+
+
 def export_advice(suffix: str) -> str:
     """How a file of an ending that is not read becomes one that is; empty where nothing is known of it."""
     return _EXPORT.get(suffix, "")
@@ -114,7 +122,8 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
         raise DataError(f"'{source}' begins with zeros only; it is half downloaded or damaged: copy it again")
     # Text claims almost anything, so other known kinds are ruled out by name.
     if not named.claims(head) or any(head.startswith(magic) for magic in _OTHERS):
-        raise DataError(f"'{source}' is named {source.suffix} but holds {_content(head)}; rename it or export it again")
+        advice = _EXPORT.get(source.suffix.lower(), "rename it or export it again")
+        raise DataError(f"'{source}' is named {source.suffix} but holds {_content(head)}; {advice}")
     return read_apart(named, source, size, signal_map)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
-from edp.logs.detect import BAG_MARK, export_advice, format_for, known_suffixes, open_log
+from edp.logs.detect import BAG_MARK, export_advice, format_for, is_text_log, known_suffixes, open_log
 from edp.logs.formats.base import TRUTH, RawLog, holds_truth_apart, is_truth
 from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
@@ -19,7 +19,8 @@ from edp.logs.write import truth_path
 from edp.recording import Recording, columns
 from edp.signals import SignalMap
 
-TEXT = ".txt"
+TEXT = (".txt", ".dat")
+"""Endings that logs share with other files: taken where a folder holds no logs of other endings."""
 _MOST_FILES = 10_000
 """Of a folder without logs, files whose endings are looked at."""
 RATE_TOLERANCE = 1e-3
@@ -136,10 +137,11 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         and not entry.name.startswith(".")
         and entry.is_file()
         and not _is_truth(entry)
+        and (entry.suffix.lower() not in TEXT or is_text_log(entry))
     ]
     # Beside logs of other endings text files hold remarks and licences; loggers of text write nothing else.
-    if bags or any(file.suffix.lower() != TEXT for file in files):
-        files = [file for file in files if file.suffix.lower() != TEXT]
+    if bags or any(file.suffix.lower() not in TEXT for file in files):
+        files = [file for file in files if file.suffix.lower() not in TEXT]
     recording_paths = sorted([*bags, *(file for file in files if file.parent not in bags)])
     if not recording_paths:
         raise DataError(f"'{source}' holds no log files; known endings: {', '.join(suffixes)}{_instead(source)}")

@@ -30,6 +30,11 @@ ALIASES = {
     "volt": "V",
     "Ampere": "A",
     "-": "1",
+    "inch": "in",
+    "inches": "in",
+    "in/sec": "in/s",
+    "inch/s": "in/s",
+    "kips": "kip",
     "µs": "us",
     "sec": "s",
     "seconds": "s",
@@ -46,9 +51,9 @@ ALIASES = {
 
 OTHER_UNITS = frozenset(
     [
-        *("N·m", "Nm", "N*m", "N.m", "Ncm", "kN·m", "kNm", "kgf", "gf", "lbf", "N/m"),
+        *("N·m", "Nm", "N*m", "N.m", "Ncm", "kN·m", "kNm", "kgf", "gf", "N/m"),
         *("W", "kW", "VA", "Wh", "kWh", "J", "kJ", "kgf/W", "Hz", "kHz", "MHz", "dB", "ohm", "Ω", "kΩ"),
-        *("L", "l", "mL", "ml", "µm", "um", "nm", "inch", "in", "ft", "lb", "lbs", "counts", "digit"),
+        *("L", "l", "mL", "ml", "µm", "um", "nm", "ft", "lb", "lbs", "counts", "digit"),
     ]
 )
 """Units of quantities that have no kind here: their numbers are taken as they are, and they end no name."""

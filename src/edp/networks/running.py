@@ -113,7 +113,11 @@ def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int
 
 
 def streamed(
-    predictor: Predictor, run: Run, series: Sequence[Series], batch: int = 16
+    predictor: Predictor,
+    run: Run,
+    series: Sequence[Series],
+    batch: int = 16,
+    groups: Sequence[Sequence[int]] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Number of each series and what `run` gives at every tick of it, ``(time, ...)``; shorter ones come first.
 
@@ -122,16 +126,26 @@ def streamed(
         run: a method of it, such as ``predictor.predict``.
         series: each from reset, state carried to its end.
         batch: streams side by side; fewer where they are so long that their answers would fill the memory.
+        groups: some of `stream_groups`, where not all series are to be run.
+    """
+    with _evaluating(predictor):
+        for group in stream_groups(series, batch) if groups is None else groups:
+            yield from zip(group, _run_group(predictor, run, [series[i] for i in group]), strict=True)
+
+
+def stream_groups(series: Sequence[Series], batch: int = 16) -> list[list[int]]:
+    """Numbers of series whose streams run side by side, in the order in which they run: shorter ones come first.
+
+    A stream's answers may differ in their last bits with its neighbours, which these groups settle once for all.
     """
     # Streams of like length run together, so that little is computed beyond the end of the shorter ones.
     order = sorted(range(len(series)), key=lambda i: series[i].samples)
-    at = 0
-    with _evaluating(predictor):
-        while at < len(order):
-            longest = max(1, series[order[min(at + batch, len(order)) - 1]].samples)
-            group = order[at : at + max(1, min(batch, MOST_TICKS_TOGETHER // longest))]
-            yield from zip(group, _run_group(predictor, run, [series[i] for i in group]), strict=True)
-            at += len(group)
+    groups, at = [], 0
+    while at < len(order):
+        longest = max(1, series[order[min(at + batch, len(order)) - 1]].samples)
+        groups.append(order[at : at + max(1, min(batch, MOST_TICKS_TOGETHER // longest))])
+        at += len(groups[-1])
+    return groups
 
 
 @contextmanager

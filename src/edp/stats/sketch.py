@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,10 +38,30 @@ class QuantileSketch:
         self.count += new.size
         self._kept.append(new)
         if self.count > MOST_EXACT or self._bins is not None:
-            bins = np.zeros(_BINS, dtype=np.int64) if self._bins is None else self._bins
-            for part in self._kept:
-                bins += np.bincount(_bin_of(part), minlength=_BINS)
-            self._bins, self._kept = bins, []
+            self._binned()
+
+    def _binned(self) -> NDArray[np.int64]:
+        """The bins, with all values in them that were kept one by one."""
+        bins = np.zeros(_BINS, dtype=np.int64) if self._bins is None else self._bins
+        for part in self._kept:
+            bins += np.bincount(_bin_of(part), minlength=_BINS)
+        self._bins, self._kept = bins, []
+        return bins
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that it holds, as arrays: values one by one, or the counts of bins."""
+        if self._bins is None:
+            return {"values": np.concatenate([np.zeros(0), *self._kept])}
+        filled = np.flatnonzero(self._bins)
+        return {"bins": filled, "counts": self._bins[filled]}
+
+    def add(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take in what another one held, by its `state`: as if its values had come here."""
+        if "values" in state:
+            self.update(state["values"])
+            return
+        self._binned()[state["bins"]] += state["counts"]
+        self.count += int(state["counts"].sum())
 
     def quantiles(self, shares: Sequence[float]) -> list[float]:
         """The values below which these shares lie; at least one value must have come."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -147,7 +149,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     source = Path(path)
     if source.suffix.lower() == ".toml":
         raise ConfigError(f"'{source}' is a data-set file; give the log or the folder of logs that it is to describe")
-    paths = find_recordings(source)
+    paths, copies = _without_copies(find_recordings(source))
     groups, broken = group_logs(paths, on_log)
     group, others = groups[0], tuple(groups[1:])
     proposal = propose_map(group.looks[0], group.common, group.looks[1:])
@@ -155,7 +157,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     if pairs:
         return _of_pairs(source, group, others, broken, proposal, pairs)
     proposal, timing = _timed(group, proposal)
-    notes = [*_notes(group, others, broken, proposal), *timing.notes]
+    notes = [*_notes(group, others, broken, proposal), *timing.notes, *_of_copies(copies)]
     targets, more = _targets(proposal)
     notes += more
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
@@ -169,7 +171,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         SETTINGS: settings_text(proposal, channels, targets, split),
     }
     repairs, apart = timing.shared, timing.apart
-    if others or broken or apart:
+    if others or broken or apart or copies:
         recordings = [
             {"path": listed_path(one), "name": name} | ({"repair": repair_table(apart[one])} if one in apart else {})
             for one, name in named_paths(group.paths)
@@ -179,6 +181,33 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     repairs = () if apart else repairs
     inputs = _untold_inputs(proposal)
     return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
+
+
+def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, Path]]]:
+    """Logs without files that hold the same bytes as an earlier one, and these with that one: a test on a copy of
+    what trained says nothing.
+    """
+    sizes = Counter(path.stat().st_size for path in paths if path.is_file())
+    seen: dict[bytes, Path] = {}
+    single, copies = [], []
+    for path in paths:
+        if not path.is_file() or sizes[path.stat().st_size] == 1:
+            single.append(path)
+            continue
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").digest()
+        if digest in seen:
+            copies.append((path, seen[digest]))
+        else:
+            seen[digest] = path
+            single.append(path)
+    return single, copies
+
+
+def _of_copies(copies: Sequence[tuple[Path, Path]]) -> list[str]:
+    shown = ", ".join(f"{copy.name[:40]} (as {first.name[:40]})" for copy, first in copies[:3])
+    more = f" and {len(copies) - 3} more" if len(copies) > 3 else ""
+    return [f"left out, since they repeat another log byte for byte: {shown}{more}"] if copies else []
 
 
 def _timed(group: LogGroup, proposal: MapProposal) -> tuple[MapProposal, Timing]:

@@ -220,7 +220,7 @@ def _provenance(
     }
 
 
-JudgedBy = Callable[[JudgeSpec, str], Mapping[str, JudgedModel]]
+JudgedBy = Callable[[ModelBench, str], Mapping[str, JudgedModel]]
 """Measures all models, for how to judge and the digest of what is judged."""
 
 
@@ -267,8 +267,8 @@ def evaluate(
         if judged_by is None:
             evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
         else:
-            models = judged_by(chosen, " ".join(judged))
-            evaluation = ModelBench(bundle.predictor, data, chosen).together(models)
+            bench = ModelBench(bundle.predictor, data, chosen)
+            evaluation = bench.together(judged_by(bench, " ".join(judged)))
         # Scores that lack a baseline are not kept for a call that asks for all.
         scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
         write_bytes(target / "predictions.safetensors", save(evaluation.tensors))

@@ -6,6 +6,8 @@ import shutil
 import pytest
 
 from edp.errors import BundleError
+from edp.evaluation import judge
+from edp.networks import running
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.judging import UNITS, evaluate_with
 from edp.workflows.fleet.training import finetune_with
@@ -49,3 +51,27 @@ def test_models_run_apart_have_the_scores_of_one_process(run, target, tmp_path):
         assert there["key"] == here["key"]
     assert told[-1] == "network, 4 of 4"
     assert not (tmp_path / "run" / UNITS).exists()
+
+
+def test_a_network_run_in_parts_has_the_scores_of_one_process(run, target, tmp_path, monkeypatch):
+    shutil.copytree(run, tmp_path / "run")
+    whole = json.loads((evaluate(tmp_path / "run", target, ()) / "scores.json").read_text())
+    monkeypatch.setattr(judge, "PART_TICKS", 100)
+    monkeypatch.setattr(judge, "stream_groups", lambda series: running.stream_groups(series, 1))
+    told = []
+    folder = tmp_path / "run"
+    (evaluate(folder, target, ()) / "scores.json").unlink()
+    there = json.loads((evaluate_with(Workforce(), folder, target, (), told.append) / "scores.json").read_text())
+    assert len(told) > 1
+    (evaluate(folder, target, ()) / "scores.json").unlink()
+    here = json.loads((evaluate(folder, target, ()) / "scores.json").read_text())
+    assert without_times(there) == without_times(here)
+    # Streams side by side and sums in another order differ in their last bits alone.
+    assert here["models"]["network"]["overall"] == approx_tree(whole["models"]["network"]["overall"])
+
+
+def approx_tree(value):
+    """A table whose numbers are compared to a millionth."""
+    if isinstance(value, dict):
+        return {key: approx_tree(part) for key, part in value.items()}
+    return pytest.approx(value, rel=1e-6)

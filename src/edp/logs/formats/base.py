@@ -241,7 +241,18 @@ def holds_truth_apart(log_format: LogFormat) -> bool:
     return bool(getattr(log_format, "parts", False))
 
 
-_TIME_NAMES = ("time_s", "time", "timestamp", "timestamps", "tout", "time_ms", "time_us", "time_ns", "date/time")
+_TIME_NAMES = (
+    "time_s",
+    "time",
+    "timestamp",
+    "timestamps",
+    "tout",
+    "time_ms",
+    "time_us",
+    "time_ns",
+    "date/time",
+    "__time",
+)
 _TIME_UNIT_NAMES = {"sec": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 
 

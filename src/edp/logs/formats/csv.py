@@ -29,9 +29,10 @@ from edp.logs.formats.base import (
     time_factor,
 )
 from edp.logs.formats.csv_dates import dates_of
+from edp.logs.formats.csv_messages import at_own_times, message_columns
 from edp.logs.formats.csv_preamble import TablePlace, find_table
 from edp.logs.formats.csv_scope import read_scope, scope_head
-from edp.logs.formats.csv_table import CsvTable, TextLayout, is_grouped, is_number
+from edp.logs.formats.csv_table import CsvTable, TextLayout, has_decimal_commas, is_grouped, is_number
 from edp.logs.units import OTHER_UNITS, normalise_unit
 from edp.recording import Recording
 from edp.signals import TIME_UNITS, UNITS, SignalMap
@@ -42,6 +43,8 @@ _MOST_CELLS_LOOKED = 200_000
 """Cells in which the layout is looked for; wide tables need fewer rows."""
 _DELIMITERS = (",", ";", "\t", "|")
 """In the order in which a tie is decided."""
+_BLANKS = " "
+"""Delimiter of columns that any number of blanks parts; only where no other one makes columns."""
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")
 NAME_BY_PLACE = re.compile(r"column_\d+")
 """Name of a column of a file that names none."""
@@ -53,10 +56,10 @@ _BLOCK_ROWS = 65536
 
 
 class CsvFormat:
-    """Comma, semicolon or tab separated text."""
+    """Text separated by commas, semicolons, tabs, bars or blanks."""
 
     name = "csv"
-    suffixes: tuple[str, ...] = (".csv", ".tsv", ".txt")
+    suffixes: tuple[str, ...] = (".csv", ".tsv", ".txt", ".dat")
     content = "CSV text"
     libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
@@ -78,8 +81,12 @@ class CsvFormat:
         time_name = find_time(names, signal_map, path)
         time = None if time_name is None else _stamps(table, layout.names.index(time_name), signal_map)
         signals: dict[str, RawSignal] = {}
+        sparse = set() if time is None else message_columns(table)
         for column_index, name in enumerate(layout.names):
             if not name or name == time_name:
+                continue
+            if column_index in sparse and time is not None and layout.names.count(name) == 1:
+                signals[name] = at_own_times(table, column_index, time)
                 continue
             if name in signals:
                 signals[name] = _ambiguous(path, name, table.rows, time)
@@ -124,7 +131,7 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
     head = rows[table_place.header]
     body = rows[table_place.first :] if named else rows[table_place.header + signal_map.header :]
     decimal = signal_map.decimal
-    if decimal == "." and _has_decimal_commas(body, delimiter):
+    if decimal == "." and has_decimal_commas(body, delimiter):
         decimal = ","
     if not signal_map.header:
         body = rows[table_place.first :]
@@ -242,6 +249,8 @@ def _rows(path: Path, lines: list[str], delimiter: str) -> tuple[list[list[str]]
     Raises:
         DataError: a cell too long.
     """
+    if delimiter == _BLANKS:
+        lines = [" ".join(line.split()) for line in lines]
     reader = text_csv.reader((line + "\n" for line in lines), delimiter=delimiter)
     rows: list[list[str]] = []
     ends: list[int] = []
@@ -307,22 +316,14 @@ def _delimiter_of_numbers(path: Path, lines: list[str]) -> str:
         score = (round(sum(map(is_some_number, cells)) / len(cells), 2), width)
         if score > best_score:
             best, best_score = delimiter, score
-    return best
+    return _BLANKS if best_score == (0.0, 0) and _parted_by_blanks(tail) else best
 
 
-def _has_decimal_commas(rows: list[list[str]], delimiter: str) -> bool:
-    """Whether the comma is the decimal sign; a point may then part thousands."""
-    cells = [cell.strip() for row in rows for cell in row]
-    # 1.234,5 says it whatever stands elsewhere.
-    if any("," in cell and is_grouped(cell) for cell in cells):
-        return True
-    with_comma = [cell for cell in cells if re.fullmatch(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", cell)]
-    with_point = [cell for cell in cells if re.fullmatch(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?", cell)]
-    # 1,234 may have a comma for thousands; 1,5 has none.
-    proven = not all(re.fullmatch(r"[-+]?\d{1,3},\d{3}", cell) for cell in with_comma)
-    if with_point or delimiter == ",":
-        return proven and all(map(is_grouped, with_point))
-    return bool(with_comma)
+def _parted_by_blanks(lines: list[str]) -> bool:
+    """Whether each line holds the same number of numbers, two or more, with blanks between them."""
+    rows = [line.split() for line in lines]
+    widths = {len(row) for row in rows}
+    return len(widths) == 1 and max(widths) > 1 and all(is_number(cell) for row in rows for cell in row)
 
 
 def _header(rows: list[list[str]]) -> tuple[tuple[str, ...], tuple[str | None, ...], int]:

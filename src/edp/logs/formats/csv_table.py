@@ -29,6 +29,10 @@ _TRIES = 8
 """Parses that end at text in a column of numbers; after the second, the columns are looked at all at once."""
 NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "-nan", "-nan(ind)", "1.#QNAN"]
 """Spellings of a missing value, those of Excel, pandas, MATLAB and C runtimes among them."""
+_SQUEEZED_BYTES = 1 << 20
+"""Of text with blanks between cells brought to one blank at a time."""
+_LONGEST_LINE = 1 << 26
+"""Characters of a line before the table at most."""
 _BLOCK_BYTES = 1 << 24
 """Of text parsed at a time."""
 
@@ -69,6 +73,21 @@ def is_grouped(cell: str) -> bool:
     return re.fullmatch(_GROUPED, cell) is not None
 
 
+def has_decimal_commas(rows: list[list[str]], delimiter: str) -> bool:
+    """Whether the comma is the decimal sign; a point may then part thousands."""
+    cells = [cell.strip() for row in rows for cell in row]
+    # 1.234,5 says it whatever stands elsewhere.
+    if any("," in cell and is_grouped(cell) for cell in cells):
+        return True
+    with_comma = [cell for cell in cells if re.fullmatch(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", cell)]
+    with_point = [cell for cell in cells if re.fullmatch(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?", cell)]
+    # 1,234 may have a comma for thousands; 1,5 has none.
+    proven = not all(re.fullmatch(r"[-+]?\d{1,3},\d{3}", cell) for cell in with_comma)
+    if with_point or delimiter == ",":
+        return proven and all(map(is_grouped, with_point))
+    return bool(with_comma)
+
+
 def _without_groups(cells: pa.Array) -> pa.Array | None:
     """Texts as numbers, by decimal comma and points for thousands; None where one is neither a number nor missing."""
     cells = pc.utf8_trim_whitespace(cells)
@@ -89,6 +108,44 @@ def _all_numbers(cells: pa.Array, nulls: pa.Array, decimal: str) -> bool:
     except pa.ArrowInvalid:
         return False
     return True
+
+
+class SqueezedText(io.RawIOBase):
+    """The lines of a text behind the first ones, as UTF-8, blanks at their ends left out and those within them one.
+
+    Args:
+        path: the text.
+        encoding: of it.
+        skip: lines before the table.
+    """
+
+    def __init__(self, path: Path, encoding: str, skip: int) -> None:
+        super().__init__()
+        self._stream = path.open(encoding=encoding, errors="replace", newline=None)
+        for _ in range(skip):
+            self._stream.readline(_LONGEST_LINE)
+        self._rest = b""
+
+    def readable(self) -> bool:
+        """It is read only."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill a buffer as far as there is text."""
+        while not self._rest:
+            lines = self._stream.readlines(_SQUEEZED_BYTES)
+            if not lines:
+                return 0
+            self._rest = "".join(" ".join(line.split()) + "\n" for line in lines).encode()
+        count = min(len(buffer), len(self._rest))
+        buffer[:count] = self._rest[:count]
+        self._rest = self._rest[count:]
+        return count
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+        super().close()
 
 
 class CsvTable:
@@ -113,7 +170,7 @@ class CsvTable:
             self.ragged.clear()
             try:
                 if small:
-                    self.kept = arrow_csv.read_csv(self.path, *self.options(self.keys))
+                    self.kept = arrow_csv.read_csv(self.source(), *self.options(self.keys))
                     self.rows = self.kept.num_rows
                 else:
                     self.rows = sum(batch.num_rows for batch in self.stream(self.keys))
@@ -152,12 +209,14 @@ class CsvTable:
         layout = self.layout
         # pyarrow skips the byte-order mark of UTF-8 by itself; other encodings pass through Python, slowly.
         encoding = "utf-8" if layout.encoding == "utf-8-sig" else layout.encoding
+        # What parts columns by blanks begins at the table, and comes as UTF-8.
+        squeezed = layout.delimiter == " "
         read = arrow_csv.ReadOptions(
             # Threads take memory that the sandbox counts, and errors would name no row.
             use_threads=False,
             column_names=self.keys,
-            skip_rows=layout.skip_rows,
-            encoding=encoding,
+            skip_rows=0 if squeezed else layout.skip_rows,
+            encoding="utf-8" if squeezed else encoding,
             block_size=_BLOCK_BYTES,
         )
         parse = arrow_csv.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=note)
@@ -166,12 +225,17 @@ class CsvTable:
         )
         return read, parse, convert
 
+    def source(self) -> Any:
+        """The file, or its rows with one blank between cells where any number of blanks parts them."""
+        layout = self.layout
+        return SqueezedText(self.path, layout.encoding, layout.skip_rows) if layout.delimiter == " " else self.path
+
     def stream(self, keys: Sequence[str]) -> Iterator[pa.RecordBatch]:
         """Blocks of rows of the wanted columns, from the file or from what is kept."""
         if self.kept is not None:
             yield from self.kept.select(list(keys)).to_batches(max_chunksize=PIECE_ROWS)
             return
-        with arrow_csv.open_csv(self.path, *self.options(keys)) as reader:
+        with arrow_csv.open_csv(self.source(), *self.options(keys)) as reader:
             yield from reader
 
     def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:

@@ -1,4 +1,4 @@
-"""MAT files: v4, v5 and v7.3; arrays, structs, Simulink logs, timeseries, Dataset and timetable objects."""
+"""MAT files: v4, v5 and v7.3; arrays, structs, Simulink logs, timeseries, Dataset, timetable and iddata objects."""
 
 from __future__ import annotations
 
@@ -69,10 +69,15 @@ class MatFormat:
                 )
             if signal_map.variable == TRUTH and edp_metadata.truth:
                 edp_metadata = replace(edp_metadata, channels=edp_metadata.truth, digest=edp_metadata.truth_digest)
+        if mat_variables.experiments > 1:
+            raise DataError(
+                f"'{path}' holds {mat_variables.experiments} experiments in one iddata, which are no single log; save "
+                "each to a file of its own (in MATLAB: one = getexp(data, 1); save('one.mat', 'one'))"
+            )
         if not mat_variables.signals:
             raise DataError(
                 f"'{path}' holds no signals (variables: {', '.join(mat_variables.names[:12]) or 'none'}); expected "
-                "numeric vectors, structs of them, timeseries, a Dataset or a timetable"
+                "numeric vectors, structs of them, timeseries, a Dataset, a timetable or iddata"
             )
         return _raw_log(path, mat_variables, edp_metadata, signal_map)
 

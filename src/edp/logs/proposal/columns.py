@@ -32,6 +32,12 @@ _PROBE_ROWS = 1000
 """Rows by which a column of text is told from one of numbers."""
 _MOST_TEXTS = 20
 """Columns of text that are tried as time."""
+_COVERED = 0.9
+"""Share of the longest span that signals with times of their own cover at least: one message is no signal."""
+_SLOWEST = 200.0
+"""Steps of the fastest signal that one of a slower lasts at most."""
+_HELD_VALUES = 4 * _VALUES
+"""Numbers held at the times of the fastest signal at most; of longer logs columns of one length are looked at."""
 _TIME_WORDS = ("time", "zeit", "stamp", "date", "datum", "uhr")
 
 
@@ -131,6 +137,10 @@ def _bounded(path: Path) -> Iterator[tuple[Path, str]]:
 def _look(path: Path, part: Path, note: str) -> LogLook:
     # With a stated step no column is taken for time: all of them are looked at.
     raw = open_log(part, SignalMap(others=True, sample_time_s=1.0))
+    for time_name in (None, *islice((name for name in raw.signals if _is_time_word(name)), 1)):
+        paced = _of_own_pace(path, part, note, time_name)
+        if paced is not None:
+            return paced
     length = _usual_length(raw)
     signals = [signal for signal in raw.signals.values() if signal.samples == length]
     left_out = {f"have another length than {length:,} rows": len(raw.signals) - len(signals)}
@@ -160,6 +170,67 @@ def _look(path: Path, part: Path, note: str) -> LogLook:
         {reason: count for reason, count in left_out.items() if count},
         note,
     )
+
+
+def _is_time_word(name: str) -> bool:
+    return any(word in name.lower() for word in _TIME_WORDS)
+
+
+def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> LogLook | None:
+    """A log whose signals have times of their own and differ in rate, at the times of the fastest; None for others."""
+    try:
+        timed = open_log(part, SignalMap(others=True, time=time_name))
+    except DataError:
+        return None
+    signals = [s for s in timed.signals.values() if s.time_s is not None and s.samples > 2]
+    if timed.rate_hz is not None or len({s.samples for s in signals}) < 2:
+        return None
+    longest = max(_span_s(s) for s in signals)
+    covering = [s for s in signals if _span_s(s) >= _COVERED * longest and _step_s(s) > 0]
+    if not covering or longest <= 0:
+        return None
+    fastest = min(covering, key=lambda s: (_step_s(s), -s.samples))
+    step, stamps = _step_s(fastest), np.asarray(fastest.time_s, dtype=np.float64)
+    alike = [s for s in covering if _step_s(s) <= _SLOWEST * step]
+    chosen = alike[:MOST_COLUMNS]
+    numbers = [s for s in chosen if _is_numeric(s)]
+    if len({s.samples for s in numbers}) < 2 or len(numbers) * len(stamps) > _HELD_VALUES:
+        return None
+    first = min(_ROWS, max(_VALUES // len(numbers) // 2, 100))
+    ranges = _ranges(len(stamps), first, min(_LATER_ROWS, first // 3))
+    columns = []
+    for signal in numbers:
+        values = _held(signal, stamps)
+        pieces = tuple(values[start:stop] for start, stop in ranges)
+        columns.append(LogColumn(signal.name, pieces, len(stamps), signal.unit, signal.kind, True))
+    left_out = {
+        "cover another time than the others, or come far more slowly": len(timed.signals) - len(alike),
+        "come after the first columns": len(alike) - len(chosen),
+    }
+    texts = tuple(s.name for s in chosen if s not in numbers)
+    counted = {reason: count for reason, count in left_out.items() if count > 0}
+    return LogLook(path, tuple(columns), texts, len(stamps), None, time_name, step, False, counted, note)
+
+
+def _span_s(signal: RawSignal) -> float:
+    stamps = np.asarray(signal.time_s, dtype=np.float64)
+    return float(stamps[-1] - stamps[0]) if np.isfinite(stamps[[0, -1]]).all() else 0.0
+
+
+def _step_s(signal: RawSignal) -> float:
+    rising = np.diff(np.asarray(signal.time_s, dtype=np.float64)[:_ROWS])
+    rising = rising[rising > 0]
+    return float(np.median(rising)) if len(rising) else 0.0
+
+
+def _held(signal: RawSignal, stamps: Column) -> Column:
+    """The latest value at each of some times; the first one before it has any."""
+    values = np.asarray(signal.load(), dtype=np.float64)
+    own = np.asarray(signal.time_s, dtype=np.float64)
+    if not bool(np.all(np.diff(own) >= 0)):
+        order = np.argsort(own, kind="stable")
+        own, values = own[order], values[order]
+    return values[np.maximum(np.searchsorted(own, stamps, side="right") - 1, 0)]
 
 
 def _usual_length(raw: RawLog) -> int:
@@ -229,7 +300,7 @@ def _read_or_missing(signal: RawSignal, start: int, stop: int) -> Column:
 
 def _time_of(part: Path, raw: RawLog, texts: Sequence[str]) -> tuple[str | None, float | None, set[str]]:
     """The column that the reader takes for time, the step in seconds, and the columns with stamps of their own."""
-    by_word = [name for name in texts if any(word in name.lower() for word in _TIME_WORDS)]
+    by_word = [name for name in texts if _is_time_word(name)]
     others = [name for name in texts if name not in by_word]
     for name in (None, *islice([*by_word, *others], _MOST_TEXTS)):
         try:

@@ -18,7 +18,7 @@ KIND_WORDS: Mapping[str, Kind] = {
     for kind, words in {
         Kind.PILOT_PRESSURE: "pilot vorsteuerdruck",
         Kind.PRESSURE: "pressure press druck",
-        Kind.ANGULAR_VELOCITY: "rpm drehzahl omega gyro angvel revs",
+        Kind.ANGULAR_VELOCITY: "rpm drehzahl omega gyro angvel revs tacho tachometer",
         Kind.ACCELERATION: "acceleration accel acc beschleunigung",
         Kind.VELOCITY: "velocity vel speed geschwindigkeit geschw",
         Kind.ANGLE: "angle winkel pitch roll yaw heading",
@@ -56,10 +56,11 @@ _UNIT_ENDINGS: Mapping[str, str] = {
 ROLE_WORDS: Mapping[str, str] = {
     word: role
     for role, words in {
-        "reference": "soll sollwert ref reference setpoint desired des target vorgabe fuehrungsgroesse r",
+        "reference": "soll sollwert ref reference set setpoint desired des target demand demanded requested vorgabe "
+        "fuehrungsgroesse r",
         "command": "command cmd ctrl control u valve ventil joystick lever hebel pilot pwm input stellgroesse pedal",
         "measured": "ist istwert act actual meas measured mess messwert fb feedback y output "
-        "sensor cell transducer encoder gauge",
+        "sensor cell transducer encoder gauge bus supply battery",
         "label": "flag status state mode id label condition fault error leak stable zustand fehler",
     }.items()
     for word in words.split()

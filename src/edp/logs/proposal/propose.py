@@ -257,7 +257,8 @@ def _named(guesses: Sequence[ColumnGuess]) -> list[ColumnGuess]:
         if channel and (count > _MOST_CHANNELS or not channel.isprintable()):
             guess = replace(guess, channel="", check=f"left out: beyond {_MOST_CHANNELS} channels, or an odd name")
         elif channel:
-            channel = channel if _PLAIN_NAME.fullmatch(channel) and channel not in used else f"channel_{i + 1}"
+            plain = channel if _PLAIN_NAME.fullmatch(channel) else channel.strip("/ .:")[:64].replace(":", ".")
+            channel = plain if _PLAIN_NAME.fullmatch(plain) and plain not in used else f"channel_{i + 1}"
             used.add(channel)
             guess = replace(guess, channel=channel)
         named.append(guess)

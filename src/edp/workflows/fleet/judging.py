@@ -1,7 +1,8 @@
-"""`edp evaluate` by a pool or a cluster: a unit the network, and one each baseline."""
+"""`edp evaluate` by a pool or a cluster: a unit each baseline, and one each part of the test for the network."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -9,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import build, plain_tree
-from edp.data.prepared import Prepared
-from edp.evaluation.judge import JudgedModel, JudgeSpec, ModelBench, by_effort
+from edp.evaluation.judge import JudgedModel, JudgedPart, JudgeSpec, ModelBench, by_effort, network_parts
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
-from edp.training import Bundle
+from edp.storage.runs import read_provenance
 from edp.training.blas import one_blas_thread
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.packing import packed, unpacked
@@ -48,52 +48,65 @@ def evaluate_with(
     """
     folder = Path(run)
 
-    def judged(spec: JudgeSpec, digest: str) -> dict[str, JudgedModel]:
-        # Costly ones first, so that none of them begins last.
-        names = [*reversed(by_effort(spec.baselines)), NETWORK]
-        units = [_unit(name, spec, digest, folder, source) for name in names]
+    def judged(bench: ModelBench, digest: str) -> dict[str, JudgedModel]:
+        # Costly ones first, so that none of them begins last; parts of the network, all alike, fill what is left.
+        names, spec = [*reversed(by_effort(bench.spec.baselines))], bench.spec
+        parts = network_parts(bench.data)
+        models = [_unit(f"model '{name}'", {"model": name}, spec, digest, folder, source) for name in names]
+        runs = [
+            _unit(f"network, part {part + 1} of {parts}", {"part": part}, spec, digest, folder, source)
+            for part in range(parts)
+        ]
 
         def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
             if on_step is not None:
-                on_step(f"{unit.arguments['model']}, {done} of {len(units)}")
+                on_step(f"{unit.arguments.get('model', NETWORK)}, {done} of {len(models) + parts}")
 
-        results = run_units(units, workforce, folder / UNITS, note)
-        models = {
-            name: unpacked(result.content or b"", JudgedModel) for name, result in zip(names, results, strict=True)
+        results = run_units([*models, *runs], workforce, folder / UNITS, note)
+        judged = {
+            name: unpacked(result.content or b"", JudgedModel)
+            for name, result in zip(names, results[: len(models)], strict=True)
         }
-        return {name: models[name] for name in [NETWORK, *by_effort(spec.baselines)]}
+        measured = (unpacked(result.content or b"", JudgedPart) for result in results[len(models) :])
+        label, seconds = describe(bench.predictor.spec), float(read_provenance(folder)["seconds"])
+        judged[NETWORK] = bench.network_of(measured, label, seconds)
+        return {name: judged[name] for name in [NETWORK, *by_effort(spec.baselines)]}
 
     scored = evaluate(folder, source, baselines, judged_by=judged)
     forget_units(folder / UNITS)
     return scored
 
 
-def _unit(name: str, spec: JudgeSpec, digest: str, folder: Path, source: DataSource | None) -> WorkUnit:
+def _unit(
+    label: str, does: Mapping[str, Any], spec: JudgeSpec, digest: str, folder: Path, source: DataSource | None
+) -> WorkUnit:
     where = {"run": str(folder.resolve()), "source": None if source is None else source.to_plain()}
-    return WorkUnit(
-        f"{__name__}:judge_model", f"model '{name}'", {"model": name, "judge": plain_tree(spec)}, digest, where
-    )
+    return WorkUnit(f"{__name__}:judge_model", label, {**does, "judge": plain_tree(spec)}, digest, where)
 
 
 @one_blas_thread()
 def judge_model(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
-    """Scores of one model of a run, and what pictures show of it."""
-    name = identity.config["model"]
-    bundle, provenance_seconds, data = _loaded(where["run"], identity.data)
-    if where["source"] is not None:
-        recordings = DataSource.from_plain(where["source"]).read()
-        data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
+    """Scores of one baseline, or what the network of a run measures on one part, and what pictures show of it."""
     spec = build(JudgeSpec, identity.config["judge"], "of the unit")
-    bench = ModelBench(bundle.predictor, data, spec)
-    if name == NETWORK:
-        model = bench.network(describe(bundle.predictor.spec), provenance_seconds)
-    else:
-        model = bench.baseline(name)
-    return WithState({"model": name}, packed(model))
+    bench = _bench(where["run"], identity.data, json.dumps(where["source"], sort_keys=True), spec)
+    if "part" in identity.config:
+        return WithState({"part": identity.config["part"]}, packed(bench.network_part(identity.config["part"])))
+    name = identity.config["model"]
+    return WithState({"model": name}, packed(bench.baseline(name)))
 
 
 @lru_cache(maxsize=1)
-def _loaded(run: str, digest: str) -> tuple[Bundle, float, Prepared]:
-    """A run with its data, once for all models that a process runs."""
-    bundle, _, provenance, data = trained_run(Path(run))
-    return bundle, float(provenance["seconds"]), data
+def _bench(run: str, digest: str, source: str, spec: JudgeSpec) -> ModelBench:
+    """A run with its data, once for all that a process measures of them.
+
+    Args:
+        run: run folder.
+        digest: of the data, so that changed data are read anew.
+        source: other recordings as JSON.
+        spec: how to judge.
+    """
+    bundle, _, _, data = trained_run(Path(run))
+    other = json.loads(source)
+    if other is not None:
+        data = replace(data, test=[bundle.task.series(recording) for recording in DataSource.from_plain(other).read()])
+    return ModelBench(bundle.predictor, data, spec)

@@ -1,7 +1,8 @@
 """The signals inside a loaded MAT file, whatever they are wrapped in.
 
 Known wrappers: vectors and matrices, structs (one time vector per struct), Simulink's structure with time,
-``timeseries``, ``Simulink.SimulationData.Dataset`` and ``Signal``, ``SimulationOutput``, cells, tables and timetables.
+``timeseries``, ``Simulink.SimulationData.Dataset`` and ``Signal``, ``SimulationOutput``, signals that Simulink streamed
+into the file, ``iddata``, cells, tables and timetables.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from edp.logs.formats.matlab.library import MatlabOpaque
 from edp.logs.formats.matlab.library import pandas as pd
+from edp.logs.formats.matlab.sigstream import EVEN_TIMES, VALUES
 from edp.logs.formats.matlab.variables import MatVariables, Part
 
 _TIME_FIELDS = ("time_s", "time", "Time", "t", "tout")
@@ -35,6 +37,7 @@ def collect(variables: dict[str, Any]) -> MatVariables:
     mat_variables = MatVariables()
     for name, value in variables.items():
         _walk(value, name, name, None, mat_variables)
+    _drop_copies(mat_variables)
     short = [part.name for part in mat_variables.signals]
     counts = Counter(short)
     for part in mat_variables.signals:
@@ -48,6 +51,26 @@ def collect(variables: dict[str, Any]) -> MatVariables:
             mat_variables.repeated.setdefault(name, []).append(part.name)
     _share_times(mat_variables)
     return mat_variables
+
+
+def _drop_copies(mat_variables: MatVariables) -> None:
+    """Leave out signals that repeat another one of their name, as a model logs one at each block that it passes."""
+    parts_by_name: dict[str, list[Part]] = {}
+    for part in mat_variables.signals:
+        namesakes = parts_by_name.setdefault(part.name, [])
+        if not any(_is_copy(part, other) for other in namesakes):
+            namesakes.append(part)
+    staying = {id(part) for parts in parts_by_name.values() for part in parts}
+    mat_variables.signals = [part for part in mat_variables.signals if id(part) in staying]
+
+
+def _is_copy(part: Part, other: Part) -> bool:
+    """Whether two signals have the same values at the same times of their own, and one unit."""
+    if part.time is None or other.time is None or part.unit != other.unit:
+        return False
+    return np.array_equal(part.time, other.time) and np.array_equal(
+        part.values, other.values, equal_nan=part.values.dtype.kind == "f" and other.values.dtype.kind == "f"
+    )
 
 
 def _share_times(mat_variables: MatVariables) -> None:
@@ -119,6 +142,19 @@ def _walk_struct(value: NDArray[Any], path: str, mat_variables: MatVariables) ->
     fields = value.dtype.names or ()
     for number, element in enumerate(value.ravel(order="F")):
         here = f"{path}({number + 1})" if value.size > 1 else path
+        if {VALUES, EVEN_TIMES} <= set(fields):
+            _add_streamed(element, fields, here, mat_variables)
+            continue
+        if {"BlockPath", "PortIndex", "Values"} <= set(fields):
+            # The block tells signals of one name apart.
+            _walk(
+                element["Values"],
+                _text(element["Name"]) if "Name" in fields else "",
+                _port(element, here),
+                None,
+                mat_variables,
+            )
+            continue
         if "signals" in fields and "time" in fields:
             _walk_structure_with_time(element, here, mat_variables)
             continue
@@ -152,6 +188,33 @@ def _walk_structure_with_time(element: Any, path: str, mat_variables: MatVariabl
         _add_array(np.asarray(signal["values"]), name, f"{path}.{name}", time, mat_variables)
 
 
+def _add_streamed(element: Any, fields: tuple[str, ...], path: str, mat_variables: MatVariables) -> None:
+    """A signal of a Dataset whose values `edp.logs.formats.matlab.sigstream` has put in their place."""
+    values, time = element[VALUES], element[EVEN_TIMES]
+    if not isinstance(values, np.ndarray) or values.ndim != 2 or time is None:
+        return
+    units = [_nested_text(element[key]) if key in fields else "" for key in ("TimeUnits", "DataUnits")]
+    seconds = np.asarray(time, dtype=np.float64) * _SECONDS.get(units[0].lower(), 1.0)
+    name = (_text(element["Name"]) if "Name" in fields else "") or path.rpartition(".")[2]
+    _add_array(values, name, path, seconds, mat_variables, units[1] or None)
+
+
+def _port(element: Any, path: str) -> str:
+    """Block and port that a signal of a Dataset was logged at; `path` where it names none."""
+    block = element["BlockPath"]
+    while isinstance(block, np.ndarray) and block.dtype == object and block.size:
+        block = block.ravel()[0]
+    port = _number(element["PortIndex"])
+    return f"{_text(block)}:{1 if port is None else port:.0f}" if _text(block) else path
+
+
+def _nested_text(value: Any) -> str:
+    """A text that a struct holds as its ``Value``, or the text itself."""
+    if isinstance(value, np.ndarray) and value.dtype.names and "Value" in value.dtype.names and value.size:
+        return _text(value.ravel()[0]["Value"])
+    return _text(value)
+
+
 def _walk_table(table: pd.DataFrame, path: str, mat_variables: MatVariables) -> None:
     time = None
     if isinstance(table.index, pd.TimedeltaIndex | pd.DatetimeIndex):
@@ -172,6 +235,8 @@ def _walk_object(value: MatlabOpaque, name: str, path: str, mat_variables: MatVa
         return
     if value.classname == "timeseries" or {"Data_", "TimeInfo"} <= set(props):
         _add_timeseries(props, name, path, mat_variables)
+    elif value.classname == "iddata":
+        _add_iddata(props, mat_variables)
     elif "Values" in props:
         _walk(props["Values"], _text(props.get("Name")) or name, path, None, mat_variables)
     else:
@@ -200,6 +265,35 @@ def _add_timeseries(props: dict[str, Any], name: str, path: str, mat_variables: 
     unit = _timeseries_unit(props.get("DataInfo"))
     series_name = _text(props.get("Name"))
     _add_array(data, series_name if series_name and series_name != "unnamed" else name, path, time, mat_variables, unit)
+
+
+def _add_iddata(props: dict[str, Any], mat_variables: MatVariables) -> None:
+    """Inputs and outputs of System Identification Toolbox, under the names that it gives them."""
+    inner = props.get("Data_")
+    facts = props | (inner.properties if isinstance(inner, MatlabOpaque) and isinstance(inner.properties, dict) else {})
+    factor = _SECONDS.get(_text(facts.get("TimeUnit_")).lower(), 1.0)
+    stamps, step = np.asarray(facts.get("SamplingInstants", np.empty(0))), _number(facts.get("Ts"))
+    start = _number(facts.get("Tstart"))
+    for part in ("Input", "Output"):
+        data = np.asarray(facts.get(f"{part}Data", np.empty(0)))
+        if data.dtype == object:
+            # A cell an experiment, each with a time of its own.
+            mat_variables.experiments = max(mat_variables.experiments, data.size)
+            continue
+        if data.dtype.kind not in "fiub" or data.ndim != 2 or not len(data):
+            continue
+        time = stamps.ravel() * factor if stamps.dtype.kind == "f" and stamps.size == len(data) else None
+        if time is None and step is not None and step > 0:
+            time = _even(start or 0.0, step, len(data), factor)
+        names, units = (_texts(facts.get(f"{part}{what}_")) for what in ("Name", "Unit"))
+        for i in range(data.shape[1]):
+            name = names[i] if i < len(names) and names[i] else f"{part.lower()}_{i + 1}"
+            unit = units[i] if i < len(units) else ""
+            mat_variables.signals.append(Part(name, data[:, i], time, unit or None, f"{part.lower()}.{name}"))
+
+
+def _texts(value: Any) -> list[str]:
+    return [_text(item) for item in np.asarray(value if value is not None else np.empty(0)).ravel()]
 
 
 def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:

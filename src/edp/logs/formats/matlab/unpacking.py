@@ -16,6 +16,7 @@ from edp.errors import DataError, brief
 from edp.logs.formats.matlab.check import check_size
 from edp.logs.formats.matlab.library import matio
 from edp.logs.formats.matlab.objects import collect
+from edp.logs.formats.matlab.sigstream import place_streams, variable_names
 from edp.logs.formats.matlab.variables import INFO, MAGIC, MatVariables, is_v4
 from edp.storage.memory import announce
 
@@ -62,7 +63,13 @@ def _load(path: Path) -> dict[str, Any]:
             if is_v4(head):
                 variables = scipy.io.loadmat(str(path))
             else:
-                variables = matio.load_from_mat(str(path), add_table_attrs=True)
+                # The library takes the group of streamed signals for a variable of no class.
+                streamed = variable_names(path)
+                variables = matio.load_from_mat(str(path), add_table_attrs=True, variable_names=streamed)
+                if streamed is not None:
+                    place_streams(path, variables)
+        except DataError:
+            raise
         except Exception as error:
             # The parsers meet damaged bytes with any exception there is; every one means the same to the user.
             raise DataError(

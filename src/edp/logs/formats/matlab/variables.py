@@ -34,6 +34,7 @@ class MatVariables:
         repeated: names that several columns have, with the names that tell them apart.
         names: of the variables.
         info: EDP's facts, a text; None where the file has none.
+        experiments: in one ``iddata``; those of more than one are not read.
     """
 
     signals: list[Part] = field(default_factory=list)
@@ -41,6 +42,7 @@ class MatVariables:
     repeated: dict[str, list[str]] = field(default_factory=dict)
     names: list[str] = field(default_factory=list)
     info: str | None = None
+    experiments: int = 1
 
 
 def is_v4(head: bytes) -> bool:
