@@ -335,10 +335,9 @@ def covering() -> tuple[str, ...]:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """An argument `structure` runs a test for every structure; with `form`, in several forms that it agrees to.
 
-    Backbones alone and with full slots take every form; the others every fifth, each from another start, so that all
-    activations, horizons and modes still meet every block. With the mark
-    `covering`, structures beyond `COVERING` are slow. `make check` takes the covering ones alone, each in every fifth
-    form.
+    Each takes every fifth form, neighbours from another start, so that all activations, horizons and modes meet every
+    block. Backbones alone and with full slots take the other forms, too, which are slow. With the mark `covering`,
+    structures beyond `COVERING` are slow. `make check` takes the covering ones alone.
     """
     quick = metafunc.config.getoption("--no-processes")
     if {"structure", "form"} <= set(metafunc.fixturenames):
@@ -347,11 +346,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
             if quick and structure not in COVERING:
                 continue
             agreed = forms_of(structure)
-            every = not quick and ("+" not in structure or structure.endswith("+all"))
-            some = agreed if every else agreed[number % 5 :: 5]
-            pairs += [(structure, form) for form in some]
-        ids = [f"{structure}-{form[0]}-{len(form[1])}-{form[2]}" for structure, form in pairs]
-        metafunc.parametrize(("structure", "form"), pairs, ids=ids)
+            fast = agreed[number % 5 :: 5]
+            every = "+" not in structure or structure.endswith("+all")
+            for form in agreed if every else fast:
+                name = f"{structure}-{form[0]}-{len(form[1])}-{form[2]}"
+                marks = () if form in fast else pytest.mark.slow
+                pairs.append(pytest.param(structure, form, id=name, marks=marks))
+        metafunc.parametrize(("structure", "form"), pairs)
     elif "structure" in metafunc.fixturenames:
         fast = COVERING if quick or metafunc.definition.get_closest_marker("covering") else STRUCTURES
         marks = {name: () if name in fast else pytest.mark.slow for name in STRUCTURES}

@@ -9,6 +9,7 @@ from edp.training.spec import TrainingSpec
 from edp.workflows.transfer.strategies import LowRank
 
 
+@pytest.mark.covering
 def test_changes_begin_at_nothing_and_are_added_at_the_end(structure, predictor_of, rows_of):
     start = predictor_of(structure)
     net = copy.deepcopy(start)

@@ -53,6 +53,7 @@ def run(predictor, x, state=None):
         return predictor(x, predictor.initial_state(len(x), x) if state is None else state)
 
 
+@pytest.mark.covering
 def test_a_rounded_network_obeys_the_streaming_contract_and_is_left_as_it_was(structure, predictor_of):
     predictor = predictor_of(structure)
     before = copy.deepcopy(predictor.state_dict())
@@ -72,6 +73,7 @@ def test_a_rounded_network_obeys_the_streaming_contract_and_is_left_as_it_was(st
     assert all(torch.equal(value, before[name]) for name, value in after.items())
 
 
+@pytest.mark.covering
 def test_what_is_left_lies_on_the_grid_of_a_static_quantisation(structure, predictor_of):
     """Every weight of a graph's multiply-accumulates, with a step for each output row, folded ones too."""
     predictor = predictor_of(structure)
@@ -92,6 +94,7 @@ def test_what_is_left_lies_on_the_grid_of_a_static_quantisation(structure, predi
             torch.testing.assert_close(exact, levels, rtol=0, atol=2e-3)
 
 
+@pytest.mark.covering
 def test_gradients_are_those_of_the_rounded_weights(structure, predictor_of):
     """Straight through: the gradient at the rounded weights, as if they were the ones that training moves."""
     predictor = predictor_of(structure)

@@ -1,13 +1,19 @@
-"""What was compiled is kept between runs, by content: `.pytest_cache/compiled`, which `make clean` removes."""
+"""What was compiled is kept between runs, by content: `.pytest_cache/compiled`, which `make clean` removes.
+
+A whole call is known by its arguments and every file that it may read. One that is new is divided: each C file is known
+by its preprocessed text, so that the runtime, which every exported folder has, is compiled once for each set of flags.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +22,13 @@ from typing import Any
 
 COMPILERS = frozenset({"cc", "gcc", "clang", "arm-none-eabi-gcc", "x86_64-w64-mingw32-gcc"})
 ZIG = ("-m", "ziglang", "cc")
+LINKED = ("-l", "-L", "-Wl,", "-shared", "-static", "-rdynamic", "-nostartfiles")
+"""Beginnings of arguments of the linker, of which compilers complain where they do not link."""
+BESIDE = (
+    *("-M", "-E", "-S", "-x", "-flto", "-fprofile", "-ftest-coverage", "--coverage", "-save-temps", "-fsyntax-only"),
+    "@",
+)
+"""Beginnings of arguments that read or write more than a source and its object."""
 READ = (".c", ".h", ".inc", ".def")
 """Endings of files that a compiler may read beside those that it is given."""
 DAYS = 14
@@ -84,7 +97,7 @@ def install(cache: Path) -> None:
                 os.utime(entry)
             silence: Any = "" if options.get("text") or options.get("encoding") else b""
             return subprocess.CompletedProcess(command, 0, silence, silence)
-        done = _plain(command, **options)
+        done = _unit_by_unit(command, call, cache, options) or _plain(command, **options)
         # What is said (warnings) is kept by not keeping the program.
         if done.returncode == 0 and not done.stdout and not done.stderr and all(map(Path.is_file, call.outputs)):
             _keep(entry, call.outputs)
@@ -124,6 +137,74 @@ def call_of(command: Any, options: dict[str, Any]) -> Call | None:
     for path in _inputs([word for word in rest if folder / word not in outputs], folder):
         digest.update(f"{path.name}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
     return Call(digest.hexdigest()[:40], outputs)
+
+
+def _unit_by_unit(command: Any, call: Call, cache: Path, options: dict[str, Any]) -> Any:
+    """What the call returns, with each C file compiled on its own or taken from the cache.
+
+    None where it cannot be divided, fails or says something: the caller then runs it as it is.
+    """
+    words = [str(word) for word in command]
+    folder = Path(options.get("cwd") or Path.cwd())
+    sources = [word for word in words if word.endswith(".c") and (folder / word).is_file()]
+    if tuple(words[1:4]) == ZIG or not sources or any(word.startswith(BESIDE) for word in words[1:]):
+        return None
+    quiet = {**options, "capture_output": True}
+    with tempfile.TemporaryDirectory(dir=cache.parent if cache.parent.is_dir() else None) as scratch:
+        objects = {word: Path(scratch) / f"{number}.o" for number, word in enumerate(sources)}
+        flags = _flags_of_units(words, sources)
+        if not all(_unit([words[0], *flags], word, objects[word], cache, quiet) for word in sources):
+            return None
+        if "-c" in words:
+            for target, word in zip(call.outputs, sources, strict=True):
+                shutil.copy(objects[word], target)
+            return subprocess.CompletedProcess(command, 0, *(("",) * 2 if options.get("text") else (b"",) * 2))
+        done = _plain([str(objects.get(word, word)) for word in words], **quiet)
+    return None if done.returncode or done.stdout or done.stderr else done
+
+
+def _flags_of_units(words: Sequence[str], sources: Sequence[str]) -> list[str]:
+    """Arguments that decide what an object is, with those of the preprocessor."""
+    dropped = {*sources, "-c"}
+    pairs = itertools.pairwise(words)
+    return [
+        word
+        for before, word in pairs
+        if word not in dropped
+        and not {word, before} & {"-o", "-T"}
+        and not word.startswith(LINKED)
+        and not word.endswith((".o", ".a", ".so"))
+    ]
+
+
+def _unit(start: Sequence[str], source: str, target: Path, cache: Path, options: dict[str, Any]) -> bool:
+    """Compile a C file into `target`, or take it from the cache; false where the compiler fails or says something."""
+    text = _plain([*start, "-E", "-P", source], **{**options, "text": False, "encoding": None})
+    program = shutil.which(start[0])
+    if text.returncode or text.stderr or program is None:
+        return False
+    # What the preprocessor was told is in its text.
+    told = [
+        word
+        for before, word in itertools.pairwise(start)
+        if before not in ("-I", "-D", "-isystem") and not word.startswith(("-I", "-D", "-isystem"))
+    ]
+    digest = hashlib.sha256()
+    for part in (*_identity(program, zig=False), *told, "unit"):
+        digest.update(f"{part}\0".encode())
+    digest.update(text.stdout)
+    entry = cache / f"{digest.hexdigest()[:40]}.made"
+    if not entry.is_dir():
+        done = _plain([*start, "-c", source, "-o", str(target)], **options)
+        if done.returncode or done.stdout or done.stderr:
+            return False
+        named = target.with_name("unit.o")
+        shutil.copy(target, named)
+        _keep(entry, (named,))
+    shutil.copy(entry / "unit.o", target)
+    with contextlib.suppress(OSError):
+        os.utime(entry)
+    return True
 
 
 def _identity(program: str, zig: bool) -> tuple[str, ...]:

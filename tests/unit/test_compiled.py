@@ -56,6 +56,8 @@ def test_a_program_is_kept_and_comes_back(tmp_path, monkeypatch):
     calls = []
 
     def compiler(command, **options):
+        if "-E" in command:
+            return compiled.subprocess.CompletedProcess(command, 1, b"", b"")  # cannot be divided
         calls.append(command)
         (Path(options["cwd"]) / command[-1]).write_text(f"made {len(calls)}")
         return compiled.subprocess.CompletedProcess(command, 0, b"", b"")
@@ -75,6 +77,35 @@ def test_a_program_is_kept_and_comes_back(tmp_path, monkeypatch):
             compiled.subprocess.run(["gcc", "a.c", "-o", "a"], cwd=tmp_path / folder, capture_output=True)
         texts.append((tmp_path / folder / "a").read_text())
     assert texts == ["made 1", "made 1", "made 2"]
+
+
+def test_a_file_that_two_folders_have_is_compiled_once(tmp_path, monkeypatch):
+    done = []
+
+    def compiler(command, **options):
+        folder, way = Path(options["cwd"]), next((word for word in command if word in ("-E", "-c")), "link")
+        if way == "-E":
+            return compiled.subprocess.CompletedProcess(command, 0, (folder / command[-1]).read_bytes(), b"")
+        parts = [folder / word for word in command if word.endswith((".c", ".o"))]
+        read = parts if way == "link" else parts[:1]
+        done.append((way, *(path.read_text() for path in read), *(word for word in command[1:] if word[0] == "-")))
+        (folder / command[command.index("-o") + 1]).write_text("+".join(path.read_text() for path in read))
+        return compiled.subprocess.CompletedProcess(command, 0, b"", b"")
+
+    monkeypatch.setattr(compiled.shutil, "which", lambda _: sys.executable)
+    monkeypatch.setattr(compiled, "_plain", compiler)
+    monkeypatch.setattr(compiled.subprocess, "run", None)
+    compiled.install(tmp_path / "cache")
+    for folder, level in (("one", "-O1"), ("two", "-O1"), ("two", "-O2")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "a.c").write_text(f"own {folder}")
+        (tmp_path / folder / "runtime.c").write_text("shared")
+        command = ["gcc", level, "-I", folder, "a.c", "runtime.c", "-lm", "-o", "a"]
+        compiled.subprocess.run(command, cwd=tmp_path / folder, capture_output=True)
+        assert (tmp_path / folder / "a").read_text() == f"own {folder}+shared"
+    assert [call[1] for call in done if call[0] == "-c"] == ["own one", "shared", "own two", "own two", "shared"]
+    assert all("-lm" not in call for call in done if call[0] == "-c")
+    assert all("-lm" in call for call in done if call[0] == "link")
 
 
 def test_the_guard_refuses_processes():

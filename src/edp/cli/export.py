@@ -66,7 +66,7 @@ def export(
 
     names = (CONTROLLER, *registered_forms())
     if to not in names:
-        raise ConfigError(f"unknown export target '{to}'{closest(to, names)}; known: {', '.join(sorted(names))}")
+        raise ConfigError(f"unknown export target '{to}'{closest(to, names)}; `edp export --forms` lists them")
     monitor = holds_monitor(bundle)
     name = name or (MONITOR_NAME if monitor else CONTROLLER_NAME if to == CONTROLLER else "predictor")
     options = dict(map(_option, changes or []))

@@ -107,6 +107,8 @@ class LogsProposal:
         kinds = {guesses.get(name, Kind.GENERIC) for name in self.targets}
         if not self.proposal.of_role("command") or not kinds <= {*INTEGRAL, Kind.GENERIC}:
             return ""
+        if {*self.inputs} & {*self.targets}:  # a log whose only moving column is both has nothing that answers
+            return ""
         parts = {"commands": self.inputs, "velocities": self.targets if Kind.GENERIC in kinds else ()}
         named = "".join(
             f" --set {shlex.quote(f'channels.{part}={json.dumps(names, ensure_ascii=False)}')}"

@@ -144,7 +144,11 @@ def test_unknown_preset_machine_format_and_paths(edp, logs, tmp_path):
     refused(edp("report", tmp_path), str(tmp_path))
     refused(edp("footprint", tmp_path / "none.toml"), "none.toml")
     refused(edp("export", tmp_path, "--to", "c", "--out", run), "not a bundle", "edp train")
-    refused(edp("export", tmp_path, "--to", "see", "--out", run), "unknown export target 'see'", "known: c")
+    refused(
+        edp("export", tmp_path, "--to", "see", "--out", run),
+        "unknown export target 'see'; known: c",
+        "simulink; `edp export",
+    )
     refused(edp("export", tmp_path, "--to", "c", "--set", "opset=9", "--out", run), "'c' has no option 'opset'")
     refused(edp("export", tmp_path, "--to", "onnx", "--set", "opset=10", "--out", run), "opset 10", "9, 11, 13")
     refused(

@@ -18,8 +18,8 @@ from edp.storage import read_json
 from edp.workflows.twin import train_twin
 
 SMALL = (
-    *("twin.fit.lengths_s=[0.1, 0.3]", "twin.fit.rounds=[3, 1]", "twin.fit.starts=1", "twin.fit.ticks=1500"),
-    *("twin.fit.final_rounds=1", "twin.fit.final_ticks=1500"),
+    *("twin.fit.lengths_s=[0.1, 0.3]", "twin.fit.rounds=[1, 1]", "twin.fit.starts=1", "twin.fit.ticks=600"),
+    *("twin.fit.final_rounds=1", "twin.fit.final_ticks=600"),
     *("twin.fit.validation_s=1", "twin.fit.validation_runs=2", "twin.inertia_degree=1"),
     *(
         "judge.seconds=2",

@@ -309,12 +309,21 @@ def test_twenty_thousand_columns_and_long_names(tmp_path):
         ("time,a\n" + "".join(f"{i},1\n" for i in range(50)), "no column moves"),
         ("time,a\n0,1\n", "two rows or more"),
         ("time,a\n" + "".join(f"{i},on\n" for i in range(50)), "no column moves"),
+        # Recordings hold single precision, in which these are infinite.
+        ("time,a,b\n" + "".join(f"{i},{i % 7}e300,{-i}e305\n" for i in range(50)), "no column moves"),
     ],
 )
 def test_nothing_to_learn_is_one_error(tmp_path, text, why):
     (tmp_path / "x.csv").write_text(text)
     with pytest.raises(DataError, match=why):
         propose(tmp_path / "x.csv")
+
+
+def test_a_plant_model_is_not_named_where_one_channel_would_command_and_answer(tmp_path):
+    (tmp_path / "x.csv").write_text("time,a,b\n" + "".join(f"{i},{i // 20 * 7 % 5},\n" for i in range(400)))
+    proposal = propose(tmp_path / "x.csv")
+    assert (proposal.inputs, proposal.targets) == (("a",), ("a",))
+    assert proposal.plant_command(tmp_path) == ""
 
 
 def test_a_data_set_file_is_no_log(tmp_path):

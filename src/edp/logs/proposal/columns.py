@@ -260,7 +260,7 @@ def _ranges(length: int, first: int, later: int) -> list[tuple[int, int]]:
 
 
 def _read(signals: Sequence[RawSignal], start: int, stop: int) -> list[Column]:
-    """Rows of columns, those of one table in one go; each float64."""
+    """Rows of columns, those of one table in one go; each float64, with NaN for what no recording can hold."""
     columns_by_id: dict[int, Column] = {}
     tables: dict[int, list[RawSignal]] = {}
     for signal in signals:
@@ -275,7 +275,9 @@ def _read(signals: Sequence[RawSignal], start: int, stop: int) -> list[Column]:
             for i, signal in enumerate(group):
                 columns = [np.asarray(part[i], dtype=np.float64) for part in parts]
                 columns_by_id[id(signal)] = np.concatenate(columns) if columns else np.empty(0)
-    return [np.where(np.isfinite(columns_by_id[id(signal)]), columns_by_id[id(signal)], np.nan) for signal in signals]
+    # Recordings hold single precision: larger numbers are as infinite there as they are said to be when they are read.
+    read = [columns_by_id[id(signal)] for signal in signals]
+    return [np.where(np.abs(values) <= np.finfo(np.float32).max, values, np.nan) for values in read]
 
 
 def _pieces(signals: Sequence[RawSignal], ranges: Sequence[tuple[int, int]]) -> list[list[NDArray[np.float64]]]:

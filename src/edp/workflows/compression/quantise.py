@@ -9,7 +9,7 @@ from edp.errors import ExportError
 from edp.export.c.sizes import constant_bytes
 from edp.networks.integer import integer_predictor
 from edp.networks.running import mean_error
-from edp.storage import write_bytes, write_json
+from edp.storage import check_writable, write_bytes, write_json
 from edp.storage.runs import RunFolder
 from edp.training import save_bundle
 from edp.workflows.train_evaluate import trained_run
@@ -30,7 +30,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
 
     Raises:
         EdpError: not a run folder, a network without an integer form or already in integer form, or a folder that
-            holds another run.
+            holds another run or cannot be written, which is seen before anything is computed.
     """
     folder = Path(run)
     bundle, _, provenance, data = trained_run(folder)
@@ -38,6 +38,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
     if (Path(out) / "run.json").exists():
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
+    check_writable(out)
     integer_network = integer_predictor(bundle.predictor, data.train, ticks)
     # Both errors on the validation part, so that the loss by rounding is not mixed with other data.
     errors = {

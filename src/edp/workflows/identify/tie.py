@@ -28,6 +28,9 @@ STEP = 1e-4
 FARTHEST = 12.0
 """Deviations beyond which no number is moved."""
 MOST_ITERATIONS, ENOUGH = 60, 1e-12
+SETTLED = 0.01
+"""Squared plausible deviations that a step must win: what is left moves no coordinate by much of a deviation, and free
+runs refine it."""
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
 
 
@@ -162,7 +165,7 @@ def nearest(tie: MachineTie, numbers: Doubles, information: Doubles, prior: floa
                 theta, least, damping = tried, new, max(damping / 5.0, LEAST_DAMPING)
                 break
             damping *= 4.0
-        if before - least <= ENOUGH * max(least, ENOUGH):
+        if before - least <= max(ENOUGH * max(least, ENOUGH), SETTLED * prior):
             break
     return theta
 
