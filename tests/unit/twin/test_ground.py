@@ -36,7 +36,7 @@ def twin():
 
 @pytest.fixture(scope="module")
 def law():
-    return DragLaw(NUMBERS, 0.1 * np.abs(NUMBERS), float(MACHINE.bodies.length[2]), GEOMETRY.ground_m, 0.0)
+    return DragLaw(NUMBERS, 0.1 * np.abs(NUMBERS), float(MACHINE.bodies.length[2]), GEOMETRY.ground_m)
 
 
 def strokes_of(poses):
@@ -61,7 +61,7 @@ def passes(count=6, ticks=150, depth=0.15, seed=0):
 def test_the_tip_and_its_depth_are_those_of_the_machine(twin, law):
     [(strokes, velocities)] = passes(1)
     tips, terms = np.empty((len(strokes), 2)), np.empty((len(strokes), contact.NUMBERS, 3))
-    contact.follow(law._front(twin), strokes, velocities, law.uneven_m, law._level(twin), tips, terms)
+    contact.follow(law._front(twin), strokes, velocities, law._level(twin), tips, terms)
     poses = GEOMETRY.tip(strokes[:, np.argsort(PLACES)])
     # Outwards nothing is cut, so that depth is that below level ground.
     assert tips[:, 0] == pytest.approx(GEOMETRY.ground_m - poses[:, 1], abs=1e-4)
@@ -75,7 +75,7 @@ def test_a_ground_only_brakes_whatever_its_numbers(twin, law):
     slopes = -1e-6 * np.eye(3)
     for _ in range(50):
         numbers = np.concatenate([rng.uniform(0.0, 2e5, contact.ACROSS), rng.uniform(-2e5, 2e5, 1)])
-        ground = replace(law, numbers=numbers, uneven_m=rng.choice([0.0, 0.05])).contact(twin)
+        ground = replace(law, numbers=numbers).contact(twin)
         strokes = strokes_of([rng.uniform(4.5, 7.0), GEOMETRY.ground_m - rng.uniform(0.01, 0.3), np.radians(-80.0)])
         free = rng.uniform(-0.4, 0.4, 3)
         assert ground.touches(strokes, free)
@@ -112,13 +112,12 @@ def test_a_law_is_found_again_in_its_own_forces(twin, law):
     logs = []
     for strokes, velocities in passes(10):
         tips, terms = np.empty((len(strokes), 2)), np.empty((len(strokes), contact.NUMBERS, 3))
-        contact.follow(law._front(twin), strokes, velocities, law.uneven_m, law._level(twin), tips, terms)
+        contact.follow(law._front(twin), strokes, velocities, law._level(twin), tips, terms)
         lagged = np.zeros((len(strokes), 3))
         for t in range(1, len(strokes)):
             lagged[t] = lagged[t - 1] + 0.3 * (law.numbers @ terms[t] - lagged[t - 1])
         logs.append((strokes, velocities, lagged + 500.0 * rng.normal(size=lagged.shape)))
     found = DragLaw.fitted(twin, logs, "m22")
-    assert found.uneven_m == 0.0
     assert found.explained(twin, logs) > 0.98
     edges = [contact.INWARDS, contact.OUTWARDS, contact.DOWN]
     assert found.numbers[edges] == pytest.approx(law.numbers[edges], rel=0.3)
@@ -191,7 +190,6 @@ def test_a_bundle_keeps_its_ground_and_exports_refuse_it(twin, law, tmp_path):
         ({"bucket_m": True}, "no machine has"),
         ({"bucket_m": 1e9}, "no machine has"),
         ({"surface_m": None}, "no machine has"),
-        ({"uneven_m": -0.01}, "no machine has"),
     ],
 )
 def test_a_damaged_ground_is_one_error(changes, says, twin, law, tmp_path):

@@ -35,8 +35,6 @@ INWARDS, OUTWARDS, DOWN, UP, ACROSS = 0, 3, 6, 9, 12
 """First of the numbers of each direction: of the edge, by depth and by its square; across has those by depth alone."""
 NUMBERS = 13
 """In which forces are linear."""
-CLEAR = 3.0
-"""Deviations of the ground above which it is not met."""
 ROUNDS = 4
 """Of the velocity at the end of a tick and the damper that belongs to it."""
 
@@ -98,18 +96,6 @@ def depth_at(tip: Array, v_x: float, profile: Array) -> float:
 
 
 @inner
-def met(depth: float, uneven: float) -> float:
-    """Mean depth (m) of a tip at a depth below the middle of a ground with this deviation (m), above ground none."""
-    if depth <= -CLEAR * uneven:
-        return 0.0
-    if uneven <= 0.0 or depth >= CLEAR * uneven:
-        return depth
-    z = depth / uneven
-    bell = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-    return uneven * bell + depth * 0.5 * (1.0 + math.erf(z / math.sqrt(2.0)))
-
-
-@inner
 def size_of(numbers: Array, first: int, depth: float) -> float:
     """Force (N) of one direction at a depth (m)."""
     return float(
@@ -118,9 +104,8 @@ def size_of(numbers: Array, first: int, depth: float) -> float:
 
 
 @inner
-def dampers(numbers: Array, uneven: float, below: float, v_x: float, v_y: float) -> tuple[float, float, float]:
-    """Along x, along y and across, N s/m, of a tip `below` uneven ground (m) and at a velocity (m/s)."""
-    depth = met(below, uneven)
+def dampers(numbers: Array, depth: float, v_x: float, v_y: float) -> tuple[float, float, float]:
+    """Along x, along y and across, N s/m, of a tip at a depth below ground (m) and at a velocity (m/s)."""
     if depth <= 0.0:
         return 0.0, 0.0, 0.0
     slow = 1.0 / math.sqrt(v_x * v_x + v_y * v_y + CREEP * CREEP)
@@ -144,7 +129,7 @@ def hold(
     strokes: Array,
     free: Array,
     slopes: Array,
-    law: tuple[Array, float],
+    numbers: Array,
     memory: tuple[Array, Array],
     forces: Array,
 ) -> None:
@@ -155,7 +140,7 @@ def hold(
         strokes: before the tick ``(actuator,)``, m.
         free: velocities after it without any ground ``(actuator,)``, m/s.
         slopes: of these by a force against each ``(actuator, actuator)``, m/s by N.
-        law: its numbers ``(NUMBERS,)`` and the deviation of the ground, m.
+        numbers: of the law ``(NUMBERS,)``.
         memory: profile, which is cut, and x of the tip before ``(1,)``.
         forces: written ``(actuator,)``, N.
     """
@@ -177,7 +162,7 @@ def hold(
                     gives[a, b] -= by[a, i] * slopes[i, j] * by[b, j]
     free_x, free_y, f_x, f_y = w_x, w_y, 0.0, 0.0
     for _ in range(ROUNDS):
-        d_x, d_y, across = dampers(law[0], law[1], depth_at(tip, w_x, profile), w_x, w_y)
+        d_x, d_y, across = dampers(numbers, depth_at(tip, w_x, profile), w_x, w_y)
         # (1 + gives D) w = free, D = [[d_x, across], [-across, d_y]].
         xx, xy = 1.0 + gives[0, 0] * d_x - gives[0, 1] * across, gives[0, 0] * across + gives[0, 1] * d_y
         yx, yy = gives[1, 0] * d_x - gives[1, 1] * across, 1.0 + gives[1, 0] * across + gives[1, 1] * d_y
@@ -193,7 +178,6 @@ def follow(
     front: tuple[Array, float],
     strokes: Array,
     velocities: Array,
-    uneven: float,
     profile: Array,
     tips: Array,
     terms: Array,
@@ -204,7 +188,6 @@ def follow(
         front: as in `hold`.
         strokes: ``(tick, actuator)``, m.
         velocities: ``(tick, actuator)``, m/s.
-        uneven: deviation of the ground, m.
         profile: cut along the log.
         tips: written: depth (m) and speed (m/s) ``(tick, 2)``.
         terms: written ``(tick, NUMBERS, actuator)``, N by each number.
@@ -225,16 +208,16 @@ def follow(
         for k in range(NUMBERS):
             one[:] = 0.0
             one[k] = 1.0
-            d_x, d_y, across = dampers(one, uneven, tips[t, 0], w_x, w_y)
+            d_x, d_y, across = dampers(one, tips[t, 0], w_x, w_y)
             for i in range(n):
                 terms[t, k, i] = by[0, i] * (d_x * w_x + across * w_y) + by[1, i] * (d_y * w_y - across * w_x)
 
 
 @compiled
-def touches(front: tuple[Array, float], strokes: Array, free: Array, uneven: float, profile: Array) -> bool:
+def touches(front: tuple[Array, float], strokes: Array, free: Array, profile: Array) -> bool:
     """Whether the tip may be in the ground; arguments are those of `hold` and `follow`."""
     tip, by, w_x = np.empty(2), np.empty((2, len(strokes))), 0.0
     tip_at(front[0], front[1], strokes, tip, by)
     for i in range(len(strokes)):
         w_x += by[0, i] * free[i]
-    return met(depth_at(tip, w_x, profile), uneven) > 0.0
+    return depth_at(tip, w_x, profile) > 0.0

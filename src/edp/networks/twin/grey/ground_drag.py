@@ -1,14 +1,14 @@
 """Ground law `drag`: forces against the edge of the bucket by direction and depth, in ground that the edge cuts down.
 
-At a mean depth d below uneven ground that the edge has not cut yet, and a velocity w of the tip::
+At a depth d below ground that the edge has not cut yet, and a velocity w of the tip::
 
     F_x = -w_x / |w| A_x(d) - w_y / |w| c d,  F_y = -w_y / |w| A_y(d) + w_x / |w| c d
     A(d) = a min(d / 5 cm, 1) + b d + e d^2
 
 A has numbers of its own inwards, outwards, downwards and upwards, none below zero; c acts inwards only. The first part
 is the edge, which meets the same strength wherever it is, the others are what is cut loose (the earthmoving equation is
-quadratic in the depth). |w| is smoothed over `CREEP`. Heights of the ground have a deviation about its level, which no
-log tells place by place: d is the mean over them, so that forces begin softly.
+quadratic in the depth). |w| is smoothed over `CREEP`. The ground is level before it is cut: a mean over uneven heights
+explained forces a little better, but began softly, and loops hunted on it that the machine damps (docs/findings.md).
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ BLOCK = 200
 """Ticks whose errors are taken as one: they lie close together."""
 ROUNDS, HUBER = 4, 1.345
 LEAST_ROWS = 500
-METRES, BUCKET, HEIGHT = span(-20.0, 20.0), above(0.0, 20.0), span(0.0, 1.0)
-UNEVEN_M = (0.0, 0.02, 0.04, 0.06)
-"""Deviations of the ground among which logs choose."""
+METRES, BUCKET = span(-20.0, 20.0), above(0.0, 20.0)
 
 
 class DragContact(GroundContact):
@@ -54,21 +52,21 @@ class DragContact(GroundContact):
 
     Args:
         front: linkage and length of the bucket.
-        law: its numbers and the deviation of the ground.
+        numbers: of the law.
         profile: heights of the ground, level.
     """
 
-    def __init__(self, front: tuple[Array, float], law: tuple[Array, float], profile: Array) -> None:
-        self._front, self._law, self._profile = front, law, profile
+    def __init__(self, front: tuple[Array, float], numbers: Array, profile: Array) -> None:
+        self._front, self._numbers, self._profile = front, numbers, profile
         self._last = np.full(1, -np.inf)
 
     def touches(self, strokes: Array, free: Array) -> bool:
-        return bool(contact.touches(self._front, strokes, free, self._law[1], self._profile))
+        return bool(contact.touches(self._front, strokes, free, self._profile))
 
     def forces(self, strokes: Array, free: Array, slopes: Array) -> Array:
         forces = np.empty(len(strokes))
         memory = (self._profile, self._last)
-        contact.hold(self._front, strokes, free, slopes, self._law, memory, forces)
+        contact.hold(self._front, strokes, free, slopes, self._numbers, memory, forces)
         return forces
 
 
@@ -82,14 +80,12 @@ class DragLaw(GroundLaw):
         deviations: their standard errors.
         bucket_m: from the bucket's pin to the edge.
         surface_m: of level ground in the frame of the boom foot.
-        uneven_m: deviation of its heights.
     """
 
     numbers: Array
     deviations: Array
     bucket_m: float
     surface_m: float
-    uneven_m: float
 
     @classmethod
     def fitted(cls, twin: GreyTwin, logs: Logs, machine: str) -> DragLaw:
@@ -99,21 +95,16 @@ class DragLaw(GroundLaw):
 
         own = load_machine(machine)
         blank = np.zeros(contact.NUMBERS)
-        empty = cls(blank, blank, float(own.bodies.length[-1]), -own.chassis.boom_foot_height, 0.0)
-        tried = [replace(empty, uneven_m=uneven)._with_numbers(twin, logs) for uneven in UNEVEN_M]
-        return max(tried, key=lambda law: law.explained(twin, logs))
-
-    def _with_numbers(self, twin: GreyTwin, logs: Logs) -> DragLaw:
-        """The law with numbers that suit its unevenness."""
-        terms, forces, blocks = self._rows_of(twin, logs)
+        empty = cls(blank, blank, float(own.bodies.length[-1]), -own.chassis.boom_foot_height)
+        terms, forces, blocks = empty._rows_of(twin, logs)
         if len(forces) < LEAST_ROWS:
             raise DataError(
-                f"the tip of the bucket moves below the surface ({self.surface_m:.2f} m from the boom foot) in "
+                f"the tip of the bucket moves below the surface ({empty.surface_m:.2f} m from the boom foot) in "
                 f"{len(forces)} ticks of the training part; {LEAST_ROWS} must hold: give logs of work in the ground, "
                 "or another machine in twin.linkage"
             )
         numbers, deviations = _solved(terms, forces, blocks)
-        return replace(self, numbers=numbers, deviations=deviations)
+        return replace(empty, numbers=numbers, deviations=deviations)
 
     def explained(self, twin: GreyTwin, logs: Logs) -> float:
         terms, forces, _ = self._rows_of(twin, logs)
@@ -123,7 +114,7 @@ class DragLaw(GroundLaw):
         return float(1.0 - np.sum(left**2) / np.sum(forces**2))
 
     def contact(self, twin: GreyTwin) -> DragContact:
-        return DragContact(self._front(twin), (self.numbers, self.uneven_m), self._level(twin))
+        return DragContact(self._front(twin), self.numbers, self._level(twin))
 
     def plain(self) -> dict[str, Any]:
         # JSON has no infinity.
@@ -133,21 +124,20 @@ class DragLaw(GroundLaw):
             "deviations": deviations,
             "bucket_m": self.bucket_m,
             "surface_m": self.surface_m,
-            "uneven_m": self.uneven_m,
         }
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> DragLaw:
         numbers = np.array(plain["numbers"], float)
         deviations = np.array([np.inf if value is None else value for value in plain["deviations"]], float)
-        bucket, surface, uneven = plain["bucket_m"], plain["surface_m"], plain["uneven_m"]
+        bucket, surface = plain["bucket_m"], plain["surface_m"]
         if numbers.shape != (contact.NUMBERS,) or deviations.shape != numbers.shape:
             raise ValueError(f"its ground has not {contact.NUMBERS} numbers")
         if not np.isfinite(numbers).all() or (numbers[: contact.ACROSS] < 0.0).any() or not (deviations >= 0.0).all():
             raise ValueError("its ground has a number that is negative or not finite")
-        if not BUCKET.holds(bucket) or not METRES.holds(surface) or not HEIGHT.holds(uneven):
+        if not BUCKET.holds(bucket) or not METRES.holds(surface):
             raise ValueError("its ground has a bucket or a surface that no machine has")
-        return cls(numbers, deviations, float(bucket), float(surface), float(uneven))
+        return cls(numbers, deviations, float(bucket), float(surface))
 
     def names(self) -> list[tuple[str, str]]:
         parts = (("edge", "N"), ("by_depth", "N/m"), ("by_depth_squared", "N/m^2"))
@@ -166,7 +156,7 @@ class DragLaw(GroundLaw):
         kept: list[tuple[Array, Array, NDArray[np.int64]]] = []
         for number, (strokes, velocities, forces) in enumerate(logs):
             tips, terms = np.empty((len(strokes), 2)), np.empty((len(strokes), contact.NUMBERS, strokes.shape[1]))
-            contact.follow(self._front(twin), strokes, velocities, self.uneven_m, self._level(twin), tips, terms)
+            contact.follow(self._front(twin), strokes, velocities, self._level(twin), tips, terms)
             depths, speeds = tips.T
             # Estimates follow what acts with a lag; so do the terms.
             terms = lfilter([LOG_SHARE], [1.0, LOG_SHARE - 1.0], terms, axis=0)
