@@ -49,35 +49,29 @@ def fold_ridge(
         column_sets: sets of columns to choose from, the simplest first.
     """
     outputs, columns = targets.shape[-1], table.shape[1]
-    of_fold = np.broadcast_to(targets, (folds.count, len(table), outputs))
-    rows_of = [folds.left_out(fold) for fold in range(folds.count)]
-    trained = [_moments(table[rows], own[rows]) for rows, own in zip(folds.training, of_fold, strict=True)]
-    judged = [_moments(table[rows], own[rows]) for rows, own in zip(rows_of, of_fold, strict=True)]
-    shares = [len(rows) / len(table) for rows in rows_of]
+    trained, judged = _fold_moments(table, targets, folds)
+    shares = np.bincount(folds.owner, minlength=folds.count) / len(table)
     best = np.full(outputs, np.inf)
     weights = np.zeros((folds.count, columns, outputs))
     intercepts = np.zeros((folds.count, outputs))
     for chosen in column_sets:
-        spectra = [np.linalg.eigh(moments.covariance[np.ix_(chosen, chosen)]) for moments in trained]
+        spectra = [_Spectrum.of(moments.of_columns(chosen)) for moments in trained]
+        others = [moments.of_columns(chosen) for moments in judged]
         for penalty in sorted(PENALTIES, reverse=True):  # the strongest first: a weaker one must earn its place
-            loss, solved, shifts = np.zeros(outputs), [], []
-            for moments, (values, vectors), others, share in zip(trained, spectra, judged, shares, strict=True):
-                # Rounding can leave eigenvalues of a singular matrix just below zero.
-                inverse = 1.0 / (np.maximum(values, 0.0) + penalty)
-                weight = vectors @ (inverse[:, None] * (vectors.T @ moments.cross[chosen]))
-                shift = moments.level - moments.mean[chosen] @ weight
-                solved.append(weight)
-                shifts.append(shift)
-                loss += share * others.squared_error(chosen, weight, shift)
+            solved = [spectrum.solve(penalty) for spectrum in spectra]
+            losses = [share * one.squared_error(*maps) for share, one, maps in zip(shares, others, solved, strict=True)]
+            loss = np.sum(losses, axis=0)
             better = loss < best * (1.0 - LEAST_GAIN)
             if better.any():
                 best[better] = loss[better]
                 # Columns of the set chosen before must not stay beside those of the new one.
                 weights[:, :, better] = 0.0
-                weights[np.ix_(np.arange(folds.count), chosen, np.flatnonzero(better))] = np.stack(solved)[:, :, better]
-                intercepts[:, better] = np.stack(shifts)[:, better]
+                own = np.stack([weight for weight, _ in solved])
+                weights[np.ix_(np.arange(folds.count), chosen, np.flatnonzero(better))] = own[:, :, better]
+                intercepts[:, better] = np.stack([shift for _, shift in solved])[:, better]
     left_out = np.zeros((len(table), outputs))
-    for rows, weight, intercept in zip(rows_of, weights, intercepts, strict=True):
+    for fold, (weight, intercept) in enumerate(zip(weights, intercepts, strict=True)):
+        rows = folds.left_out(fold)
         left_out[rows] = table[rows] @ weight + intercept
     return FoldRidge(weights, intercepts, left_out)
 
@@ -99,22 +93,134 @@ class TableMoments:
     level: DoubleArray
     variance: DoubleArray
 
-    def squared_error(self, chosen: NDArray[np.int64], weight: DoubleArray, shift: DoubleArray) -> DoubleArray:
-        """Mean squared error of a linear map of the columns `chosen`, ``(output,)``."""
-        bias = self.mean[chosen] @ weight + shift - self.level
-        quadratic = (weight * (self.covariance[np.ix_(chosen, chosen)] @ weight)).sum(axis=0)
-        return np.asarray(self.variance - 2.0 * (weight * self.cross[chosen]).sum(axis=0) + quadratic + bias**2)
+    def of_columns(self, chosen: NDArray[np.int64]) -> TableMoments:
+        """Those of some columns."""
+        covariance = self.covariance[np.ix_(chosen, chosen)]
+        return TableMoments(covariance, self.cross[chosen], self.mean[chosen], self.level, self.variance)
+
+    def squared_error(self, weight: DoubleArray, shift: DoubleArray) -> DoubleArray:
+        """Mean squared error of a linear map, ``(output,)``."""
+        bias = self.mean @ weight + shift - self.level
+        quadratic = (weight * (self.covariance @ weight)).sum(axis=0)
+        return np.asarray(self.variance - 2.0 * (weight * self.cross).sum(axis=0) + quadratic + bias**2)
 
 
-def _moments(table: NDArray[np.floating], targets: DoubleArray) -> TableMoments:
-    """Means and covariances, of a block at a time."""
-    rows = len(table)
-    mean, level = table.mean(axis=0, dtype=np.float64), targets.mean(axis=0)
-    covariance, cross = np.zeros((table.shape[1], table.shape[1])), np.zeros((table.shape[1], targets.shape[1]))
-    variance = np.zeros(targets.shape[1])
-    for start in range(0, rows, 16_384):  # double-precision copies of a block, not of the whole table
-        block, centred = table[start : start + 16_384] - mean, targets[start : start + 16_384] - level
-        covariance += block.T @ block / rows
-        cross += block.T @ centred / rows
-        variance += np.square(centred).sum(axis=0) / rows
-    return TableMoments(covariance, cross, mean, level, variance)
+@dataclass(frozen=True, eq=False)
+class _Spectrum:
+    """Ridge regressions of one set of rows, for any penalty.
+
+    Attributes:
+        moments: of the rows.
+        values: eigenvalues of their covariance.
+        vectors: its eigenvectors, ``(column, direction)``.
+        turned: covariances of directions and targets, ``(direction, output)``.
+    """
+
+    moments: TableMoments
+    values: DoubleArray
+    vectors: DoubleArray
+    turned: DoubleArray
+
+    @classmethod
+    def of(cls, moments: TableMoments) -> _Spectrum:
+        """That of some rows."""
+        values, vectors = np.linalg.eigh(moments.covariance)
+        # Rounding can leave eigenvalues of a singular matrix just below zero.
+        return cls(moments, np.maximum(values, 0.0), vectors, vectors.T @ moments.cross)
+
+    def solve(self, penalty: float) -> tuple[DoubleArray, DoubleArray]:
+        """Weights ``(column, output)`` and intercepts ``(output,)``."""
+        weight = self.vectors @ (self.turned / (self.values + penalty)[:, None])
+        return weight, self.moments.level - self.moments.mean @ weight
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums over rows of products, of what lies about common centres.
+
+    Attributes:
+        rows: how many.
+        squares: of columns, ``(column, column)``.
+        cross: of columns and targets, ``(column, target)``.
+        first: of the columns themselves; `level` of the targets, and `power` of their squares.
+    """
+
+    rows: int
+    squares: DoubleArray
+    cross: DoubleArray
+    first: DoubleArray
+    level: DoubleArray
+    power: DoubleArray
+
+    @classmethod
+    def none(cls, columns: int, targets: int) -> _Sums:
+        """Those of no rows."""
+        shapes = ((columns, columns), (columns, targets), (columns,), (targets,), (targets,))
+        return cls(0, *(np.zeros(shape) for shape in shapes))
+
+    def plus(self, other: _Sums, sign: int = 1) -> _Sums:
+        """Those of the rows of both, or without those of the other."""
+        pairs = [(mine, vars(other)[name]) for name, mine in vars(self).items()]
+        return _Sums(*(mine + sign * theirs for mine, theirs in pairs))
+
+    def moments(self, centre: DoubleArray, level: DoubleArray, own: slice) -> TableMoments:
+        """Means and covariances, with some of the targets; sums are about these centres."""
+        mean, height = self.first / self.rows, self.level[own] / self.rows
+        return TableMoments(
+            self.squares / self.rows - np.outer(mean, mean),
+            self.cross[:, own] / self.rows - np.outer(mean, height),
+            centre + mean,
+            level[own] + height,
+            self.power[own] / self.rows - np.square(height),
+        )
+
+
+def _fold_moments(
+    table: NDArray[np.floating], targets: DoubleArray, folds: Folds
+) -> tuple[list[TableMoments], list[TableMoments]]:
+    """Moments of the rows that each fold trains on, and of those that it leaves out.
+
+    Each row is multiplied out once for the fold that leaves it out, and once for each fold beside whose gap it lies:
+    what a fold trains on is the sum over the other folds without its gap.
+    """
+    outputs = targets.shape[-1]
+    centre, level = table.mean(axis=0, dtype=np.float64), targets.mean(axis=-2).ravel()
+    judged, gaps = [], []
+    for fold, training in enumerate(folds.training):
+        rows = folds.left_out(fold)
+        beside = np.ones(len(table), dtype=bool)
+        beside[rows] = beside[training] = False
+        judged.append(_sums(table, targets, rows, centre, level))
+        gaps.append(_sums(table, targets, np.flatnonzero(beside), centre, level))
+    every = _Sums.none(table.shape[1], len(level))
+    for one in judged:
+        every = every.plus(one)
+    own = [slice(None) if targets.ndim == 2 else slice(f * outputs, (f + 1) * outputs) for f in range(folds.count)]
+    trained = [every.plus(one, -1).plus(gap, -1) for one, gap in zip(judged, gaps, strict=True)]
+    return (
+        [sums.moments(centre, level, part) for sums, part in zip(trained, own, strict=True)],
+        [sums.moments(centre, level, part) for sums, part in zip(judged, own, strict=True)],
+    )
+
+
+def _sums(
+    table: NDArray[np.floating], targets: DoubleArray, rows: NDArray[np.int64], centre: DoubleArray, level: DoubleArray
+) -> _Sums:
+    """Sums over some rows, of a block at a time; targets of several folds lie side by side, so that columns are
+    multiplied out once, however many there are.
+    """
+    total = _Sums.none(table.shape[1], len(level))
+    for start in range(0, len(rows), 8_192):  # double-precision copies of a block, not of the whole table
+        own = rows[start : start + 8_192]
+        wide = targets[own] if targets.ndim == 2 else targets[:, own].transpose(1, 0, 2).reshape(len(own), -1)
+        block, ahead = table[own] - centre, wide - level
+        part = _Sums(
+            len(own),
+            block.T @ block,
+            block.T @ ahead,
+            block.sum(axis=0),
+            ahead.sum(axis=0),
+            np.square(ahead).sum(axis=0),
+        )
+        total = total.plus(part)
+    return total

@@ -47,7 +47,8 @@ class JudgeSpec:
     Attributes:
         baselines: names of registered baselines.
         history: samples of history that baselines may use.
-        skip: first ticks of each stretch that are not scored; None leaves out a whole window (start-up).
+        skip: first ticks of each stretch that are not scored; None leaves out a whole window (start-up), and as many
+            as baselines need of history: all are measured on the same ticks.
         seed: of the baselines' row sampling and initial weights.
     """
 
@@ -203,8 +204,11 @@ class ModelBench:
     def __init__(self, predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None:
         _check_memory(predictor, data, spec)
         self.predictor, self.data, self.spec = predictor, data, spec
-        # A whole window from reset: before that the network's memory is not filled, and baselines lack history.
-        skip = predictor.spec.window if spec.skip is None else spec.skip
+        # A whole window from reset: before that the network's memory is not filled. Baselines lack history for longer
+        # than the preset `auto` waits: without the rows in which sensors settle a rival looks far better than it is.
+        history = baseline_task(data, spec).history if spec.baselines else 0
+        started = max(predictor.spec.window, history)
+        skip = started if spec.skip is None else spec.skip
         if data.task.features.starting:  # While the start is read there is nothing to predict.
             skip = max(skip, data.task.features.starting_ticks)
         self.skip, self.ruler = skip, Ruler(data, skip)

@@ -83,5 +83,5 @@ def logged_forces(twin: GreyTwin, series: Series) -> Log:
         before, state = state, runner.step(series.inputs[tick], state, measured)
         estimate.expect(series.inputs[tick], measured, before, state)
     rows = series.targets[prefix:].astype(float)
-    known = np.isfinite(rows[:, [*speeds, *strokes]]).all(axis=1)
-    return rows[known][:, strokes], rows[known][:, speeds], forces[known]
+    measured_rows = np.isfinite(rows[:, [*speeds, *strokes]]).all(axis=1)
+    return rows[measured_rows][:, strokes], rows[measured_rows][:, speeds], forces[measured_rows]

@@ -11,7 +11,7 @@ from edp.networks import running
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.judging import UNITS, evaluate_with
 from edp.workflows.fleet.training import finetune_with
-from edp.workflows.train_evaluate import evaluate
+from edp.workflows.train_evaluate import evaluate, trained_run
 from edp.workflows.transfer import FinetuneCallbacks, FinetuneRequest, finetune
 
 
@@ -68,6 +68,17 @@ def test_a_network_run_in_parts_has_the_scores_of_one_process(run, target, tmp_p
     assert without_times(there) == without_times(here)
     # Streams side by side and sums in another order differ in their last bits alone.
     assert here["models"]["network"]["overall"] == approx_tree(whole["models"]["network"]["overall"])
+
+
+def test_all_models_are_scored_on_the_same_ticks(run):
+    bundle, _, _, data = trained_run(run)
+    assert bundle.predictor.spec.window == 10
+    bench = judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=("ridge_arx",), history=30))
+    assert bench.skip == 30
+    models = [bench.network("", 0.0), bench.baseline("ridge_arx")]
+    counts = [[scores["mean"]["count"] for scores in model.entry["overall"].values()] for model in models]
+    assert counts[0] == counts[1]
+    assert judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=())).skip == 10
 
 
 def approx_tree(value):

@@ -95,7 +95,11 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     # test looks at them either; of a short stretch most rows are still taken.
     skips = [min(net.spec.window - 1, count // 4) for count in ticks]
     stride = max(1, math.ceil((sum(ticks) - sum(skips)) / spec.rows))
-    chosen = [range(skip, count, stride) for skip, count in zip(skips, ticks, strict=True)]
+    # Logs that begin alike, as filters settle, would all give the same ticks of it: the others would be told by none.
+    firsts = [
+        skip + number % min(stride, count - skip) for number, (skip, count) in enumerate(zip(skips, ticks, strict=True))
+    ]
+    chosen = [range(first, count, stride) for first, count in zip(firsts, ticks, strict=True)]
     outputs = len(data.task.horizons) * len(data.task.targets)
     rows = sum(map(len, chosen))
     check_setting(
@@ -127,7 +131,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     # what tests there is the gap that lies beside that (`prepare`): wider ones would cost a third of what trains.
     gap = math.ceil(((net.spec.window if pieces > 1 else bank.reach) + reach) / stride)
     gap = min(gap, max(1, sum(lengths) // (4 * spec.folds * pieces)))
-    starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), skips, strict=True)
+    starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), firsts, strict=True)
     return Table(columns, targets, blocked_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
 
 

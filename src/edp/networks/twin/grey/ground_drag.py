@@ -153,7 +153,7 @@ class DragLaw(GroundLaw):
 
     def _rows_of(self, twin: GreyTwin, logs: Logs) -> tuple[Array, Array, NDArray[np.int64]]:
         """Terms ``(row, number, actuator)``, forces ``(row, actuator)`` and block of each row that a fit reads."""
-        kept: list[tuple[Array, Array, NDArray[np.int64]]] = []
+        parts: list[tuple[Array, Array, NDArray[np.int64]]] = []
         for number, (strokes, velocities, forces) in enumerate(logs):
             tips, terms = np.empty((len(strokes), 2)), np.empty((len(strokes), contact.NUMBERS, strokes.shape[1]))
             contact.follow(self._front(twin), strokes, velocities, self._level(twin), tips, terms)
@@ -163,8 +163,8 @@ class DragLaw(GroundLaw):
             clear = depths < -CLEAR_M
             bias = np.median(forces[clear], axis=0) if clear.sum() > BLOCK else np.zeros(strokes.shape[1])
             rows = np.flatnonzero((depths > LEAST_DEPTH) & (speeds > LEAST_SPEED))
-            kept.append((terms[rows], forces[rows] - bias, 1_000_000 * number + rows // BLOCK))
-        terms, forces, blocks = (np.concatenate(part) for part in zip(*kept, strict=True))
+            parts.append((terms[rows], forces[rows] - bias, 1_000_000 * number + rows // BLOCK))
+        terms, forces, blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         return terms, forces, blocks
 
 
