@@ -71,6 +71,8 @@ class Corpus:
                 write_recording(self.recording(), self.file(name), WriteOptions(layout, version))
         self.formula("honest_formula.mf4", "X1*0.001+2")
         pq.write_table(pa.table({"time": TIME, "BmUp": TIME}), self.file("honest_foreign.parquet"))
+        rows = "".join(f"{t},{'on' if t < 0.1 else 'off'}\n" for t in TIME)
+        self.file("honest_switch.csv").write_text(f"time,BmUp\n{rows}")
         scipy.io.savemat(self.file("honest_foreign.mat"), {"t": TIME, "BmUp": TIME, "s": {"time": TIME, "y": TIME}})
         self.file("honest_settings.toml").write_text("[training]\nepochs = 2\n")
         self.file("honest_map.toml").write_text("time = 't'\n[channels.BmUp]\ncolumn = 'a'\n")

@@ -96,7 +96,7 @@ def test_ragged_row_and_doubled_column(tmp_path):
     with pytest.raises(DataError, match="line 3 has 2 cells, the header has 3"):
         read_recording(path)
     path = text(tmp_path, "time,BmUp,BmUp\n0,1,2\n0.01,2,2\n0.02,3,3\n")
-    with pytest.raises(DataError, match="two columns named 'BmUp'"):
+    with pytest.raises(DataError, match="2 columns named 'BmUp'"):
         read_recording(path)
 
 

@@ -93,3 +93,44 @@ def test_inches_and_pounds_force_are_units(tmp_path):
     columns = {guess.column: guess.kind for guess in propose(path).proposal.columns}
     assert (columns["stroke"].kind, columns["stroke"].unit) == ("position", "in")
     assert (columns["force"].kind, columns["force"].unit) == ("force", "kip")
+
+
+def test_states_of_switches_are_numbers(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = [
+        f"{i / 100:.2f},{i},{'ON' if i % 3 else 'off'},{'true' if i > 9 else ''},{'dig' if i % 2 else 'on'}"
+        for i in range(60)
+    ]
+    path.write_text("time,x,pump,valve,mode\n" + "\n".join(rows) + "\n")
+    columns = {column.name: column for column in look_at_log(path).columns}
+    assert list(columns["pump"].values[:4]) == [0.0, 1.0, 1.0, 0.0]
+    assert np.isnan(columns["valve"].values[0])
+    assert columns["valve"].values[10] == 1.0
+    assert "mode" not in columns
+
+
+def test_columns_of_one_name_are_told_apart(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,lever,speed,speed\n" + "".join(f"{i / 100},{i % 5},{i},{2 * i}\n" for i in range(60)))
+    read = read_recording(path, ALL)
+    assert read.channel_names == ("lever", "column_3.speed", "column_4.speed")
+    assert read.column("column_4.speed")[3] == 6.0
+
+
+def test_raw_frames_of_a_bus_say_that_they_are_to_be_decoded(tmp_path):
+    path = tmp_path / "trace.csv"
+    path.write_text("Time,ID,DLC,Data\n" + "".join(f"{i / 100},0x1{i % 9},8,00 {i % 10}F\n" for i in range(60)))
+    with pytest.raises(DataError, match=r"raw frames of a bus .*DBC"):
+        propose(path)
+    (tmp_path / "trace.csv").unlink()
+    (tmp_path / "a.blf").write_bytes(b"LOGG")
+    with pytest.raises(DataError, match=r"1 end in '\.blf': it holds frames of a bus"):
+        find_recordings(tmp_path)
+
+
+def test_a_log_whose_end_rests_however_it_is_divided_is_said(tmp_path):
+    path = tmp_path / "a.csv"
+    steps = np.r_[np.sin(np.arange(400) / 20), np.zeros(5600)]
+    rows = [f"{i / 100:.2f},{x:.4f},{y:.4f}" for i, (x, y) in enumerate(zip(steps, np.cumsum(steps)))]
+    path.write_text("time,lever,speed\n" + "\n".join(rows) + "\n")
+    assert any("a test there says little" in note for note in propose(path).notes)

@@ -169,6 +169,23 @@ def blocks_where_time_is_uneven(
     )
 
 
+def rests_where_it_tests(
+    recordings: Sequence[Recording], channels: Sequence[str], horizons: Sequence[int], by_time: ByTime
+) -> bool:
+    """Whether the machine rests in most of what would be tested or validated, however it is divided.
+
+    Args:
+        recordings: the data set.
+        channels: what is predicted, by name.
+        horizons: in ticks.
+        by_time: how they would be divided.
+    """
+    reach = max(1, *horizons)
+    gap = HISTORY + reach
+    moving = moving_ticks(recordings, channels, reach)
+    return not any(is_even(split, recordings, gap, moving) for split in (by_time, blocks_of_motion(recordings, gap)))
+
+
 def blocks_of_motion(recordings: Sequence[Recording], gap: int) -> ByBlocks:
     """Blocks that test in turn, so that rest at one end of a recording is shared out."""
     shortest = min(recording.samples / recording.rate_hz for recording in recordings)

@@ -19,6 +19,10 @@ _ARRAYS = (
     "write its arrays as CSV or Parquet, a column a channel (in Python: pandas.DataFrame(...).to_parquet), or give "
     "them to edp.Recordings.from_arrays"
 )
+_DECODE = (
+    "it holds frames of a bus: decode them with their DBC file into signals, as MDF 4 or CSV (in Python: asammdf or "
+    "cantools)"
+)
 _EXPORT = {
     ".mldatx": (
         "only MATLAB reads MLDATX: open it in the Simulation Data Inspector, press Export and choose a MAT, Parquet or "
@@ -35,6 +39,9 @@ _EXPORT = {
     ".7z": "unpack it and give the files in it",
     ".active": "the bag was not closed (its recorder was killed): run 'rosbag reindex' and rename it to .bag",
     ".dat": "save it as MDF 4 (.mf4), MAT or CSV with your measurement tool",
+    ".blf": _DECODE,
+    ".asc": _DECODE,
+    ".trc": _DECODE,
     ".xlsx": "save the sheet as CSV",
     ".xls": "save the sheet as CSV",
     ".ods": "save the sheet as CSV",

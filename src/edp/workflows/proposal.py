@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from edp.data.even_split import blocks_where_time_is_uneven
+from edp.data.even_split import blocks_where_time_is_uneven, rests_where_it_tests
 from edp.data.splits import ByTime
 from edp.data.twin_channels import INTEGRAL
 from edp.errors import ConfigError, DataError, StorageError
-from edp.logs.proposal.columns import LogLook
+from edp.logs.proposal.columns import LogLook, holds_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
@@ -254,7 +254,12 @@ def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
         measured = proposal.of_role("command", "reference")
         if not measured:
             texts = len(proposal.look.texts)
-            unread = f", and {texts} that hold text or share a name" if texts else ""
+            unread = f", and {texts} that hold text" if texts else ""
+            if holds_frames(proposal.look):
+                raise DataError(
+                    f"'{proposal.look.path}' holds raw frames of a bus ({', '.join(proposal.look.texts[:3])}), no "
+                    "signals: decode them with their DBC file, as MDF 4 or CSV (in Python: asammdf or cantools)"
+                )
             raise DataError(
                 f"'{proposal.look.path}': no column moves (constants, counters and labels only{unread}); there is "
                 "nothing to predict: record while the machine works, and give each column a name of its own"
@@ -320,6 +325,11 @@ def _split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tu
             longer = min(look.rows / step for look in group.looks) / min(log.samples for log in logs)
             split = {"kind": "blocks", "block_s": round(blocks.block_s * max(1.0, longer), 2), "every": blocks.every}
             return split, [f"{why}: blocks of time test in turn"]
+        if rests_where_it_tests(logs, names, horizons_for(rate), ByTime()):
+            return {"kind": "time"}, [
+                "the machine moves in so small a part of this that the end, which would test, is mostly rest, and so "
+                "are blocks of it: a test there says little; record more motion, or give a part that moves"
+            ]
     return {"kind": "time"}, []
 
 

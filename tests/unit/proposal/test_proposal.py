@@ -305,7 +305,6 @@ def test_twenty_thousand_columns_and_long_names(tmp_path):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("time,a,a\n" + "".join(f"{i},{i % 3},{i}\n" for i in range(50)), "share a name"),
         ("time,a\n" + "".join(f"{i},1\n" for i in range(50)), "no column moves"),
         ("time,a\n0,1\n", "two rows or more"),
         ("time,a\n" + "".join(f"{i},on\n" for i in range(50)), "no column moves"),

@@ -82,21 +82,25 @@ class CsvFormat:
         time = None if time_name is None else _stamps(table, layout.names.index(time_name), signal_map)
         signals: dict[str, RawSignal] = {}
         sparse = set() if time is None else message_columns(table)
-        for column_index, name in enumerate(layout.names):
-            if not name or name == time_name:
+        repeated: dict[str, list[str]] = {}
+        times_named = Counter(layout.names)
+        for column_index, shared_name in enumerate(layout.names):
+            if not shared_name or shared_name == time_name:
                 continue
-            if column_index in sparse and time is not None and layout.names.count(name) == 1:
-                signals[name] = at_own_times(table, column_index, time)
-                continue
-            if name in signals:
-                signals[name] = _ambiguous(path, name, table.rows, time)
+            name = shared_name
+            if times_named[shared_name] > 1:
+                name = f"column_{column_index + 1}.{shared_name}"
+                repeated.setdefault(shared_name, []).append(name)
+            if column_index in sparse and time is not None:
+                signals[name] = at_own_times(table, column_index, name, time)
                 continue
             key = str(column_index)
             load = partial(load_column, table, key, table.rows)
             signals[name] = RawSignal(
                 name, load, table.rows, time, unit=layout.units[column_index], table=table, key=key
             )
-        return RawLog(path, signals, meta={} if table.torn_line is None else {TORN_LINE: table.torn_line})
+        meta = {} if table.torn_line is None else {TORN_LINE: table.torn_line}
+        return RawLog(path, signals, repeated=repeated, meta=meta)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write ``time_s`` and every channel as ``name [unit]``; numbers read back bit for bit."""
@@ -367,13 +371,6 @@ def _stated_columns(
             f"{len(signal_map.columns)}: name all {width} in order"
         )
     return tuple(signal_map.columns), (None,) * width
-
-
-def _ambiguous(path: Path, name: str, samples: int, time: Column | None) -> RawSignal:
-    def load() -> Column:
-        raise DataError(f"'{path}' has two columns named '{name}'; rename one of them")
-
-    return RawSignal(name, load, samples, time)
 
 
 def _stamps(table: CsvTable, column_index: int, signal_map: SignalMap) -> Column:

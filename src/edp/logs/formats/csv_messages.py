@@ -36,10 +36,11 @@ def message_columns(table: CsvTable) -> set[int]:
     return sparse if len(sparse) > 1 and full <= 1 else set()
 
 
-def at_own_times(table: CsvTable, column_index: int, time: Column) -> RawSignal:
+def at_own_times(table: CsvTable, column_index: int, name: str, time: Column) -> RawSignal:
     """A column at the rows that hold a number of it."""
     values = load_column(table, str(column_index), table.rows)
     present = np.isfinite(values)
     values = values[present]
-    name, unit = table.layout.names[column_index], table.layout.units[column_index]
-    return RawSignal(name, partial(np.asarray, values), len(values), time[present], unit=unit)
+    return RawSignal(
+        name, partial(np.asarray, values), len(values), time[present], unit=table.layout.units[column_index]
+    )

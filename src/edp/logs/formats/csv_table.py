@@ -62,6 +62,8 @@ def is_number(cell: str, decimal: str = ".") -> bool:
     return True
 
 
+_ON, _OFF = ("true", "on", "yes", "ein", "wahr"), ("false", "off", "no", "aus", "falsch")
+"""Words for the states of a switch, in small letters."""
 _REMARKS, _FEW_REMARKS = 0.001, 10
 """Share of rows that may end in a remark, or so many of few rows."""
 _GROUPED = r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?"
@@ -96,6 +98,16 @@ def _without_groups(cells: pa.Array) -> pa.Array | None:
         return None
     plain = pc.replace_substring(pc.replace_substring(cells, ".", ""), ",", ".")
     return pc.cast(pc.replace_substring_regex(plain, r"^\+", ""), pa.float64())
+
+
+def _switched(cells: pa.Array) -> pa.Array | None:
+    """States of a switch as 0 and 1; None where a text is none."""
+    cells = pc.utf8_lower(pc.utf8_trim_whitespace(cells))
+    missing = pc.is_in(cells, pa.array([text.lower() for text in NULLS]))
+    on, off = pc.is_in(cells, pa.array(_ON)), pc.is_in(cells, pa.array(_OFF))
+    if not pc.all(pc.or_(pc.or_(on, off), missing), min_count=0).as_py():
+        return None
+    return pc.if_else(missing, pa.scalar(None, pa.float64()), pc.cast(on, pa.float64()))
 
 
 def _all_numbers(cells: pa.Array, nulls: pa.Array, decimal: str) -> bool:
@@ -243,9 +255,6 @@ class CsvTable:
         places = [int(name) for name in names]
         keys = [self.keys[column_index] for column_index in places]
         texts = [column_index for column_index in places if self.types[self.keys[column_index]] == pa.string()]
-        for column_index in texts:
-            if self.layout.decimal != ",":
-                self.refuse_text(column_index)
         grouped = {self.keys[column_index]: column_index for column_index in texts}
         first = 0
         for batch in self.stream(list(dict.fromkeys(keys))):
@@ -260,8 +269,9 @@ class CsvTable:
                 return
 
     def _grouped(self, cells: pa.Array, column_index: int) -> pa.Array:
-        """Numbers of a column of text, which have points for thousands."""
-        numbers = _without_groups(cells)
+        """Numbers of a column of text: those that have points for thousands, or the states of a switch."""
+        numbers = _without_groups(cells) if self.layout.decimal == "," else None
+        numbers = _switched(cells) if numbers is None else numbers
         if numbers is None:
             self.refuse_text(column_index)
         return numbers

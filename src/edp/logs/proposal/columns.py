@@ -185,6 +185,10 @@ def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> Lo
     signals = [s for s in timed.signals.values() if s.time_s is not None and s.samples > 2]
     if timed.rate_hz is not None or len({s.samples for s in signals}) < 2:
         return None
+    texts = tuple(s.name for s in signals if not _is_numeric(s))
+    signals = [s for s in signals if s.name not in texts]
+    if len({s.samples for s in signals}) < 2:
+        return None
     longest = max(_span_s(s) for s in signals)
     covering = [s for s in signals if _span_s(s) >= _COVERED * longest and _step_s(s) > 0]
     if not covering or longest <= 0:
@@ -192,8 +196,7 @@ def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> Lo
     fastest = min(covering, key=lambda s: (_step_s(s), -s.samples))
     step, stamps = _step_s(fastest), np.asarray(fastest.time_s, dtype=np.float64)
     alike = [s for s in covering if _step_s(s) <= _SLOWEST * step]
-    chosen = alike[:MOST_COLUMNS]
-    numbers = [s for s in chosen if _is_numeric(s)]
+    numbers = alike[:MOST_COLUMNS]
     if len({s.samples for s in numbers}) < 2 or len(numbers) * len(stamps) > _HELD_VALUES:
         return None
     first = min(_ROWS, max(_VALUES // len(numbers) // 2, 100))
@@ -204,10 +207,9 @@ def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> Lo
         pieces = tuple(values[start:stop] for start, stop in ranges)
         columns.append(LogColumn(signal.name, pieces, len(stamps), signal.unit, signal.kind, True))
     left_out = {
-        "cover another time than the others, or come far more slowly": len(timed.signals) - len(alike),
-        "come after the first columns": len(alike) - len(chosen),
+        "cover another time than the others, or come far more slowly": len(signals) - len(alike),
+        "come after the first columns": len(alike) - len(numbers),
     }
-    texts = tuple(s.name for s in chosen if s not in numbers)
     counted = {reason: count for reason, count in left_out.items() if count > 0}
     return LogLook(path, tuple(columns), texts, len(stamps), None, time_name, step, False, counted, note)
 
@@ -321,3 +323,11 @@ def _time_of(part: Path, raw: RawLog, texts: Sequence[str]) -> tuple[str | None,
             return name or absent[0], step, set()
         return None, step, {s.name for s in timed.signals.values() if s.time_s is not None}
     return None, None, set()
+
+
+def holds_frames(look: LogLook) -> bool:
+    """Whether the columns are those of a trace of a bus: an identifier and bytes."""
+    names = {name.lower() for name in (*look.names, *look.texts)}
+    return bool(names & {"id", "can_id", "canid", "arbitration_id", "identifier"}) and bool(
+        names & {"data", "payload", "bytes", "data bytes", "d0", "d1", "data0"}
+    )
