@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import DESK, Browser
+from browser import DESK, Browser, serious_findings
 
 from edp.live import Forecast, LiveLayout, LiveSession, LiveTrace, Pace, write_session_page
 from edp.live.server import LiveServer
@@ -83,6 +83,7 @@ def test_a_session_is_shown_as_it_comes_and_names_are_text(browser, served):
     assert page.run("document.getElementById('front').width") > 100
     assert page.run("document.documentElement.scrollWidth <= innerWidth")
     harmless(page, served.address)
+    assert serious_findings(page) == []
     page.size(390, 844, phone=True)
     page.wait("document.documentElement.scrollWidth <= innerWidth")
     page.size(*DESK, dark=True)
@@ -90,6 +91,7 @@ def test_a_session_is_shown_as_it_comes_and_names_are_text(browser, served):
     stream(session, 10)
     # The line of what is measured is light on dark now.
     page.wait("document.querySelector('figcaption i[data-colour=measured]').style.borderColor === 'rgb(232, 236, 240)'")
+    assert serious_findings(page) == []
 
 
 def test_viewers_pause_look_back_and_run_ahead(browser, served):
