@@ -1,6 +1,7 @@
 """The monitor as a whole: streams, alarms, silence, refusals, its folder."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from edp.recording import Recording
 from edp.testing.monitor import rig_sessions
 from edp.training.bundle import HASH, header_digest
 from edp.workflows.monitor import fit_to_recordings
+from edp.workflows.monitor.fit_monitor import _divided
 
 from .conftest import EXPERIMENT, TICKS
 
@@ -120,8 +122,13 @@ def test_another_machine_and_another_rate_are_refused(fitted, fresh):
 
 
 def test_too_few_hours_name_the_rate_that_they_support(healthy):
-    with pytest.raises(ConfigError, match=r"supports one in 0\.\d+ h"):
+    with pytest.raises(ConfigError, match=r"supports one in 0\.\d+ h") as ended:
         fit_to_recordings(healthy, load_monitor_experiment(None, (), {"hours_per_false_alarm": 8.0}))
+    # What is advised must hold after minutes of training, too, when doubtful sessions are left out.
+    advised = float(re.search(r"--hours-per-false-alarm ([\d.]+)", str(ended.value)).group(1))
+    experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": advised})
+    rest = _divided(healthy, experiment)[2]
+    assert 0.0 < advised < 0.85 * sum(session.duration_s for session in rest) / 3600.0
 
 
 def test_a_healthy_log_with_a_fault_is_named(healthy, fitted):

@@ -33,6 +33,8 @@ NOTED_SESSIONS = 25
 """Simulated sessions of the dictionary between two notes."""
 CUT_S = 480.0
 """Where there are too few sessions, longer ones are cut into pieces of this length."""
+ROOM = 0.8
+"""Of the hours that set the limit, in advice: sessions that turn out doubtful are left out after the training."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +99,8 @@ def fit_to_recordings(
     channels = watched_channels(recordings, experiment)
     _check_values(recordings, channels)
     sessions = _enough_sessions(recordings)
-    _check_hours(sessions, experiment)
     train, validation, rest = _divided(sessions, experiment)
+    _check_hours(sessions, rest, experiment)
     material = FitMaterial(
         train=train,
         validation=validation,
@@ -220,17 +222,24 @@ def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
     return pieces
 
 
-def _check_hours(sessions: Sequence[Recording], experiment: MonitorExperiment) -> None:
-    """Refuse a promise that the hours cannot support before networks are trained for it."""
+def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], experiment: MonitorExperiment) -> None:
+    """Refuse a promise that the hours cannot support before networks are trained for it.
+
+    Args:
+        sessions: all of them.
+        rest: those that train nothing and set the limit.
+        experiment: with the promise.
+    """
     hours = sum(session.duration_s for session in sessions) / 3600.0
-    left = hours * (1.0 - experiment.train_share)
-    if left < experiment.hours_per_false_alarm:
-        promised = experiment.hours_per_false_alarm
+    left = sum(session.duration_s for session in rest) / 3600.0
+    promised = experiment.hours_per_false_alarm
+    if left < promised:
+        share = left / hours
         raise ConfigError(
             f"{hours:.3g} h of healthy logs are too few for one false alarm in {promised:g} h: "
-            f"{experiment.train_share:.0%} of them train residuals, and what is left supports one in {left:.3g} h; ask "
-            f"for that with --hours-per-false-alarm {0.97 * left:.3g}, or bring "
-            f"{promised / (1.0 - experiment.train_share) - hours:.3g} h more"
+            f"{1.0 - share:.0%} of them train residuals, and what is left supports one in {left:.3g} h; ask "
+            f"for one in {ROOM * left:.3g} (--hours-per-false-alarm {ROOM * left:.3g}), which leaves room for sessions "
+            f"that turn out doubtful, or bring {promised / (ROOM * share) - hours:.3g} h more"
         )
 
 
