@@ -117,7 +117,7 @@ def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
         verdicts = tuning_of.tuning_verdicts(details[part], quick)
     else:
         details[part] = tuning_of.tuning_other(models, of_tuning, seed)
-    finish(f"closed_loop_{part}", verdicts, seed, details)
+    finish(f"closed_loop_{part}", verdicts, seed, details, keep=not quick)
 
 
 def predictive(
