@@ -142,31 +142,28 @@ class Models:
 
     def other_grey(self, minutes: int, fit: Sequence[str]) -> Path:
         """The like of C14 from minutes of its own logs in free air, and nothing of M22."""
-        order = SimulationOrder(
-            machine="C14",
-            minutes=float(minutes),
-            recordings=max(5, minutes // 2),
-            seed=self.seed + 41,
-            mix=MIX,
-            materials={"air": 1.0},
-        )
-        source, guess = self._simulated(f"c14_air_{minutes}", order), self.folder / "guess_c14.toml"
+        source, guess = self._of_other("air", minutes, 41, MIX, "air"), self.folder / "guess_c14.toml"
         return self._grey(source, "c14", guess, f"c14_grey_{minutes}", fit)
 
     def other_grounded(self, minutes: int, fit: Sequence[str]) -> Path:
         """That of C14 with a ground, which it learned from as many minutes of grading and digging in loam."""
+        start = self.other_grey(minutes, fit)
+        source = self._of_other("loam", minutes, 61, {"grading": 0.5, "dig": 0.5}, "sandy_loam")
+        name = f"c14_grounded_{minutes}"
+        train_twin(source, load_twin_experiment(None, ("ground=drag",)), self.folder / name, start=start)
+        return self.folder / name
+
+    def _of_other(self, name: str, minutes: int, draw: int, mix: Mapping[str, float], material: str) -> DataSource:
+        """Logs of C14 in one material."""
         order = SimulationOrder(
             machine="C14",
             minutes=float(minutes),
             recordings=max(5, minutes // 2),
-            seed=self.seed + 61,
-            mix={"grading": 0.5, "dig": 0.5},
-            materials={"sandy_loam": 1.0},
+            seed=self.seed + draw,
+            mix=mix,
+            materials={material: 1.0},
         )
-        start, source = self.other_grey(minutes, fit), self._simulated(f"c14_loam_{minutes}", order)
-        name = f"c14_grounded_{minutes}"
-        train_twin(source, load_twin_experiment(None, ("ground=drag",)), self.folder / name, start=start)
-        return self.folder / name
+        return self._simulated(f"c14_{name}_{minutes}", order)
 
     def _grey(self, source: DataSource, machine: str, guess: Path, name: str, fit: Sequence[str]) -> Path:
         told = tomllib.loads((resources.files("edp.sim") / "machines" / f"{machine}.toml").read_text(encoding="utf-8"))

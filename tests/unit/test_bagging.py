@@ -1,15 +1,17 @@
 """Committees trained on folds: left-out predictions are honest, and the network says what the sum of its parts says."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import nnls
+from sklearn.linear_model import Ridge
 
 from edp.config.experiment import build
 from edp.data.features import FeatureSet
-from edp.data.fold_ridge import fold_ridge
+from edp.data.fold_ridge import LEAST_GAIN, PENALTIES, fold_ridge
 from edp.data.folds import blocked_folds
 from edp.data.prepared import prepare
 from edp.data.splits import ByTime
@@ -451,6 +453,42 @@ def test_fold_ridge_leaves_useless_columns_out():
     found = fold_ridge(table, targets, blocked_folds([400], 5, 0), [np.arange(2), np.arange(30)])
     assert np.abs(found.mean()[0][2:]).max() == 0
     np.testing.assert_allclose(found.mean()[0][:2, 0], [1.0, -2.0], atol=0.1)
+
+
+@pytest.mark.parametrize("of_fold", [False, True])
+def test_fold_ridge_is_the_ridge_regression_of_each_fold(of_fold):
+    """Against scikit-learn's on the rows of each fold, gaps left out, with the penalty of the least left-out error."""
+    rng = np.random.default_rng(3)
+    table = (rng.normal(size=(300, 12)) @ rng.normal(size=(12, 12)) + rng.normal(size=12)).astype(np.float32)
+    targets = table[:, :3] @ np.ones((3, 1)) + 3.0 * rng.normal(size=(300, 1)) + 7.0
+    if of_fold:
+        targets = np.stack([targets + 0.1 * fold for fold in range(4)])
+    folds = blocked_folds([180, 120], 4, 7)
+    assert any(len(folds.training[fold]) + len(folds.left_out(fold)) < 300 for fold in range(4))
+    own = targets if of_fold else np.stack([targets] * 4)
+    best, wanted = np.inf, np.zeros((300, 1))
+    for penalty in sorted(PENALTIES, reverse=True):
+        found = np.zeros((300, 1))
+        for fold, rows in enumerate(folds.training):
+            model = Ridge(alpha=penalty * len(rows)).fit(table[rows].astype(float), own[fold][rows])
+            left = folds.left_out(fold)
+            found[left] = model.predict(table[left].astype(float)).reshape(-1, 1)
+        truth = np.concatenate([own[fold][folds.left_out(fold)] for fold in range(4)])
+        guess = np.concatenate([found[folds.left_out(fold)] for fold in range(4)])
+        error = np.mean(np.square(guess - truth))
+        if error < best * (1.0 - LEAST_GAIN):
+            best, wanted = error, found
+    np.testing.assert_allclose(fold_ridge(table, targets, folds, [np.arange(12)]).left_out, wanted, rtol=1e-8)
+
+
+def test_where_rows_are_taken_at_a_distance_logs_show_different_ticks_of_their_starts():
+    data = data_of(*(recording(600, seed, f"log{seed}") for seed in range(4)))
+    table = table_of(build_model(data.task, MODEL, data.scaler(), 0), data, BaggingSpec(folds=4, rows=800))
+    assert table.stride > 1
+    firsts = [first for _, first in table.starts]
+    assert {first - min(firsts) for first in firsts} == set(range(table.stride))
+    ends = [*(row for row, _ in table.starts), len(table.targets)]
+    assert all(stop > start for start, stop in pairwise(ends))
 
 
 def test_the_bank_gives_changes_over_its_spans():

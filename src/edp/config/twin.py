@@ -54,8 +54,7 @@ class TwinExperiment:
                 raise ConfigError(f"judge.floors: {error}") from None
         if self.ground and self.ground not in GROUNDS:
             raise ConfigError(
-                f"ground = '{self.ground[:80]}'{closest(self.ground, GROUNDS)}; any of {', '.join(GROUNDS)}, or none, "
-                "must hold"
+                f"ground = '{self.ground[:80]}' is unknown{closest(self.ground, GROUNDS)}; leave it out for free air"
             )
 
 

@@ -147,15 +147,12 @@ def blocks_where_time_is_uneven(
         horizons: in ticks.
         by_time: how they would be divided.
     """
-    reach = max(1, *horizons)
-    gap = HISTORY + reach
-    moving = moving_ticks(recordings, channels, reach)
-    blocks = blocks_of_motion(recordings, gap)
-    if not is_even(blocks, recordings, gap, moving):
+    blocks, even_in_blocks, even_in_time = _evenness(recordings, channels, horizons, by_time)
+    if not even_in_blocks:
         return None
-    if not is_even(by_time, recordings, gap, moving):
+    if not even_in_time:
         return blocks, "the machine rests in most of what would be tested or validated"
-    spans = sorted({1, reach})
+    gap, spans = _gap(horizons), sorted({1, max(1, *horizons)})
     ratio, name, span = most_unlike(by_time, recordings, gap, channels, spans)
     if _distance(ratio) <= np.log(UNLIKE):
         return None
@@ -180,10 +177,22 @@ def rests_where_it_tests(
         horizons: in ticks.
         by_time: how they would be divided.
     """
-    reach = max(1, *horizons)
-    gap = HISTORY + reach
-    moving = moving_ticks(recordings, channels, reach)
-    return not any(is_even(split, recordings, gap, moving) for split in (by_time, blocks_of_motion(recordings, gap)))
+    _, *even = _evenness(recordings, channels, horizons, by_time)
+    return not any(even)
+
+
+def _gap(horizons: Sequence[int]) -> int:
+    """Ticks that are set apart around what tests."""
+    return HISTORY + max(1, *horizons)
+
+
+def _evenness(
+    recordings: Sequence[Recording], channels: Sequence[str], horizons: Sequence[int], by_time: ByTime
+) -> tuple[ByBlocks, bool, bool]:
+    """Blocks of motion, and whether they and the division by time test and validate motion."""
+    gap, moving = _gap(horizons), moving_ticks(recordings, channels, max(1, *horizons))
+    blocks = blocks_of_motion(recordings, gap)
+    return blocks, is_even(blocks, recordings, gap, moving), is_even(by_time, recordings, gap, moving)
 
 
 def blocks_of_motion(recordings: Sequence[Recording], gap: int) -> ByBlocks:

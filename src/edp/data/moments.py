@@ -39,8 +39,7 @@ class Moments:
 
     def merge(self, other: Moments) -> None:
         """Take in what other rows gave."""
-        if other.count:
-            self._merge(other.count, other.low, other.high, other.mean, other.squares)
+        self.add(other.state())
 
     def state(self) -> dict[str, Any]:
         """All that it holds, as plain values and arrays."""
@@ -49,7 +48,7 @@ class Moments:
         }  # fmt: skip
 
     def add(self, state: Mapping[str, Any]) -> None:
-        """As `merge`, by the `state` of the other."""
+        """Take in what other rows gave, by the `state` of those."""
         if state["count"]:
             self._merge(state["count"], state["low"], state["high"], state["mean"], state["squares"])
 

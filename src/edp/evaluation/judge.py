@@ -189,6 +189,16 @@ def _groups_of_part(data: Prepared, number: int) -> list[list[int]]:
     return [group for group, part in zip(groups, part_of, strict=True) if part == number]
 
 
+def first_scored(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> int:
+    """The tick from which on every stretch is scored, of all models alike."""
+    # A whole window from reset: before that the network's memory is not filled. Baselines lack history for longer
+    # than the preset `auto` waits: without the rows in which sensors settle a rival looks far better than it is.
+    history = baseline_task(data, spec).history if spec.baselines else 0
+    first = max(predictor.spec.window, history) if spec.skip is None else spec.skip
+    # While the start is read there is nothing to predict.
+    return max(first, data.task.features.starting_ticks) if data.task.features.starting else first
+
+
 class ModelBench:
     """Where models are measured one by one, on the same ticks: all here, or each in a process of its own.
 
@@ -204,14 +214,8 @@ class ModelBench:
     def __init__(self, predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None:
         _check_memory(predictor, data, spec)
         self.predictor, self.data, self.spec = predictor, data, spec
-        # A whole window from reset: before that the network's memory is not filled. Baselines lack history for longer
-        # than the preset `auto` waits: without the rows in which sensors settle a rival looks far better than it is.
-        history = baseline_task(data, spec).history if spec.baselines else 0
-        started = max(predictor.spec.window, history)
-        skip = started if spec.skip is None else spec.skip
-        if data.task.features.starting:  # While the start is read there is nothing to predict.
-            skip = max(skip, data.task.features.starting_ticks)
-        self.skip, self.ruler = skip, Ruler(data, skip)
+        self.skip = first_scored(predictor, data, spec)
+        self.ruler = Ruler(data, self.skip)
 
     def network(self, label: str, seconds: float) -> JudgedModel:
         """Run the network along the test part; its label and training time are those of reports."""

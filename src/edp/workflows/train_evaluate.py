@@ -20,7 +20,7 @@ from edp.evaluation.channel_importance import ChannelImportances, ChannelImporta
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, judge, score_network
+from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, first_scored, judge, score_network
 from edp.evaluation.scores_file import earlier_scores
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
@@ -221,7 +221,7 @@ def _provenance(
 
 
 JudgedBy = Callable[[ModelBench, str], Mapping[str, JudgedModel]]
-"""Measures all models, for how to judge and the digest of what is judged."""
+"""Measures all models on a bench, with the digest of what is judged."""
 
 
 @one_blas_thread()
@@ -260,7 +260,9 @@ def evaluate(
         target = make_folder(folder / f"on_{source.path.stem}")
     chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
     settings = plain_tree(replace(experiment, judge=chosen))["judge"]
-    key = run_key({"judge": settings, "weights": weights_digest(bundle.predictor)}, " ".join(judged))
+    # Settings may leave the first tick to what models need, which versions have seen differently.
+    how = {"judge": settings, "first": first_scored(bundle.predictor, data, chosen)}
+    key = run_key(how | {"weights": weights_digest(bundle.predictor)}, " ".join(judged))
     scores = earlier_scores(target, key)
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]

@@ -8,6 +8,7 @@ import pytest
 from edp.errors import BundleError
 from edp.evaluation import judge
 from edp.networks import running
+from edp.workflows import train_evaluate
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.judging import UNITS, evaluate_with
 from edp.workflows.fleet.training import finetune_with
@@ -79,6 +80,17 @@ def test_all_models_are_scored_on_the_same_ticks(run):
     counts = [[scores["mean"]["count"] for scores in model.entry["overall"].values()] for model in models]
     assert counts[0] == counts[1]
     assert judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=())).skip == 10
+
+
+def test_scores_from_another_first_tick_are_measured_anew(run, target, tmp_path, monkeypatch):
+    shutil.copytree(run, tmp_path / "run")
+    first = train_evaluate.first_scored
+    monkeypatch.setattr(train_evaluate, "first_scored", lambda *args: first(*args) - 1)
+    before = evaluate(tmp_path / "run", target, ()) / "scores.json"
+    key = json.loads(before.read_text())["key"]
+    monkeypatch.undo()
+    after = json.loads((evaluate(tmp_path / "run", target, ()) / "scores.json").read_text())
+    assert after["key"] != key
 
 
 def approx_tree(value):

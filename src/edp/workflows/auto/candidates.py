@@ -62,7 +62,10 @@ SHARE = {"perceptrons": 0.2, "trees": 0.4, "recurrent": 0.4}
 LONG_SHARE = {"perceptrons": 0.25, "trees": 0.15, "recurrent": 0.6}
 """Of what linear models and kernel machines leave of the budget, up to `LONG_ROWS` and above."""
 LINEAR_PRODUCTS_PER_S, LINEAR_MODELS = 2e10, 2
-"""Products of columns that sums for a ridge regression take in a second, and how many candidates need them."""
+"""Products of columns that sums for a ridge regression take in a second, and how many candidates need them. Measured
+were 2.8e10 to 7.4e10: every row is multiplied out once, whatever the folds."""
+EIGEN_CUBES_PER_S = 1e9
+"""Cubes of the number of columns in a second, of the spectra of a fold over all sets of columns; measured: 2e9."""
 RADIAL_ROW_S, RADIAL_CELL_S = 3e-5, 3.7e-8
 """A row of radial basis functions of one length takes the first, and the second for each column: measured."""
 LEAST_SHARE = 0.5
@@ -195,7 +198,7 @@ def _steps(amount: Amount, groups: int) -> int:
 def _fixed_seconds(amount: Amount) -> float:
     """Processor time of what no budget shortens: linear models and radial basis functions."""
     rows, columns = min(amount.rows, BaggingSpec().rows), _columns(amount)
-    linear = LINEAR_MODELS * FOLDS * 2 * rows * columns**2 / LINEAR_PRODUCTS_PER_S
+    linear = LINEAR_MODELS * (2 * rows * columns**2 / LINEAR_PRODUCTS_PER_S + FOLDS * columns**3 / EIGEN_CUBES_PER_S)
     kernels = len(LENGTHS) * min(rows, JUDGED_ROWS) + (rows if rows > JUDGED_ROWS else 0)
     near = sum(RADIAL_ROW_S + RADIAL_CELL_S * amount.features * (1 + (span > 0)) for span in _near(amount))
     return linear + kernels * (RADIAL_ROW_S + RADIAL_CELL_S * columns + near)

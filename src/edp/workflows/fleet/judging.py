@@ -48,7 +48,7 @@ def evaluate_with(
     """
     folder = Path(run)
 
-    def judged(bench: ModelBench, digest: str) -> dict[str, JudgedModel]:
+    def by_units(bench: ModelBench, digest: str) -> dict[str, JudgedModel]:
         # Costly ones first, so that none of them begins last; parts of the network, all alike, fill what is left.
         names, spec = [*reversed(by_effort(bench.spec.baselines))], bench.spec
         parts = network_parts(bench.data)
@@ -72,7 +72,7 @@ def evaluate_with(
         judged[NETWORK] = bench.network_of(measured, label, seconds)
         return {name: judged[name] for name in [NETWORK, *by_effort(spec.baselines)]}
 
-    scored = evaluate(folder, source, baselines, judged_by=judged)
+    scored = evaluate(folder, source, baselines, judged_by=by_units)
     forget_units(folder / UNITS)
     return scored
 

@@ -17,7 +17,7 @@ from edp.logs.source import DataSource
 from edp.monitor.fitting import doubtful_sessions, fit_chain, session_means
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import save_monitor
-from edp.monitor.residuals.base import FitMaterial, note_nothing
+from edp.monitor.residuals.base import FitMaterial, ResidualSource, note_nothing
 from edp.monitor.residuals.groups import sensed_channels
 from edp.recording import Recording
 from edp.signals import Channel
@@ -113,13 +113,7 @@ def fit_to_recordings(
         minutes=experiment.minutes,
         note=note,
     )
-    fits = [spec.fit(material) for spec in experiment.residuals]
-    sources = tuple(source for source in fits if source is not None)
-    if not sources:
-        raise DataError(
-            "none of the settings' residuals finds something to judge in these channels; name further channels or "
-            "residuals"
-        )
+    sources = _sources(experiment, material)
     fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note)
     if not again:
         note("sessions that trained, compared with the others")
@@ -220,6 +214,22 @@ def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
         edges = np.linspace(0, recording.samples, count + 1).astype(int).tolist()
         pieces += [recording.rows(a, b) for a, b in itertools.pairwise(edges) if b > a]
     return pieces
+
+
+def _sources(experiment: MonitorExperiment, material: FitMaterial) -> tuple[ResidualSource, ...]:
+    """The settings' residuals that find something to judge.
+
+    Raises:
+        DataError: none does.
+    """
+    fits = [spec.fit(material) for spec in experiment.residuals]
+    sources = tuple(source for source in fits if source is not None)
+    if not sources:
+        raise DataError(
+            "none of the settings' residuals finds something to judge in these channels; name further channels or "
+            "residuals"
+        )
+    return sources
 
 
 def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], experiment: MonitorExperiment) -> None:

@@ -55,20 +55,25 @@ class BaseTwin:
         Raises:
             EdpError: not a twin, or one that no training can go on with.
         """
-        bundle = load_twin(folder)
-        if not isinstance(bundle.twin, RecurrentTwin):
-            kind = TWINS.name_of(bundle.spec)
-            raise ConfigError(
-                f"--start {folder}: the twin is of kind '{kind}', which has no training that could go on; begin with a "
-                "recurrent one, or fit this kind to the recordings anew, without --start"
-            )
-        return BaseTwin(Path(folder), bundle, twin_hash(folder))
+        base = BaseTwin(Path(folder), load_twin(folder), twin_hash(folder))
+        _ = base.twin
+        return base
 
     @property
     def twin(self) -> RecurrentTwin:
-        """The twin."""
-        assert isinstance(self.bundle.twin, RecurrentTwin)  # noqa: S101  for the type checker: `of` refuses others
-        return self.bundle.twin
+        """The twin.
+
+        Raises:
+            ConfigError: it is one that no training can go on with.
+        """
+        twin = self.bundle.twin
+        if not isinstance(twin, RecurrentTwin):
+            kind = TWINS.name_of(self.bundle.spec)
+            raise ConfigError(
+                f"--start {self.folder}: the twin is of kind '{kind}', which has no training that could go on; begin "
+                "with a recurrent one, or fit this kind to the recordings anew, without --start"
+            )
+        return twin
 
     def settled(self, experiment: TwinExperiment) -> TwinExperiment:
         """Settings with the formulation and the channels of this twin.
