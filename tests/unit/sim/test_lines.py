@@ -9,6 +9,7 @@ import pytest
 
 from edp.errors import ConfigError
 from edp.sim import Scenario, Simulation, load_machine
+from edp.sim.environment import ExcavatorEnv
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine_files import parse_machine
 from edp.sim.machine.parameters import pack
@@ -181,6 +182,19 @@ def test_a_snapshot_holds_the_lines(tmp_path):
     simulation.restore(moment)
     assert np.array_equal(simulation.run(60), first)
     assert np.abs(simulation.plant.state[at.FLOW_HEAD :]).max() > 1e-6
+
+
+def test_an_environment_is_the_recording_of_its_levers_to_the_bit(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(text_with(f"line_bore = {list(BORES)}", 'pressure_at = "valve"'))
+    scenario = Scenario(machine=str(path), excitation="combined", duration_s=1.5, seed=2, sensor_noise=False)
+    simulation = Simulation(scenario)
+    log = simulation.run(scenario.samples)
+    alike = {"machine": str(path), "duration_s": 1.5, "step_s": scenario.step_s, "sensor_noise": False}
+    env = ExcavatorEnv(**alike, hand=simulation.operator.by_hand)
+    seen = [env.reset(seed=2)[0]] + [env.step(lever)[0] for lever in simulation.targets[:-1]]
+    ports = log[:, at.LOG_PORT : at.LOG_PORT + 6].astype(np.float32)
+    np.testing.assert_array_equal(np.array(seen)[:, 6:12], ports)
 
 
 @pytest.mark.parametrize(
