@@ -252,10 +252,10 @@ def _without_empty_start(assembly: Assembly) -> Assembly:
         return assembly
     name = assembly.sources[slowest].channel.name
     if late[slowest] < 0 or first > _MOST_EMPTY * assembly.samples:
-        found = "holds no number" if late[slowest] < 0 else f"has its first number in row {first}"
+        reason = "holds no number" if late[slowest] < 0 else f"has its first number in row {first}"
         raise DataError(
-            f"'{assembly.raw.path}': channel '{name}' {found} of {assembly.samples:,}; leave it out of the signal map, "
-            "or leave the log out"
+            f"'{assembly.raw.path}': channel '{name}' {reason} of {assembly.samples:,}; leave it out of the signal "
+            "map, or leave the log out"
         )
     fact = {"repair": "nan = hold: start left out", "channel": name, "count": first, "row": 0}
     ticks = slice(assembly.ticks.start + first, assembly.ticks.stop)

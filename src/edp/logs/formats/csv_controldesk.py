@@ -130,15 +130,15 @@ def _rows_of_head(path: Path, encoding: str, delimiter: str) -> tuple[dict[str, 
 def _told_apart(names: Sequence[str], paths: Sequence[str], times: Sequence[int]) -> tuple[str, ...]:
     """Names of the cells of a row, each once: that of the trace, else the block in its path."""
     shared = Counter(names)
-    wanted = [
+    blocks = [
         path.rstrip("/").rpartition("/")[2] or name if shared[name] > 1 or _PORT.fullmatch(name) or not name else name
         for name, path in zip(names, paths)
     ]
-    taken = {i for i in range(len(names)) if i and i not in times}
-    used = Counter(wanted[i] for i in taken)
+    traces = {i for i in range(len(names)) if i and i not in times}
+    used = Counter(blocks[i] for i in traces)
     return tuple(
-        "" if i not in taken else name if name and used[name] == 1 else f"{name or 'trace'}.{i + 1}"
-        for i, name in enumerate(wanted)
+        "" if i not in traces else name if name and used[name] == 1 else f"{name or 'trace'}.{i + 1}"
+        for i, name in enumerate(blocks)
     )
 
 

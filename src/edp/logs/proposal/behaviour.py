@@ -287,10 +287,10 @@ def is_steered_by(command: LogColumn, reference: LogColumn, measured: LogColumn)
     good = np.isfinite(own) & np.isfinite(target) & np.isfinite(rate)
     if good.sum() < 100 or _scatter(own[good]) == 0:
         return False
-    ones, wanted = np.ones(int(good.sum())), np.gradient(target)[good]
+    ones, reference_rate = np.ones(int(good.sum())), np.gradient(target)[good]
     answer = _unexplained(own[good], np.column_stack([(target - actual)[good], rate[good], ones]))
     # What the motion says by itself, or that which is asked for, is a velocity and no answer.
-    velocity = _unexplained(own[good], np.column_stack([rate[good], wanted, ones]))
+    velocity = _unexplained(own[good], np.column_stack([rate[good], reference_rate, ones]))
     return answer < 0.1 and velocity > max(0.02, 2.0 * answer)
 
 

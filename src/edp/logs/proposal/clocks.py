@@ -86,8 +86,8 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
 
 def _behind(column: LogColumn, look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
     """The column behind one that numbers the rows, where it climbs as a clock does."""
-    place = look.columns.index(column) + 1
-    second = look.columns[place] if place < len(look.columns) else None
+    next_index = look.columns.index(column) + 1
+    second = look.columns[next_index] if next_index < len(look.columns) else None
     if second is None or not behaviours[second.name].climbs or behaviours[second.name].counts:
         return None
     return second
@@ -151,8 +151,8 @@ def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> Clock
             check = "it begins anew within the log: are rows without gaps?"
             return ClockGuess(None, "s", step, 1.0 / step, None, (column.name,), 0.65, check)
     still = [c.name for c in look.columns if behaviours[c.name].constant and is_time_name(c.name)]
-    found = f"'{still[0][:40]}' stands still" if still else "no time found"
-    return ClockGuess(None, "s", 1.0, 1.0, None, (), 0.3, f"{found}: a row counts as 1 s; set sample_time_s")
+    reason = f"'{still[0][:40]}' stands still" if still else "no time found"
+    return ClockGuess(None, "s", 1.0, 1.0, None, (), 0.3, f"{reason}: a row counts as 1 s; set sample_time_s")
 
 
 def _brought_down(clock: ClockGuess, rows: int) -> ClockGuess:

@@ -148,10 +148,10 @@ def _ranges_of_all(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) 
     ranges = dict(behaviours)
     for column in (column for look in beside for column in look.columns):
         numbers = column.values[np.isfinite(column.values)]
-        known = ranges.get(column.name)
-        if known is not None and len(numbers):
-            low, high = np.fmin(known.low, numbers.min()), np.fmax(known.high, numbers.max())
-            ranges[column.name] = replace(known, low=float(low), high=float(high))
+        behaviour = ranges.get(column.name)
+        if behaviour is not None and len(numbers):
+            low, high = np.fmin(behaviour.low, numbers.min()), np.fmax(behaviour.high, numbers.max())
+            ranges[column.name] = replace(behaviour, low=float(low), high=float(high))
     return ranges
 
 
@@ -163,10 +163,10 @@ def _of_brothers(columns: Sequence[LogColumn], kinds: dict[str, KindGuess]) -> d
     filled = dict(kinds)
     for row in rows.values():
         word = kind_by_word(row[0].name)
-        told = {(kinds[c.name].kind, kinds[c.name].unit): kinds[c.name] for c in row if kinds[c.name].kind is word}
-        if word is None or len(told) != 1:
+        guessed = {(kinds[c.name].kind, kinds[c.name].unit): kinds[c.name] for c in row if kinds[c.name].kind is word}
+        if word is None or len(guessed) != 1:
             continue
-        guess = next(iter(told.values()))
+        guess = next(iter(guessed.values()))
         for column in row:
             if kinds[column.name].confidence < BOUND and not column.unit and column.kind is None:
                 filled[column.name] = replace(guess, confidence=BOUND, why="as the others of its row")
