@@ -12,6 +12,8 @@ from edp.sim.physics import lines
 CYLINDERS = ("boom", "arm", "bucket")
 MOST_BLED = 0.1
 """Largest share of a pump's flow that the bleed of a load-sensing block takes at its margin."""
+LEAST_BORE = 1e-3
+"""m: below it a line is an orifice, and its length has no meaning."""
 SOFTEST = 1e7
 """Pa, bulk modulus of walls that give way more than any hose's, 1e8 to 1e9 Pa."""
 LINE_LENGTHS = 0.3, 60.0
@@ -80,10 +82,10 @@ def check_lines(machine: Machine, where: str) -> None:
                     "lines between valve and cylinders; give line_bore in [cylinders], too, or leave it out"
                 )
         return
-    if not all(cylinders.line_bore):
+    if min(cylinders.line_bore) < LEAST_BORE:
         raise ConfigError(
-            f"machine file {where} [cylinders]: line_bore = {list(cylinders.line_bore)!r} must be above 0 for all "
-            "cylinders, or for none"
+            f"machine file {where} [cylinders]: line_bore = {list(cylinders.line_bore)!r} must be at least "
+            f"{LEAST_BORE:g} m for all cylinders, or 0 for all"
         )
     for name, modulus in zip(CYLINDERS, cylinders.line_modulus, strict=True):
         if 0.0 < modulus < SOFTEST:
