@@ -176,6 +176,14 @@ def test_motion_that_a_lower_rate_loses_is_named(tmp_path, hz, told):
     assert not told or "set rate_hz = 200" in notes[0]
 
 
+def test_tables_of_text_beside_other_logs_are_named(tmp_path):
+    table(tmp_path / "log.csv", {"time": TIME, "u": SWING, "y": OTHER})
+    (tmp_path / "README.txt").write_text("These logs, of a rig,\nare of May.\n\nAsk us, please.\n")
+    assert not any("text files beside" in note for note in propose(tmp_path).notes)
+    table(tmp_path / "stand.txt", {"a": SWING[:20], "b": OTHER[:20]})
+    assert any("not looked at: stand.txt; give" in note for note in propose(tmp_path).notes)
+
+
 def test_a_clock_that_stands_still_is_named(tmp_path):
     found = propose(table(tmp_path / "log.csv", {"time": 0 * TIME, "u": SWING, "y": OTHER}))
     assert "'time' stands still: a row counts as 1 s" in found.proposal.clock.check

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 
+from edp.errors import DataError
 from edp.logs.formats.base import Column
 from edp.logs.proposal.clocks import ClockGuess
-from edp.logs.proposal.columns import LogLook
+from edp.logs.proposal.columns import LogLook, names_in_log
 
 _LEAST_COLUMNS = 20
 """Columns without names from which a row may hold samples of one signal."""
@@ -19,6 +22,8 @@ _SLOWER, _LOST, _FEW = 4.0, 0.25, 0.1
 """A rate is this many times the motion that it shows well; share of faster motion from which a person is told, and
 that a better rate leaves. Eight samples a period would be plenty, two are lost between samples."""
 _LEAST_ROWS = 500
+_MOST_TEXTS = 8
+"""Text files beside logs of other endings that are tried."""
 _RATES_HZ = (200.0, 500.0, 1000.0, 2000.0, 5000.0)
 
 
@@ -82,3 +87,24 @@ def _faster(values: Column, rate_hz: float, limit_hz: float) -> float:
     power = np.square(np.abs(np.fft.rfft(moved)))
     total = float(power.sum())
     return float(power[np.fft.rfftfreq(len(values), 1.0 / rate_hz) > limit_hz].sum()) / total if total > 0 else 0.0
+
+
+def beside_notes(source: Path, paths: Collection[Path]) -> list[str]:
+    """Text files that hold tables beside logs of other endings, which are passed over for the remarks among them.
+
+    Args:
+        source: what was asked about.
+        paths: the logs that were found there.
+    """
+    if not source.is_dir() or any(path.suffix.lower() == ".txt" for path in paths):
+        return []
+    tables = [path for path in sorted(islice(source.rglob("*.txt"), _MOST_TEXTS)) if _is_table(path)]
+    named = ", ".join(path.name[:40] for path in tables[:3])
+    return [f"text files beside these logs are not looked at: {named}; give such logs on their own"] if tables else []
+
+
+def _is_table(path: Path) -> bool:
+    try:
+        return path.is_file() and len(names_in_log(path)) > 1
+    except DataError:
+        return False
