@@ -13,7 +13,8 @@ from edp.ir.base import INPUT
 from edp.ir.layers import Activate, BinaryOperation, Clip, Function, ScaleShift
 from edp.ir.memory import Feed, Feedback
 from edp.networks.twin.lowering import stopped_strokes
-from edp.networks.twin.lumped.parts import EDGE, SLIP, SPILL, Doubles
+from edp.networks.twin.lumped.constants import EDGE, EMPTY, SLIP, SPILL
+from edp.networks.twin.lumped.parts import Doubles
 
 if TYPE_CHECKING:
     from edp.networks.twin.elements import ElementsTwin
@@ -24,8 +25,6 @@ ADD, SUBTRACT, MULTIPLY, DIVIDE = (
     BinaryOperation.MULTIPLY,
     BinaryOperation.DIVIDE,
 )
-EMPTY = 1e-30
-"""Share of a tank's height below which it counts as this full: a logarithm has no zero."""
 
 Values = NDArray[np.floating]
 
@@ -82,7 +81,7 @@ class _Tick:
 
 
 def lowered_answers(build: Builder, twin: ElementsTwin, fed: str) -> str:
-    """Scaled answers within their bounds, from SI commands and what the ports read (scaled); see `ElementsTwin.tick`.
+    """Scaled answers within their bounds, from SI commands and what the ports read (scaled); see `lumped.run`.
 
     Levels that are not measured are a second feedback edge, which starts where a reset of the twin does.
     """

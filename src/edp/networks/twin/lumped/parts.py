@@ -15,12 +15,6 @@ from edp.networks.twin.scales import TwinScales
 Doubles = NDArray[np.float64]
 MOST_ELEMENTS = 32
 """Of a kind; tangents of all numbers run side by side, and twice the elements take four times as long."""
-SLIP = 0.005
-"""Share of the fastest velocity over which friction turns round; less makes the fit stiff, more lets loads creep."""
-EDGE = 0.01
-"""Share of a tank's height over which its overflow sets in; a hard edge leaves the fit in valleys of its own."""
-SPILL = 0.8
-"""Share of what stands above the edge that leaves in a tick; explicit steps stay stable below 2 a step."""
 LONGEST_NAME = 64
 """Of an element: a line of the datasheet holds it."""
 
