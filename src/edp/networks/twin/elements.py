@@ -85,7 +85,8 @@ class ElementsBox:
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """All numbers."""
         parts = self.parts(channels)
-        return {"numbers": (5 * len(parts.tanks) + 5 * len(parts.masses) + 3 * len(parts.lags),)}
+        tanks = sum(6 if tank.level else 5 for tank in parts.tanks)
+        return {"numbers": (tanks + 5 * len(parts.masses) + 3 * len(parts.lags),)}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> ElementsTwin:
         """The elements with these numbers."""

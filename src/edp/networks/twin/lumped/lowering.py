@@ -208,13 +208,14 @@ def _rates(tick: _Tick, levels: str, pumped: str) -> str:
     twin, build, tanks = tick.twin, tick.build, tick.twin.elements.tanks
     names, rate = [tank.name for tank in tanks], twin.channels.rate_hz
     inflow, outflow, exponent = (tick.numbers(names, n) for n in ("inflow", "outflow", "exponent"))
-    edge = tick.numbers(names, "edge", 1.0)
-    full = tick.of(Function.SOFTPLUS, "full", tick.line("share", levels, 1.0 / (edge * EDGE)))
+    edge, zero = tick.numbers(names, "edge", 1.0), tick.numbers(names, "zero", 0.0)
+    gain, shift = 1.0 / (edge * EDGE), -zero / (edge * EDGE)
+    full = tick.of(Function.SOFTPLUS, "full", tick.line("share", levels, gain, shift))
     bound = np.full(len(tanks), EMPTY)
     share = build.add(Clip, "not_empty", tick.line("height", full, EDGE), low=bound, high=1.0 / bound)
     logarithm = tick.of(Function.LOG, "logarithm", share)
     out = tick.of(Function.EXP, "out", tick.line("exponent", logarithm, exponent))
-    beyond = tick.line("beyond", levels, 1.0 / (edge * EDGE), -1.0 / EDGE)
+    beyond = tick.line("beyond", levels, gain, shift - 1.0 / EDGE)
     over = tick.line("over", tick.of(Function.SOFTPLUS, "spill", beyond), SPILL * rate * EDGE)
     above = [names.index(tank.source) if tank.source in names else i for i, tank in enumerate(tanks)]
     fed = np.array([tank.source not in twin.inputs for tank in tanks])

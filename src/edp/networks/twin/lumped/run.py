@@ -111,7 +111,7 @@ def _flows(numbers: Values, command: Doubles, levels: Values, work: Values, wiri
         pump, above, column, at = tanks[k, 0], tanks[k, 1], tanks[k, 2], tanks[k, 4]
         outflow, share = numbers[at + 2], levels[k]
         if column >= 0:
-            share = share / numbers[at + 4]
+            share = (share - numbers[at + 5]) / numbers[at + 4]
         if pump >= 0:
             filled = numbers[at] * ramp(command[pump] - numbers[at + 1], EDGE * widths[pump])
         else:
