@@ -182,8 +182,8 @@ class ElementsTwin(Twin):
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         answer, hidden = (np.array(state[name], np.float32, order="C") for name in ("answer", "hidden"))
-        given = (np.ascontiguousarray(part, np.float32) for part in (commands, measured))
-        answers = np.asarray(measured_run(self.numbers, *given, answer, hidden, self.wiring))
+        driven, read = (np.ascontiguousarray(part, np.float32) for part in (commands, measured))
+        answers = np.asarray(measured_run(self.numbers, driven, read, answer, hidden, self.wiring))
         return answers, {"answer": answer, "hidden": hidden}
 
     def lower_answers(self, build: Builder, commands: str, fed: str) -> str:

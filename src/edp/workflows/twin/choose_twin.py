@@ -15,7 +15,6 @@ from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.evaluation.free_run import FreeRuns, free_run_scores, free_runs
 from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
-from edp.networks.twin.arx import Arx
 from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, member_seed
@@ -31,11 +30,6 @@ LENGTHS = (0.05, 0.15, 0.45, 1.0)
 """Shares of the updates of `[training]` that are tried in turn, each with a whole schedule of its learning rate.
 
 A longer one is not always better: on 3 min of a cylinder under a hanging load 1,050 updates were better than 3,150."""
-ARX_LAGS = (2, 4, 8, 12)
-"""Memories of ARX that are tried before its default, in ticks.
-
-On short logs fewer are better as often as more: of two coupled drives, 250 ticks, 4 lags left 0.84 of the static map's
-error out and 25 left 1.16, of a ball on a beam 12 left 0.35 and 25 left 0.38 (`docs/findings.md`)."""
 BOTH_FORMS = 2
 """Lengths at which a recurrent twin is trained with and without a static map; the better one goes on."""
 LENGTHENED = 0.01
@@ -178,29 +172,19 @@ class TwinChoice:
         return [self._runs(spec.start(*shared, fold.train, seed), fold) for fold in self.folds]
 
     def _tried(self, name: str, rival: TwinCandidate | None) -> list[TwinCandidate]:
-        """A formulation with the default options; ARX and the recurrent one in several forms, the simplest first."""
+        """A formulation with the default options; the recurrent one in several forms, the simplest first."""
         if name == "recurrent":  # a short training far behind a floor may be ahead of it as a long one
             return self._recurrent()
-        spec, tried = self._default(name), [] if rival is None else [rival]
-        forms = [spec]
-        if isinstance(spec, Arx):
-            forms = [*(replace(spec, lags=lags) for lags in ARX_LAGS if lags < spec.lags), spec]
-        for form in forms:
-            tried.append(self._fitted(form, _best(tried)))
-        return tried[-len(forms) :]
-
-    def _fitted(self, spec: TwinSpec, rival: TwinCandidate | None) -> TwinCandidate:
-        """A formulation that is fitted to each fold as its options say."""
-        label = described(spec)
+        spec = self._default(name)
 
         def fitted(some: range) -> Iterator[FittedFormulation]:
             for which in some:
                 data = replace(self.fit.data, train=self.folds[which].train, validation=self.folds[which].validation)
-                with part_of(self.run, self._part(TWINS.name_of(spec), which)) as own:
+                with part_of(self.run, self._part(name, which)) as own:
                     yield replace(self._whole, data=data).fitted(spec, own)
 
-        self.fit.tell(f"fitting {label}")
-        return self._attempt(label, spec, fitted, rival, FAR_BEHIND)
+        self.fit.tell(f"fitting {name}")
+        return [self._attempt(described(spec), spec, fitted, rival, FAR_BEHIND)]
 
     def _recurrent(self) -> list[TwinCandidate]:
         """The recurrent twin on a static map or not, as long as longer training helps."""
@@ -373,8 +357,6 @@ def shortened(training: FreeRunSpec, share: float) -> FreeRunSpec:
 def described(spec: TwinSpec) -> str:
     """How sentences call a formulation."""
     name = TWINS.name_of(spec)
-    if isinstance(spec, Arx) and spec.lags != Arx().lags:
-        return f"{name} ({spec.lags} lags)"
     if not isinstance(spec, Recurrent):
         return name
     members = f"{spec.members} x " if spec.members > 1 else ""
