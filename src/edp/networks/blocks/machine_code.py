@@ -53,8 +53,10 @@ class CodedChannels(Streaming):
     Attributes:
         lanes: codes ``(batch, size)`` of the streams of a batch, in a training over machines; None for the network's
             own.
+        table: codes of all machines in a row; there while a training over machines lasts.
     """
 
+    table: Tensor
     lanes: Tensor | None = None
 
     def __init__(self, width: int, size: int) -> None:

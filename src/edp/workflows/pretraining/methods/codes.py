@@ -59,7 +59,7 @@ class MachineSampler(EpisodeSampler):
         return [
             (np.column_stack([inputs, np.full(len(inputs), number, np.float32)]), *rest)
             for inputs, *rest in super()._episode(machine, rng)
-        ]  # type: ignore[misc]
+        ]
 
 
 class WithCodes(EpisodicStrategy):
