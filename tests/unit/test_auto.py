@@ -17,7 +17,7 @@ from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
 from edp.training import load_bundle
 from edp.workflows.auto import load_auto, train_auto
-from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_of, tree_plan
+from edp.workflows.auto.candidates import CANDIDATES, Amount, RecurrentTrial, spans_of, tree_plan
 from edp.workflows.auto.promise import Promise, choose
 from edp.workflows.train_evaluate import DataSource, evaluate, trained_run
 
@@ -309,6 +309,40 @@ def test_the_budget_of_long_recordings_goes_to_the_recurrent_network():
         assert seconds[most] >= max(seconds.values())
 
 
+def test_the_budget_follows_the_trial_of_the_recurrent_network():
+    kinds = ("perceptrons", "trees", "recurrent")
+    for rows in (60_000, 300_000):
+        amount = Amount(rows=rows, shortest=1_000, features=12, outputs=3, horizon=10, minutes=5.0)
+        seconds = {
+            trial: {kind: replace(amount, trial=trial).seconds(kind) for kind in kinds} for trial in RecurrentTrial
+        }
+        assert seconds[RecurrentTrial.RUNNING]["perceptrons"] == 0
+        assert 0 < seconds[RecurrentTrial.RUNNING]["recurrent"] < 30.0
+        # A trial that passed is paid by the network's own share; all others keep theirs.
+        passed, without = seconds[RecurrentTrial.PASSED], seconds[RecurrentTrial.NONE]
+        trial = seconds[RecurrentTrial.RUNNING]["recurrent"]
+        assert passed == pytest.approx(without | {"recurrent": without["recurrent"] - trial})
+        failed = seconds[RecurrentTrial.FAILED]
+        assert failed["recurrent"] == 0
+        assert failed["trees"] >= without["trees"]
+
+
+@pytest.mark.parametrize(("margin", "trained"), [(1e-9, ["trial"]), (1e9, ["recurrent", "trial"])])
+def test_a_recurrent_network_is_trained_to_the_end_where_its_trial_comes_near_the_linear_model(
+    tmp_path, monkeypatch, margin, trained
+):
+    monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
+    monkeypatch.setattr("edp.workflows.auto.portfolio.MARGIN", margin)
+    shown = []
+    source = write(tmp_path / "logs", ticks=1500)
+    facts = train_auto(source, load_auto(None, SET), tmp_path / "run", None, lambda *event: shown.append(event)).facts
+    assert sorted(path.name for path in (tmp_path / "run" / "candidates").iterdir()) == trained
+    assert list(facts["candidates"]) == ["linear", "committee", "recurrent"]
+    assert any("short trial" in note for note in facts["notes"]) == (len(trained) == 1)
+    count = 2 + len(trained)
+    assert [event[1:] for event in shown] == [(0, 3), (1, 3), *((number, count) for number in range(2, count))]
+
+
 def test_trees_of_many_outputs_keep_most_of_the_rows():
     """A budget goes into rows first, then into left-out parts, then into trees; more minutes never mean less."""
     amount = Amount(rows=31_000, shortest=1_000, features=12, outputs=24, horizon=10, minutes=5.0)
@@ -331,7 +365,7 @@ def test_trees_of_many_outputs_keep_most_of_the_rows():
     plans = [tree_plan(replace(amount, minutes=minutes)) for minutes in (0.01, 1.0, 5.0, 20.0, 200.0)]
     assert plans[0].trees == 0
     assert [one.rows for one in plans[1:]] == sorted(one.rows for one in plans[1:])
-    assert (plans[-1].trees, plans[-1].folds, plans[-1].rows) == (300, 5, 30_000)
+    assert (plans[-1].trees, plans[-1].folds, plans[-1].rows) == (300, 5, 60_000)
 
 
 def test_many_channels_get_fewer_spans():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 
 from edp.registry import Registry
 from edp.settings.tree import Table
@@ -45,8 +46,9 @@ ROUNDS, LEAST_ROUNDS, TREE_DEPTH = 100, 40, 6
 TREE_MODELS = {3: 60, 2: LEAST_ROUNDS}
 """Models of each output: of what a line leaves, of the target by few columns, of the target by all columns. The third
 one is worth its time where it leaves so many rounds: left-out errors of five measured sets fall by 0.5 to 6 %."""
-TREE_ROWS = (30_000, 15_000, 8_000, 4_000)
-"""Rows that a tree is grown on: the most that leave time for `LEAST_ROUNDS`."""
+TREE_ROWS = (60_000, 30_000, 15_000, 8_000, 4_000)
+"""Rows that a tree is grown on: the most that leave time for `LEAST_ROUNDS`. On left-out logs of three measured sets
+rows are worth more than rounds (findings)."""
 TREE_FOLDS = {5: 0.8, 3: 0.6, 2: 0.4}
 """Parts that trees leave out in turn, each at the cost of a growth; and the share of rows beside the largest."""
 ALIKE_ROWS = 0.8
@@ -61,6 +63,10 @@ FOLDS = 5
 SHARE = {"perceptrons": 0.2, "trees": 0.4, "recurrent": 0.4}
 LONG_SHARE = {"perceptrons": 0.25, "trees": 0.15, "recurrent": 0.6}
 """Of what linear models and kernel machines leave of the budget, up to `LONG_ROWS` and above."""
+ALONE = {"perceptrons": 0.2, "trees": 0.5, "recurrent": 0.0}
+"""Of it where the recurrent network failed its trial. More would be ready later: nothing else runs beside trees."""
+TRIAL = 0.08
+"""Of it, and of the recurrent network's share, for a first short training of that network (see `RecurrentTrial`)."""
 LINEAR_PRODUCTS_PER_S, LINEAR_MODELS = 2e10, 2
 """Products of columns that sums for a ridge regression take in a second, and how many candidates need them. Measured
 were 2.8e10 to 7.4e10: every row is multiplied out once, whatever the folds."""
@@ -78,13 +84,26 @@ FEW_STEPS, MOST_PASSES = 500, 200
 """Rows of a short log are seen so often at most, but for so many updates: of 457 rows 2,500 updates leave 5 % more
 error on left-out rows than 700, of 966 rows 1,500 leave 1 % more than 300 and take five times as long."""
 LONG_ROWS = 100_000
-"""Training ticks above which most of the budget goes to the recurrent network, which has a memory of its own; below,
-its useful updates cost less than its share, and trees were the rival to beat (26 min of a small excavator)."""
+"""Training ticks above which most of the budget goes to the recurrent network, if its trial says that it will do well;
+below, its useful updates cost less than its share, and trees were the rival to beat (26 min of a small excavator)."""
 RECURRENT_ROWS = 20_000
 """Training ticks below which a recurrent network lost to the committee on every measured set that was tried."""
 RECURRENT_LANES, RECURRENT_CHUNK, RECURRENT_BURN_IN = 8, 128, 50
 RECURRENT_TICK = 70_000
 """Weights that a tick of the recurrent network passes through."""
+
+
+class RecurrentTrial(Enum):
+    """Whether the recurrent network is worth its share of the budget, which a short training of it tells.
+
+    On simulated machines it is far ahead of a committee, on each measured set that was tried far behind: there its time
+    is worth more to the trees (39 min of a full-size excavator; decision 99).
+    """
+
+    NONE = "none"
+    RUNNING = "running"
+    PASSED = "passed"
+    FAILED = "failed"
 
 
 @dataclass(frozen=True)
@@ -95,6 +114,7 @@ class Amount:
         rows: ticks of the training and validation parts.
         shortest: ticks of their shortest stretch.
         usual: ticks of most of their stretches; 0 for those of the shortest one.
+        trial: of the recurrent network, which decides how the budget is divided.
         features: features of a tick.
         outputs: horizons times targets.
         horizon: the largest one, in ticks.
@@ -116,6 +136,7 @@ class Amount:
     foundation: Foundation | None = None
     changes: bool = True
     usual: int = 0
+    trial: RecurrentTrial = RecurrentTrial.NONE
 
     @property
     def span(self) -> int:
@@ -130,7 +151,19 @@ class Amount:
         """Processor time for a kind of learner."""
         budget = 60 * self.minutes
         left = max(budget - _fixed_seconds(self), LEAST_SHARE * budget)
-        return left * (LONG_SHARE if self.rows > LONG_ROWS else SHARE)[kind]
+        return left * self._shares()[kind]
+
+    def _shares(self) -> dict[str, float]:
+        """Of that time, by kind of learner."""
+        shares = LONG_SHARE if self.rows > LONG_ROWS else SHARE
+        match self.trial:
+            case RecurrentTrial.RUNNING:
+                return dict.fromkeys(shares, 0.0) | {"recurrent": TRIAL}
+            case RecurrentTrial.PASSED:
+                return shares | {"recurrent": shares["recurrent"] - TRIAL}
+            case RecurrentTrial.FAILED:
+                return ALONE
+        return shares
 
     @property
     def window(self) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from edp.config.experiment import Experiment, plain_tree
+from edp.config.experiment import plain_tree
 from edp.data.prepared import Prepared
 from edp.data.scaling import least_spread
 from edp.data.task import TargetMode
@@ -22,15 +22,16 @@ from edp.storage import make_folder, read_object, write_json
 from edp.storage.runs import run_key
 from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
-from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
+from edp.workflows.auto.candidates import LEAST_SPAN, Amount
 from edp.workflows.auto.channels import MOST_LISTED, fit_to_channels
 from edp.workflows.auto.choice_facts import choice_facts
 from edp.workflows.auto.division import divide
 from edp.workflows.auto.foundation import Foundation, read_foundation
-from edp.workflows.auto.promise import blocks_of, choose
+from edp.workflows.auto.portfolio import Trainer, train_portfolio
+from edp.workflows.auto.promise import choose
 from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.auto.size import check_size
-from edp.workflows.auto.train_candidates import CandidateTraining, TrainedCandidate, train_all
+from edp.workflows.auto.train_candidates import TrainedCandidate
 from edp.workflows.train_evaluate import keep_fitted, prepare_data
 
 MOST_TICKS = 0.9
@@ -94,8 +95,8 @@ def train_auto(
         return finished
     _check_moving(data)
     check_size(data)
-    jobs = _jobs(_experiments(settings, amount), data, amount, folder)
-    outcomes = {job.name: one for job, one in zip(jobs, train_all(jobs, workers, on_event, on_candidate), strict=True)}
+    portfolio = train_portfolio(settings, data, amount, folder, Trainer(workers, on_event, on_candidate))
+    outcomes, amount = portfolio.outcomes, portfolio.amount
     trained = {name: one for name, one in outcomes.items() if isinstance(one, TrainedCandidate)}
     failed = {name: one for name, one in outcomes.items() if isinstance(one, str)}
     if not trained:
@@ -103,7 +104,7 @@ def train_auto(
     choice = choose({name: one.promise for name, one in trained.items()})
     facts = choice_facts(choice, trained, failed, data, settings, amount) | {
         "key": key,
-        "notes": [*of_channels, *of_parts, *_still_inputs(data)],
+        "notes": [*of_channels, *of_parts, *_still_inputs(data), *portfolio.notes],
     }
     winner, floor = trained[choice.name], trained.get(FLOOR)
     # First the choice, whose key tells a folder that a kill left between the two from one of another run.
@@ -246,28 +247,3 @@ def _moving(parts: Sequence[FloatArray], kinds: Sequence[Kind]) -> list[bool]:
     values = np.concatenate(parts).astype(np.float64)
     spreads, sizes = values.std(axis=0), np.abs(values).max(axis=0)
     return [spread > least_spread(kind, size) for spread, size, kind in zip(spreads, sizes, kinds, strict=True)]
-
-
-def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment]:
-    """The candidates that suit the data, the simplest first."""
-    names = settings.auto.candidates or tuple(CANDIDATES)
-    chosen = [name for name in CANDIDATES if name in names]
-    _ = [CANDIDATES[name] for name in names]  # an unknown name is answered with the closest
-    tables = {name: CANDIDATES[name].tables(amount) for name in chosen}
-    experiments = {name: settings.experiment(table) for name, table in tables.items() if table is not None}
-    if not experiments:
-        raise ConfigError(
-            f"auto.candidates = {list(names)}: none of them suits {amount.rows:,} ticks of training; add 'linear' or "
-            "'committee'"
-        )
-    return experiments
-
-
-def _jobs(experiments: dict[str, Experiment], data: Prepared, amount: Amount, folder: Path) -> list[CandidateTraining]:
-    """The trainings of the candidates, judged on the same blocks."""
-    blocks, judged = blocks_of(data, amount.window)
-    begun = {"foundation": amount.foundation}
-    return [
-        CandidateTraining(name, experiment, data, folder / "candidates" / name, blocks, judged, begun.get(name))
-        for name, experiment in experiments.items()
-    ]

@@ -39,6 +39,7 @@ class CandidateTraining:
         blocks: on which it is judged; the last `judged` of them are of the validation part.
         judged: how many.
         foundation: a network to begin with; None where it begins at random.
+        trial: a short training that tells whether a long one is worth its time.
     """
 
     name: str
@@ -48,11 +49,12 @@ class CandidateTraining:
     blocks: Sequence[Block]
     judged: int
     foundation: Foundation | None = None
+    trial: bool = False
 
     @property
     def label(self) -> str:
         """How sentences call it."""
-        return CANDIDATES[self.name].label
+        return CANDIDATES[self.name].label + (", a short trial" if self.trial else "")
 
     @property
     def on_folds(self) -> bool:
