@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
 from edp.monitor.detectors.separate_cusums import SeparateCusumsSpec
-from edp.monitor.residuals.base import ResidualSource, note_nothing, residuals_of, rows_of, sisters_of
+from edp.monitor.residuals.base import ResidualSource, SideBySide, note_nothing, residuals_of, rows_of, sisters_of
 from edp.monitor.summaries import BlockSummaries
 from edp.monitor.watches import BankSpec, Watch, WatchSpec, fit_watch, scaled_alike
 from edp.recording import Recording
@@ -34,6 +34,8 @@ LEAST_SESSIONS = 4
 """For conditioning and limits."""
 LEAST_TICKS = 10
 """Of a block: spreads of fewer say nothing."""
+NO_FOLD = -1
+"""In place of the number of a fold: nothing is left out."""
 
 
 def default_watches() -> tuple[WatchSpec, ...]:
@@ -127,6 +129,7 @@ def fit_chain(
     sessions: Sequence[Recording],
     promised_hours: float,
     note: Callable[[str], None] = note_nothing,
+    side_by_side: SideBySide = map,
 ) -> FittedChain:
     """Fit all behind the residuals.
 
@@ -137,6 +140,7 @@ def fit_chain(
         sessions: healthy ones.
         promised_hours: operating hours to one false alarm.
         note: called with what begins.
+        side_by_side: calls a function for each of some jobs, such as in processes.
 
     Raises:
         ConfigError: too few hours for the promise; says for which there are enough.
@@ -150,16 +154,17 @@ def fit_chain(
         )
     note("summaries of healthy sessions")
     summaries = fit_summaries(spec, sources, channels, sessions)
-    blocks = [
-        blocks_of(summaries, sisters_of(sources, spec.tolerance, number), channels, session)
+    jobs = [
+        BlocksJob(summaries, sisters_of(sources, spec.tolerance, number), channels, session)
         for number, session in enumerate(sessions)
     ]
+    blocks = list(side_by_side(summarised, jobs))
     rate_hz = sessions[0].rate_hz
     shortest = min(session.samples for session in sessions)
     # A tenth: one-minute cycles of a rig would otherwise lose most of what they have.
     settle_ticks = min(round(spec.settle_s * rate_hz), shortest // 10)
     settle = -(-settle_ticks // summaries.block)
-    return fit_from_blocks(spec, summaries, blocks, rate_hz, settle, promised_hours, note)
+    return fit_from_blocks(spec, summaries, blocks, rate_hz, settle, promised_hours, note, side_by_side)
 
 
 def fit_from_blocks(
@@ -170,26 +175,21 @@ def fit_from_blocks(
     settle: int,
     promised_hours: float,
     note: Callable[[str], None] = note_nothing,
+    side_by_side: SideBySide = map,
 ) -> FittedChain:
     """`fit_chain` from the blocks of the sessions on."""
     note("conditioning, views and limit")
     remaining, doubtful = _without_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
-    white: list[Array] = [np.zeros(0)] * len(remaining)
     drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
-    conditioning = _conditioning(spec, remaining, settle)
-    whole = [_conditioned(conditioning, drift, part, settle) for part in remaining]
-    watches = _watches(spec, whole, blocks_per_s, settle)
     folds = min(spec.folds, len(remaining))
-    for fold in range(folds):
-        others = [part for i, part in enumerate(remaining) if i % folds != fold]
-        own_conditioning = _conditioning(spec, others, settle)
-        fitted = [_conditioned(own_conditioning, drift, part, settle) for part in others]
-        own = _watches(spec, fitted, blocks_per_s, settle)
-        own = [_as_wide(watch, whole_one.directions) for watch, whole_one in zip(own, watches, strict=True)]
-        for i in range(fold, len(remaining), folds):
-            # The start of a session is operating time: its rows are missing, and count as healthy.
-            white[i] = BankSpec(tuple(own)).white(*_conditioned(own_conditioning, drift, remaining[i], settle))
+    jobs = [_Part(spec, remaining, drift, blocks_per_s, settle, fold, folds) for fold in (NO_FOLD, *range(folds))]
+    white: list[Array] = [np.zeros(0)] * len(remaining)
+    for job, (own_conditioning, own, rows) in zip(jobs, side_by_side(_fit_part, jobs), strict=True):
+        if job.fold == NO_FOLD:
+            conditioning, watches = own_conditioning, own
+        for place, part in zip(job.left_out, rows, strict=True):
+            white[place] = _as_wide(part, [watch.directions for watch in watches])
     # On sessions that a view was not fitted to: on its own ones one of many directions looks far too calm.
     bank = BankSpec(scaled_alike(spec.watches, watches, white))
     limit = calibrated(bank, white, blocks_per_s, promised_hours)
@@ -206,13 +206,51 @@ def _watches(spec: ChainSpec, sessions: Sequence[tuple[Array, Array]], blocks_pe
     ]
 
 
-def _as_wide(watch: Watch, directions: int) -> Watch:
-    """A view of a fold as wide as that of all sessions: a direction that it lacks counts as healthy."""
-    if watch.directions == directions:
-        return watch
-    matrix = np.zeros((len(watch.matrix), directions))
-    matrix[:, : min(directions, watch.directions)] = watch.matrix[:, :directions]
-    return replace(watch, matrix=matrix)
+def _as_wide(parts: Sequence[Array], directions: Sequence[int]) -> Array:
+    """Rows of the views of a fold as wide as those of all sessions: a direction that it lacks counts as healthy."""
+    wide = []
+    for part, width in zip(parts, directions, strict=True):
+        fitting = part[:, :width]
+        wide.append(np.pad(fitting, ((0, 0), (0, width - fitting.shape[1]))))
+    return np.concatenate(wide, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A fit to all sessions, or to those outside a fold."""
+
+    spec: ChainSpec
+    sessions: Sequence[SessionBlocks]
+    drift: SlowDrift
+    blocks_per_s: float
+    settle: int
+    fold: int
+    folds: int
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return "conditioning and views" if self.fold == NO_FOLD else f"fold {self.fold + 1} of {self.folds}"
+
+    @property
+    def left_out(self) -> range:
+        """Places of the sessions that it is not fitted to."""
+        return range(0) if self.fold == NO_FOLD else range(self.fold, len(self.sessions), self.folds)
+
+
+def _fit_part(job: _Part) -> tuple[Conditioning, list[Watch], list[list[Array]]]:
+    """Conditioning, views, and the rows of each view for each session that they were not fitted to."""
+    out = set(job.left_out)
+    others = [session for place, session in enumerate(job.sessions) if place not in out]
+    conditioning = _conditioning(job.spec, others, job.settle)
+    fitted = [_conditioned(conditioning, job.drift, session, job.settle) for session in others]
+    watches = _watches(job.spec, fitted, job.blocks_per_s, job.settle)
+    rows = []
+    for place in job.left_out:
+        # The start of a session is operating time: its rows are missing, and count as healthy.
+        clipped, gross = _conditioned(conditioning, job.drift, job.sessions[place], job.settle)
+        rows.append([watch(gross if watch.own else clipped) for watch in watches])
+    return conditioning, watches, rows
 
 
 def _quiet(bank: BankSpec, sessions: Sequence[Array]) -> float:
@@ -253,10 +291,13 @@ def doubtful_sessions(
     sources: Sequence[ResidualSource],
     channels: Sequence[Channel],
     sessions: Sequence[Recording],
+    side_by_side: SideBySide = map,
 ) -> tuple[str, ...]:
     """Names of further sessions whose means lie far from those that a chain was fitted to, such as of the training."""
     chain = fitted.chain
-    blocks = [blocks_of(chain.summaries, sources, channels, session) for session in sessions]
+    blocks = list(
+        side_by_side(summarised, [BlocksJob(chain.summaries, sources, channels, session) for session in sessions])
+    )
     bad = _doubtful(spec, blocks, fitted.sessions, chain.settle)
     return tuple(block.name for block, out in zip(blocks, bad, strict=True) if out)
 
@@ -381,6 +422,26 @@ def blocks_of(
     rows = rows_of(session, [channel.name for channel in channels])
     raw, points, _ = summaries.run(residuals, rows, summaries.initial_state())
     return SessionBlocks(session.name, raw, points)
+
+
+@dataclass(frozen=True, eq=False)
+class BlocksJob:
+    """What `blocks_of` is called with."""
+
+    summaries: BlockSummaries
+    sources: Sequence[ResidualSource]
+    channels: Sequence[Channel]
+    session: Recording
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return self.session.name
+
+
+def summarised(job: BlocksJob) -> SessionBlocks:
+    """`blocks_of` of a job."""
+    return blocks_of(job.summaries, job.sources, job.channels, job.session)
 
 
 def session_means(channels: Sequence[Channel], sessions: Sequence[Recording]) -> Array:
