@@ -20,6 +20,8 @@ _SHOWN_ROWS = 60
 """Columns in the table; all of them are in the map and in --json."""
 _SHOWN_NAME = 20
 """Characters of a name in the table, which fits into 80 columns."""
+_SHOWN_END = 11
+"""Of these, from the end of a longer name."""
 
 
 def init(
@@ -69,7 +71,8 @@ def show_proposal(proposal: LogsProposal) -> None:
     rate = "unknown rate" if clock.rate_hz is None else f"{clock.rate_hz:.5g} Hz"
     count = len(proposal.group.paths)
     out.print(f"{count} log(s) with these columns; {look.path.name}: {look.rows:,} rows, {rate}")
-    columns = proposal.proposal.columns
+    # What never moves last: logs of ROS hold more of it than fits.
+    columns = sorted(proposal.proposal.columns, key=lambda guess: guess.role == "constant")
     rows = [_row(guess) for guess in columns[:_SHOWN_ROWS]]
     listing("", ["column", "role", "kind", "unit", "sure", "check"], rows)
     if len(columns) > _SHOWN_ROWS:
@@ -85,7 +88,10 @@ def show_proposal(proposal: LogsProposal) -> None:
 
 
 def _row(guess: ColumnGuess) -> tuple[str, ...]:
-    name = guess.column if len(guess.column) <= _SHOWN_NAME else guess.column[: _SHOWN_NAME - 3] + "..."
+    name = guess.column
+    if len(name) > _SHOWN_NAME:
+        # Names of topics differ at their ends.
+        name = f"{name[: _SHOWN_NAME - 3 - _SHOWN_END]}...{name[-_SHOWN_END:]}"
     kind = (str(guess.kind.kind).replace("_", " "), guess.kind.unit) if guess.channel else ("-", "-")
     return name, guess.role, *kind, guess.sureness, guess.check or guess.why
 
