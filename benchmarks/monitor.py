@@ -30,9 +30,10 @@ import numpy as np
 
 from common import Verdict, finish, in_folder, kept, parser, table, verdict
 from edp.monitor.alarms import MonitorAlarm
-from edp.monitor.fitting import SessionBlocks, fit_from_blocks
+from edp.monitor.fitting import fit_from_blocks
 from edp.monitor.monitor_file import load_monitor
 from edp.monitor.residuals.base import SideBySide
+from edp.monitor.session_blocks import SessionBlocks
 from edp.sandbox.helpers import Helpers
 from edp.sim.faults import FAULTS, parse_fault
 from monitor_metrics import (

@@ -16,11 +16,12 @@ from edp.config.monitor import MonitorExperiment, load_monitor_experiment
 from edp.errors import DataError
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
-from edp.monitor.fitting import SessionBlocks, blocks_of, fit_from_blocks
+from edp.monitor.fitting import fit_from_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.monitor.residuals.base import ResidualSource, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
+from edp.monitor.session_blocks import SessionBlocks, blocks_of
 from edp.recording import Recording
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.workflows.monitor import fit_to_recordings

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.monitor.chain import MonitorChain
-from edp.monitor.fitting import SessionBlocks
 from edp.monitor.residuals.base import ResidualSource
 from edp.monitor.residuals.flow_balances import FlowBalances
+from edp.monitor.session_blocks import SessionBlocks
 
 Array = NDArray[np.float64]
 FIRST_S = 120.0
@@ -78,12 +78,12 @@ def _axes(sources: Sequence[ResidualSource], chain: MonitorChain) -> dict[str, l
     """Columns of the summaries of balances of flow, by the velocity that they judge."""
     each = chain.summaries.width // chain.summaries.residuals
     axes: dict[str, list[int]] = {}
-    place = 0
+    index = 0
     for source in sources:
         for judged in source.judged:
             if isinstance(source, FlowBalances):
-                axes.setdefault(judged[0], []).extend(range(place * each, (place + 1) * each))
-            place += 1
+                axes.setdefault(judged[0], []).extend(range(index * each, (index + 1) * each))
+            index += 1
     return axes
 
 

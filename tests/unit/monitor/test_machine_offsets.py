@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edp.monitor.fitting import SessionBlocks
 from edp.monitor.machine_offsets import other_machine, scatter_of
 from edp.monitor.residuals.flow_balances import FlowBalances
+from edp.monitor.session_blocks import SessionBlocks
 
 BLOCKS, EACH, SETTLE = 300, 8, 5
 

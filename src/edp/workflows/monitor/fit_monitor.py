@@ -14,7 +14,7 @@ import numpy as np
 from edp.config.monitor import MonitorExperiment, monitor_toml
 from edp.errors import ConfigError, DataError, closest
 from edp.logs.source import DataSource
-from edp.monitor.fitting import SessionBlocks, doubtful_sessions, fit_chain, session_means
+from edp.monitor.fitting import doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import save_monitor
@@ -22,6 +22,7 @@ from edp.monitor.residuals.base import FitMaterial, ResidualSource, ResidualSpec
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.residuals.groups import Group, sensed_channels
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
+from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.recording import Recording
 from edp.signals import Channel
 from edp.storage import check_writable, write_bytes
@@ -273,11 +274,11 @@ def _sources(
         jobs += [_Fit(spec, material, group, len(groups)) for group in groups]
     fits: dict[ResidualSpec, ResidualSource | None] = {}
     networks: dict[ResidualSpec, dict[str, Bundle]] = {}
-    for job, found in zip(jobs, side_by_side(_fit_source, jobs), strict=True):
+    for job, result in zip(jobs, side_by_side(_fit_source, jobs), strict=True):
         if job.group is None:
-            fits[job.spec] = found
-        elif found is not None:
-            networks.setdefault(job.spec, {})[job.group.name] = found
+            fits[job.spec] = result
+        elif result is not None:
+            networks.setdefault(job.spec, {})[job.group.name] = result
             fits[job.spec] = VirtualSensorsSpec.together(networks[job.spec], material)
     sources = tuple(source for spec in experiment.residuals if (source := fits.get(spec)) is not None)
     if not sources:

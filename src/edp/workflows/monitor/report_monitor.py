@@ -86,8 +86,8 @@ def _remarks(content: Mapping[str, Any], where: str) -> dict[str, list[str]]:
         entries = content.get(key, {})
         if not isinstance(entries, dict) or len(entries) > MOST_REMARKED:
             raise StorageError(f"{where}: {key} must be an object of at most {MOST_REMARKED}; run the monitor again")
-        for name, said in entries.items():
-            for remark in said if isinstance(said, list) else [said]:
+        for name, texts in entries.items():
+            for remark in texts if isinstance(texts, list) else [texts]:
                 remarks.setdefault(_text(remark, where), []).append(_text(name, where))
     return remarks
 
