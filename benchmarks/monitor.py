@@ -313,7 +313,8 @@ class Beside:
     """Work in a thread beside the rest, whose result is asked for later; ends with the program."""
 
     def __init__(self, work: Callable[[], Any]) -> None:
-        self._work, self._result, self._error = work, None, None
+        self._work, self._result = work, None
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import ConfigError, DataError, closest
+from edp.errors import BundleError, ConfigError, DataError, closest
 from edp.logs.source import DataSource
 from edp.monitor.fitting import doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
@@ -82,12 +82,26 @@ def fit_monitor(
         EdpError: runs or logs that cannot be used, or too few hours for the promise.
     """
     check_writable(out)
-    bundles = [load_twin(run) if holds_twin(run) else load_bundle(run) for run in runs]
+    bundles = [_network_of(run) for run in runs]
     recordings = source.read()
     fitted = fit_to_recordings(recordings, experiment, bundles, note)
     folder = save_monitor(fitted.monitor, out)
     write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
     return replace(fitted, folder=folder)
+
+
+def _network_of(run: str | Path) -> Bundle | TwinBundle:
+    """The network or twin of a run.
+
+    Raises:
+        BundleError: it holds none, or is damaged.
+    """
+    try:
+        return load_twin(run) if holds_twin(run) else load_bundle(run)
+    except BundleError as error:
+        if any((Path(run) / name).exists() for name in ("bundle", "bundle.json", "run.json", "twin")):
+            raise
+        raise BundleError(f"{error}; healthy logs are the last argument alone: put them into one folder") from error
 
 
 @one_blas_thread()
