@@ -304,6 +304,8 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     for other in others:
         names = ", ".join(path.name[:40] for path in other.paths[:3])
         notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")
+    if any(guess.role == "label" for guess in proposal.columns):
+        notes.append("labels: those that are known while the machine works may be features")
     notes += [f"not readable: {reason[:300]}" for reason in list(broken.values())[:3]]
     if len(broken) > 3:
         notes.append(f"{len(broken) - 3} more logs are not readable")
