@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ KEPT = 0.1
 """How far the test error may lie from the promise."""
 STUDENT_UNITS, STUDENT_LOSS = 64, 0.02
 """Width of a student's two perceptrons, and how much more error than its committee it may have."""
+
+ENDS, SKILLS = ("low", "high"), ("promise", "test")
+"""Keys of a promise's interval, and of a skill, in ``auto.json``."""
 
 
 @dataclass(frozen=True)
@@ -67,47 +71,93 @@ class Task:
     student: float | None
 
 
-def run_set(
-    entry: dict[str, Any], seeds: Sequence[int], changes: Sequence[str], distilled: bool
-) -> tuple[list[Task], dict[str, Any]]:
-    """Train and judge one set with every seed; its tasks, and what was chosen in how many seconds."""
-    judged: list[dict[str, Any]] = []
-    promised: list[dict[str, Any]] = []
-    choices: list[dict[str, Any]] = []
-    taught: list[dict[str, Any]] = []
-    notes: dict[str, Any] = {"chosen": [], "seconds": [], "student": []}
-    for seed in seeds:
-        with tempfile.TemporaryDirectory() as folder:
-            began = time.perf_counter()
-            settings = load_auto(EXAMPLES / entry["settings"], [f"auto.seed={seed}", *changes])
-            facts = train_auto(DataSource.of(EXAMPLES / entry["data"]), settings, Path(folder) / "run").facts
-            notes["seconds"].append(round(time.perf_counter() - began, 1))
-            notes["chosen"].append(facts["chosen"])
-            promised.append(facts["candidates"][facts["chosen"]]["promise"])
-            judged.append(read_json(evaluate(Path(folder) / "run", baselines=tuple(BASELINES)) / "scores.json"))
-            choices.append(read_json(Path(folder) / "run" / "auto.json"))
-            if distilled and facts["chosen"] == "committee":
-                request = DistilRequest(spec=DistilSpec(units=STUDENT_UNITS))
-                student = distil(Path(folder) / "run", request, Path(folder) / "student").predictor
-                notes["student"].append(sum(weights.numel() for weights in student.parameters()))
-                taught.append(read_json(evaluate(Path(folder) / "student", baselines=()) / "scores.json"))
+@dataclass(frozen=True)
+class Training:
+    """One set trained with one seed; what its tasks are made of.
+
+    Attributes:
+        scores: of the run, every baseline among them.
+        choice: what `edp train` wrote of its choice (``auto.json``).
+        chosen: the candidate.
+        promise: its errors on left-out data, by horizon and target.
+        seconds: that training took, wall clock.
+        taught: scores of the committee's student; None where none was made.
+        student: its number of parameters.
+    """
+
+    scores: dict[str, Any]
+    choice: dict[str, Any]
+    chosen: str
+    promise: dict[str, Any]
+    seconds: float
+    taught: dict[str, Any] | None
+    student: int | None
+
+
+def train_set(entry: dict[str, Any], seed: int, changes: Sequence[str], distilled: bool) -> Training:
+    """Train and judge one set with one seed."""
+    taught, size = None, None
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        settings = load_auto(EXAMPLES / entry["settings"], [f"auto.seed={seed}", *changes])
+        facts = train_auto(DataSource.of(EXAMPLES / entry["data"]), settings, Path(folder) / "run").facts
+        seconds = round(time.perf_counter() - began, 1)
+        scores = read_json(evaluate(Path(folder) / "run", baselines=tuple(BASELINES)) / "scores.json")
+        choice = read_json(Path(folder) / "run" / "auto.json")
+        if distilled and facts["chosen"] == "committee":
+            request = DistilRequest(spec=DistilSpec(units=STUDENT_UNITS))
+            student = distil(Path(folder) / "run", request, Path(folder) / "student").predictor
+            size = sum(weights.numel() for weights in student.parameters())
+            # A baseline beside it, whose history sets the first tick that counts: the rows of its committee.
+            taught = read_json(evaluate(Path(folder) / "student", baselines=("persistence",)) / "scores.json")
+    promise = facts["candidates"][facts["chosen"]]["promise"]
+    return Training(scores, choice, facts["chosen"], promise, seconds, taught, size)
+
+
+def tasks_of(entry: dict[str, Any], trainings: Sequence[Training]) -> list[Task]:
+    """Medians over the seeds of one set."""
     tasks = []
+    taught = [one.taught for one in trainings if one.taught is not None]
     for target, horizon, persistence, linear in entry["rows"]:
         errors = {
-            model: float(np.median([rmse(scores, model, target, horizon) for scores in judged]))
+            model: float(np.median([rmse(one.scores, model, target, horizon) for one in trainings]))
             for model in ("network", *BASELINES)
         }
         ours = errors.pop("network")
         best = min(errors, key=lambda model: errors[model])
-        promise = median_of(promised, horizon, target)
-        bounds = [median_of([one["interval"][side] for one in choices], horizon, target) for side in ("low", "high")]
-        skills = [median_of([one["skill"][part] for one in choices], horizon, target) for part in ("promise", "test")]
+        promise = median_of([one.promise for one in trainings], horizon, target)
+        low, high = (median_of([one.choice["interval"][side] for one in trainings], horizon, target) for side in ENDS)
+        told, shown = (median_of([one.choice["skill"][part] for one in trainings], horizon, target) for part in SKILLS)
         floor = min(persistence, linear)
         student = [rmse(scores, "network", target, horizon) for scores in taught]
         of_student = float(np.median(student)) if student else None
-        rival = (errors[best], best)
-        tasks.append(Task(entry["title"], target, horizon, ours, floor, *rival, promise, *bounds, *skills, of_student))
-    return tasks, notes
+        tasks.append(
+            Task(
+                entry["title"],
+                target,
+                horizon,
+                ours,
+                floor,
+                errors[best],
+                best,
+                promise,
+                low,
+                high,
+                told,
+                shown,
+                of_student,
+            )
+        )
+    return tasks
+
+
+def notes_of(trainings: Sequence[Training]) -> dict[str, Any]:
+    """What was chosen, in how many seconds, and how many numbers a student has, for every seed."""
+    return {
+        "chosen": [one.chosen for one in trainings],
+        "seconds": [one.seconds for one in trainings],
+        "student": [one.student for one in trainings if one.student is not None],
+    }
 
 
 def median_of(errors: Sequence[dict[str, Any]], horizon: int, target: str) -> float:
@@ -189,20 +239,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser(__doc__ or "")
     options.add_argument("--shared", type=Path, default=None, help="folder of the recordings (else $EDP_SHARED_DATA)")
     options.add_argument("--seeds", type=int, default=5, help="how many seeds, from --seed on")
+    options.add_argument("--workers", type=int, default=1, help="trainings side by side, each a process of its own")
     chosen = options.parse_args(arguments)
     if shared_folder(chosen.shared) is None:
         return
     seeds = range(chosen.seed, chosen.seed + (1 if chosen.quick else chosen.seeds))
+    entries = read_toml(EXAMPLES / "leagues.toml")["floors"]
+    entries = [entry for entry in entries if not chosen.quick or entry["data"] in QUICK_SETS]
+    changes = QUICK if chosen.quick else ()
     tasks: list[Task] = []
     notes: dict[str, dict[str, Any]] = {}
-    for entry in read_toml(EXAMPLES / "leagues.toml")["floors"]:
-        if chosen.quick and entry["data"] not in QUICK_SETS:
-            continue
-        print(f"{entry['settings']} ...", file=sys.stderr, flush=True)
-        found, notes[entry["title"]] = run_set(entry, seeds, QUICK if chosen.quick else (), not chosen.quick)
-        show(found, {entry["title"]: notes[entry["title"]]})
-        print(flush=True)
-        tasks += found
+    # Processes of their own, so that the compiled parts and pools of one training are not those of another.
+    with ProcessPoolExecutor(chosen.workers, mp_context=get_context("spawn")) as pool:
+        begun = [
+            [pool.submit(train_set, entry, seed, changes, not chosen.quick) for seed in seeds] for entry in entries
+        ]
+        for entry, futures in zip(entries, begun, strict=True):
+            trainings = [future.result() for future in futures]
+            of_set, notes[entry["title"]] = tasks_of(entry, trainings), notes_of(trainings)
+            show(of_set, {entry["title"]: notes[entry["title"]]})
+            print(flush=True)
+            tasks += of_set
     show(tasks, notes)
     kept = {"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}
     finish("auto_preset", verdicts_of(tasks, chosen.quick), chosen.seed, json.loads(json.dumps(kept)))
