@@ -93,17 +93,17 @@ def show_proposal(proposal: LogsProposal) -> None:
 def _rows(columns: Sequence[ColumnGuess]) -> list[tuple[str, ...]]:
     """Rows of the table: name, role, kind, unit, sureness, and what to check or why."""
     rows: list[tuple[str, ...]] = []
-    held: list[str] = []
+    siblings: list[str] = []
     for guess in columns:
         row = _row(guess)
-        if rows and row[1:] == rows[-1][1:] and _follows(held[-1], guess.column):
-            held.append(guess.column)
+        if rows and row[1:] == rows[-1][1:] and _follows(siblings[-1], guess.column):
+            siblings.append(guess.column)
         else:
-            held = [guess.column]
-        if len(held) == _SIBLINGS:
+            siblings = [guess.column]
+        if len(siblings) == _SIBLINGS:
             del rows[2 - _SIBLINGS :]  # all but the first of them
-        if len(held) >= _SIBLINGS:
-            rows[-1] = (f"{_cut(held[0])} to {_cut(held[-1])}", *row[1:])
+        if len(siblings) >= _SIBLINGS:
+            rows[-1] = (f"{_cut(siblings[0])} to {_cut(siblings[-1])}", *row[1:])
         else:
             rows.append(row)
     return rows

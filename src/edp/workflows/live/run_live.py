@@ -364,7 +364,7 @@ def _interrupts(stop: asyncio.Event) -> Iterator[None]:
     """Ctrl-C and the system's request end the session, and files are finished; only the main thread hears them."""
     loop = asyncio.get_running_loop()
     signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    kept = {number: signal.getsignal(number) for number in signals}
+    handlers_before = {number: signal.getsignal(number) for number in signals}
     for number in signals:
         try:
             loop.add_signal_handler(number, stop.set)
@@ -377,4 +377,4 @@ def _interrupts(stop: asyncio.Event) -> Iterator[None]:
             with contextlib.suppress(NotImplementedError):
                 loop.remove_signal_handler(number)
             # None: a handler that is not Python's cannot be set again.
-            signal.signal(number, kept[number] or signal.SIG_DFL)
+            signal.signal(number, handlers_before[number] or signal.SIG_DFL)
