@@ -9,12 +9,14 @@ Part nmpc sets predictive control on a well-trained twin beside a PI loop that i
 inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part
 o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
 plant; part o4_other the same for C14 in loam. Part grey asks parts nmpc, but for C14, and o4 of a grey box with a known
-linkage, fitted to 45 min of logs in free air, in place of the network. Part grey_other does so for C14: predictive
-control on a grey box of 20 min of its logs in free air; o4_grey_other asks gains in loam of grey boxes of 5, 20 and 45
-min, o4_ground of the one of 20 min with a ground that it learned from as many minutes in loam. Their models are trained
-where --data has none: 3 h of recordings, some ten processor minutes.
+linkage, fitted to 45 min of logs in free air, in place of the network: parts grey and o4_grey. Part grey_other does so
+for C14: predictive control on a grey box of 20 min of its logs in free air; o4_grey_other asks gains in loam of grey
+boxes of 5, 20 and 45 min, o4_ground of the one of 20 min with a ground that it learned from as many minutes in loam,
+on the plant with four draws of the ground. Their models are trained where --data has none: 3 h of recordings, some ten
+processor minutes.
 
-Results are kept part by part, `closed_loop_PART.json`.
+Results are kept part by part, `closed_loop_PART.json`; of another seed, with other logs and fits of the models but the
+same lines, in `closed_loop_PART_seedN.json`.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ from edp.workflows.twin import train_twin
 
 MACHINE = "M22"
 LEAD_TICKS = 20
-PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_other", "o4_grey_other", "o4_ground")
+PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_grey", "o4_other", "o4_grey_other", "o4_ground")
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ QUICK = Size(
 def main() -> None:
     arguments_of = parser(__doc__ or "")
     arguments_of.add_argument("--part", choices=["all", *PARTS], default="all")
-    arguments_of.add_argument("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines, in part nmpc")
+    arguments_of.add_argument("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines")
+    arguments_of.add_argument("--variants", type=int, choices=range(2, 7), default=6, help="of the plant, last ones")
     arguments = arguments_of.parse_args()
     chosen = PARTS if arguments.part == "all" else (arguments.part,)
 
@@ -90,7 +93,8 @@ def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
     """One part, whose results are kept in a file of its own."""
     quick, seed = arguments.quick, arguments.seed
     size = QUICK if quick else FULL
-    of_loops = nmpc_of.QUICK if quick else replace(nmpc_of.FULL, draws=arguments.draws)
+    full = replace(nmpc_of.FULL, draws=arguments.draws, variants=arguments.variants)
+    of_loops = nmpc_of.QUICK if quick else full
     of_tuning = tuning_of.QUICK if quick else tuning_of.FULL
     models = Models(folder, models_of.QUICK if quick else models_of.FULL, seed)
     details: dict[str, Any] = {"size": asdict(size)}
@@ -103,9 +107,11 @@ def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
     elif part == "grey":
         grey = models.grey(models_of.QUICK_GREY if quick else models_of.GREY)
         details[part], verdicts = predictive(models, of_loops, quick, seed, grey)
-        if not quick:  # A grey box of three minutes of logs has not been where the lines begin.
-            details[part]["o4"] = {"twin": tuning_of.tuning_on(grey, of_tuning, seed)}
-            verdicts += tuning_of.tuning_verdicts(details[part]["o4"], quick)
+    elif part == "o4_grey":
+        if quick:  # A grey box of three minutes of logs has not been where the lines begin.
+            return
+        details[part] = {"twin": tuning_of.tuning_on(models.grey(models_of.GREY), of_tuning, seed)}
+        verdicts = tuning_of.tuning_verdicts(details[part], quick)
     elif part == "grey_other":
         details[part], verdicts = grey_other(models, of_loops, quick, seed)
     elif part == "o4_grey_other":
@@ -117,7 +123,7 @@ def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
         verdicts = tuning_of.tuning_verdicts(details[part], quick)
     else:
         details[part] = tuning_of.tuning_other(models, of_tuning, seed)
-    finish(f"closed_loop_{part}", verdicts, seed, details, keep=not quick)
+    finish(f"closed_loop_{part}{f'_seed{seed}' if seed else ''}", verdicts, seed, details, keep=not quick)
 
 
 def predictive(
@@ -161,8 +167,12 @@ def o4_ground(models: Models, size: tuning_of.TuningSize, quick: bool, seed: int
     """C14: gains in loam on a grey box with a ground, beside what its ground explains of forces along logs."""
     run = models.other_grounded(models.size.other[0], _grey_fit(quick))
     rows = tuning_of.tuning_in_soil({"twin": run}, size, seed)
-    facts = {"ground": load_twin(run).provenance["ground"], "settings": asdict(size)}
-    return rows | facts, tuning_of.tuning_verdicts(rows, quick, ", C14 in loam, grey box with a ground")
+    where = ", C14 in loam, grey box with a ground"
+    verdicts = tuning_of.tuning_verdicts(rows, quick, where)
+    grounds = tuning_of.over_grounds(size, seed, rows["twin"])
+    verdicts += tuning_of.tuning_verdicts({"twin": grounds}, quick, f"{where}, mean over draws of the ground")
+    facts = {"grounds": grounds, "ground": load_twin(run).provenance["ground"], "settings": asdict(size)}
+    return rows | facts, verdicts
 
 
 def _grey_fit(quick: bool) -> tuple[str, ...]:

@@ -23,6 +23,8 @@ from edp.workflows.control.transfer_of_tuning import TransferSpec, TuningTransfe
 SEED, OTHER_SEED = 500_000, 600_000
 """First seeds of the lines, which neither judge a controller nor tune one; the others ask how far lines differ."""
 MACHINE, OTHER, SOIL = "M22", "C14", "sandy_loam"
+GROUNDS = (0, 1_000_000, 2_000_000, 3_000_000)
+"""Added to the seeds of loops, not to those of lines: draws of the ground's heights and strength, and of the noise."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +76,7 @@ def tuning_other(models: Models, size: TuningSize, seed: int) -> dict[str, dict[
 
 def tuning_in_soil(runs: Mapping[str, Path], size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
     """C14 in soil, on twins of it, which know no soil but that of their logs, or a ground of their own."""
-    experiment = ControlExperiment(
-        task=TASKS["grade"](material=SOIL), controller=CONTROLLERS["pi"](), machine=OTHER, loops=size.lines, seed=SEED
-    )
-    plant = ControlBench(experiment, ControlSources())
-    settings = drawn_settings(experiment.controller, TransferSpec(size.settings, seed))
+    experiment, plant, settings = _in_soil(size, seed)
     on_plant = costs_of(plant, settings)
     air = without_soil(ControlBench(experiment, ControlSources(), plant.models))
     rows = {"the plant, in free air": _row(costs_of(air, settings), on_plant)}
@@ -89,6 +87,45 @@ def tuning_in_soil(runs: Mapping[str, Path], size: TuningSize, seed: int) -> dic
         rows[name] = _row(costs_of(bench, settings), on_plant)
     show("gains of pi, C14 in loam", rows)
     return rows
+
+
+def over_grounds(size: TuningSize, seed: int, first: Mapping[str, Any]) -> dict[str, Any]:
+    """C14 in soil, the mean over draws of its ground, and beside it each draw by itself.
+
+    A model knows none of the draws; how the others rank the settings of a draw says how much of the order is chance.
+
+    Args:
+        size: how many settings and lines.
+        seed: of the drawing of the settings.
+        first: row of a model on the first draw.
+    """
+    _, plant, settings = _in_soil(size, seed)
+    on_model = first["on_model_mm"]
+    tasks, by_draw = plant.tasks, [np.array(first["on_plant_mm"])]
+    for shift in GROUNDS[1:]:
+        plant.tasks = [replace(task, seed=task.seed + shift) for task in tasks]
+        by_draw.append(costs_of(plant, settings))
+    costs = np.array(by_draw)
+    others = [np.delete(costs, n, axis=0).mean(0) for n in range(len(costs))]
+    row = _row(np.array(on_model), costs.mean(0))
+    row["each_draw"] = [TuningTransfer(np.array(on_model), draw).rank_correlation for draw in costs]
+    row["draw_by_draw"] = [[TuningTransfer(a, b).rank_correlation for a in costs] for b in costs]
+    row["each_draw_by_the_mean_of_the_others"] = [
+        TuningTransfer(other, draw).rank_correlation for other, draw in zip(others, costs, strict=True)
+    ]
+    show("C14 in loam, mean over draws of the ground", {"twin": row})
+    for name in ("each_draw", "each_draw_by_the_mean_of_the_others"):
+        print(name, [round(value, 3) for value in row[name]])
+    return row | {"each_draw_mm": costs.tolist()}
+
+
+def _in_soil(size: TuningSize, seed: int) -> tuple[ControlExperiment, ControlBench, list[ControllerSpec]]:
+    """C14 in soil: the experiment, the plant, and the settings to rank."""
+    experiment = ControlExperiment(
+        task=TASKS["grade"](material=SOIL), controller=CONTROLLERS["pi"](), machine=OTHER, loops=size.lines, seed=SEED
+    )
+    settings = drawn_settings(experiment.controller, TransferSpec(size.settings, seed))
+    return experiment, ControlBench(experiment, ControlSources()), settings
 
 
 def without_soil(bench: ControlBench) -> ControlBench:

@@ -102,6 +102,7 @@ UNITS: Mapping[str, Unit] = {
     "kip": Unit((Kind.FORCE,), 4448.2216152605),
     "m^3/s": Unit((Kind.FLOW,), 1.0),
     "L/min": Unit((Kind.FLOW,), 1.0 / 6e4),
+    "gal/min": Unit((Kind.FLOW,), 3.785411784e-3 / 60.0),
     "kg": Unit((Kind.MASS,), 1.0),
     "t": Unit((Kind.MASS,), 1e3),
     "K": Unit((Kind.TEMPERATURE,), 1.0),

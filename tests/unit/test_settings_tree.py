@@ -40,7 +40,7 @@ TREE = SettingsTree(what="test file", positions={Pair: ("low", "high")})
         ({"pair": ["0.1", 0.2]}, r"pair\[low\] = '0.1': a text is no number"),
         ({"pair": [0.1, True]}, r"pair\[high\] = True: true and false are no numbers"),
         ({"pair": [0.1]}, r"pair = \[0.1\] lists 1; a list of 2 must hold \(low, high\)"),
-        ({"pair": 0.1}, "pair = 0.1: a list must hold"),
+        ({"pair": 0.1}, r"pair = 0.1: a list must hold, in brackets such as \[1, 2\]"),
         ({"shares": {"a": "1"}}, "shares.a = '1': a text is no number"),
         ({"shares": 3}, "shares = 3: a table must hold"),
         ({"inner": {"count": 1.5}}, "inner.count = 1.5: an integer must hold"),

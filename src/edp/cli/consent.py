@@ -36,5 +36,6 @@ def ask_for_fmus(yes: bool, *plants: Path | None) -> None:
     from edp.workflows.control import is_fmu
 
     for plant in plants:
-        if plant is not None and is_fmu(plant) and not yes:
+        # Whether one that is not there may run is no question; what reads it says that it is missing.
+        if plant is not None and is_fmu(plant) and plant.exists() and not yes:
             ask(f"'{plant}': {FMU_CODE}")

@@ -75,7 +75,8 @@ def show_proposal(proposal: LogsProposal) -> None:
     rate = "unknown rate" if clock.rate_hz is None else f"{clock.rate_hz:.5g} Hz"
     count = len(proposal.group.paths)
     out.print(f"{count} log(s) with these columns; {look.path.name}: {look.rows:,} rows, {rate}")
-    columns = proposal.proposal.columns
+    # What never moves last: logs of ROS hold more of it than fits.
+    columns = sorted(proposal.proposal.columns, key=lambda guess: guess.role == "constant")
     rows = _rows(columns[:_SHOWN_ROWS])
     listing("", ["column", "role", "kind", "unit", "sure", "check"], rows)
     if len(columns) > _SHOWN_ROWS:

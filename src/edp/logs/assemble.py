@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from edp.storage.memory import check_memory
 
 _CACHED_ROWS = 4096
 """Rows written at a time: blocks of 1,000 to 4,000 are fastest, 500 or 8,000 take 1.5 to 2 times as long (findings)."""
+_MOST_EMPTY = 0.5
+"""Share of a log that may be left out since a channel has no value yet."""
 _TICK_BYTES = 25
 """What the time rule takes a tick: its time, its row and whether it is missing."""
 
@@ -104,8 +107,7 @@ class Assembly:
         )
 
     def _mended(self, start: int, stop: int, before: FloatArray | None) -> tuple[FloatArray, list[dict[str, Any]]]:
-        first = self.ticks.start + start
-        values = self._values(first, self.ticks.start + stop)
+        values = self.values(start, stop)
         missing = self.missing[start:stop]
         if self.repair.gaps != "hold":
             values[missing] = np.nan
@@ -115,6 +117,10 @@ class Assembly:
         offset = start if before is None else start - 1
         repairs = repair_values(values, missing, names, self.rate_hz, self.repair, f"'{self.raw.path}'", offset)
         return (values if before is None else values[1:]), repairs
+
+    def values(self, start: int, stop: int) -> FloatArray:
+        """The samples ``start <= t < stop`` as the file has them, float32, shape ``(time, channel)``."""
+        return self._values(self.ticks.start + start, self.ticks.start + stop)
 
     def _values(self, first: int, last: int) -> FloatArray:
         """Ticks ``first <= k < last`` of the grid, float32, shape ``(time, channel)``."""
@@ -211,7 +217,7 @@ def prepare(
     # Only values that are taken as they were written have the digest that was written with them.
     own_way = not signal_map.channels and signal_map.rate_hz is None and signal_map.sample_time_s is None
     untouched = own_way and repair == Repair() and (first, last) == (0, grid.count)
-    return Assembly(
+    assembly = Assembly(
         raw,
         sources,
         repair,
@@ -222,6 +228,38 @@ def prepare(
         repairs + gap_facts,
         untouched,
     )
+    return _without_empty_start(assembly) if repair.nan == "hold" and rows is None else assembly
+
+
+def _without_empty_start(assembly: Assembly) -> Assembly:
+    """A log from the first tick on at which every channel has had a value: before it, none can be held.
+
+    Raises:
+        DataError: more than `_MOST_EMPTY` of the log would be left out.
+    """
+    late = np.full(len(assembly.sources), -1)
+    # The first row by itself: most logs have all their values there.
+    edges = sorted({0, 1, *range(_CACHED_ROWS, assembly.samples, _CACHED_ROWS), assembly.samples})
+    for start, stop in pairwise(edges):
+        values = assembly.values(start, stop)
+        for i in np.flatnonzero(late < 0):
+            good = np.flatnonzero(np.isfinite(values[:, i]))
+            late[i] = start + good[0] if len(good) else -1
+        if (late >= 0).all():
+            break
+    first, slowest = int(late.max()), int(late.argmax() if (late >= 0).all() else late.argmin())
+    if not first and (late >= 0).all():
+        return assembly
+    name = assembly.sources[slowest].channel.name
+    if late[slowest] < 0 or first > _MOST_EMPTY * assembly.samples:
+        reason = "holds no number" if late[slowest] < 0 else f"has its first number in row {first}"
+        raise DataError(
+            f"'{assembly.raw.path}': channel '{name}' {reason} of {assembly.samples:,}; leave it out of the signal "
+            "map, or leave the log out"
+        )
+    fact = {"repair": "nan = hold: start left out", "channel": name, "count": first, "row": 0}
+    ticks = slice(assembly.ticks.start + first, assembly.ticks.stop)
+    return replace(assembly, ticks=ticks, missing=assembly.missing[first:], repairs=[*assembly.repairs, fact])
 
 
 def assemble(

@@ -37,7 +37,7 @@ _RULES = {
     "int_from_float": "an integer must hold",
     "int_type": "an integer must hold",
     "string_type": "a text in quotes must hold",
-    "tuple_type": "a list must hold",
+    "tuple_type": "a list must hold, in brackets such as [1, 2]",
     "mapping_type": "a table must hold",
     "dict_type": "a table must hold",
 }

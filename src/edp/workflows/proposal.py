@@ -18,9 +18,11 @@ from edp.data.even_split import blocks_where_time_is_uneven, rests_where_it_test
 from edp.data.splits import ByTime
 from edp.data.twin_channels import INTEGRAL
 from edp.errors import ConfigError, DataError, StorageError
-from edp.logs.proposal.columns import LogLook, holds_frames
+from edp.logs.proposal.columns import LogLook, refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
+from edp.logs.proposal.names import is_error_name
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
+from edp.logs.proposal.shapes import shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.recording import Recording
@@ -154,6 +156,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     paths, copies = _without_copies(find_recordings(source))
     groups, broken = group_logs(paths, on_log)
     group, others = groups[0], tuple(groups[1:])
+    refuse_frames(group.looks[0])
     proposal = propose_map(group.looks[0], group.common, group.looks[1:])
     pairs = _side_by_side(proposal)
     if pairs:
@@ -255,16 +258,13 @@ def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
         if not measured:
             texts = len(proposal.look.texts)
             unread = f", and {texts} that hold text" if texts else ""
-            if holds_frames(proposal.look):
-                raise DataError(
-                    f"'{proposal.look.path}' holds raw frames of a bus ({', '.join(proposal.look.texts[:3])}), no "
-                    "signals: decode them with their DBC file, as MDF 4 or CSV (in Python: asammdf or cantools)"
-                )
             raise DataError(
                 f"'{proposal.look.path}': no column moves (constants, counters and labels only{unread}); there is "
                 "nothing to predict: record while the machine works, and give each column a name of its own"
             )
         notes.append("no column looks measured: check task.targets")
+    # A deviation follows from two other columns; where nothing else moves it is what there is.
+    measured = tuple(guess for guess in measured if not is_error_name(guess.column)) or measured
     # A change of another column is a velocity, whatever its unit.
     changes = [guess for guess in measured if guess.relation is not None and guess.relation.how == "change"]
     # Where one of a row of axes shows it, its brothers are velocities, too.
@@ -290,6 +290,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     look, clock = proposal.look, proposal.clock
     notes = [] if not look.part else [f"{look.path.name}: looked at {look.part}"]
     notes += [f"{count} column(s) {reason}: left out" for reason, count in look.left_out.items()]
+    notes += shape_notes(look)
     if clock.check:
         notes.append(f"time: {clock.check}")
     rows = sum(look.rows for look in group.looks) * len(group.paths) / len(group.looks)
@@ -300,7 +301,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
             f"some {rows:,.0f} rows in all: too few to train and to test on; record more, or set rate_hz higher"
         )
     if len(group.looks) < len(group.paths):
-        notes.append(f"{len(group.looks)} of {len(group.paths)} logs were looked at; the others are taken for alike")
+        notes.append(f"{len(group.looks)} of {len(group.paths)} logs were looked at; of the others the columns only")
     for other in others:
         names = ", ".join(path.name[:40] for path in other.paths[:3])
         notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")

@@ -112,6 +112,7 @@ def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, tw
         (("--set", "deadline_ms=12"), "a tick has 10 ms at rate_hz = 100; give a deadline within it"),
         (("--controller", "nmpc"), "name its run folder with --twin"),
         (("--plant", "nowhere"), "nowhere"),
+        (("--plant", "nowhere.fmu"), "there is no file"),
     ],
 )
 def test_mistakes_end_in_one_message(edp, tmp_path, words, message):

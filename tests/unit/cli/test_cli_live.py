@@ -62,7 +62,7 @@ def test_a_log_is_played_to_its_end_saved_and_recorded(edp, log, tmp_path):
         (("--sim", "M22", "--record", "a.bag"), "ends in .mcap"),
         (("nowhere", "--sim", "M22"), "nowhere"),
         (("--loop", "grade", "--plant", "nowhere"), "nowhere"),
-        (("--loop", "grade", "--plant", "some.fmu"), "native code"),
+        (("--loop", "grade", "--plant", "some.fmu"), "there is no file"),
         (("--sim", "M22", "--plant", "runs/twin"), "--plant is of --loop"),
         (("--loop", "grade", "--excitation", "dig"), "--excitation is of --sim"),
         (("--sim", "M22", "--monitor", "nowhere"), "nowhere"),

@@ -173,8 +173,8 @@ def test_a_leaking_load_check_lets_its_share_back():
     sound, numbers = faulty_numbers("check_leak:boom:10%")
     area, back = 1e-7, []
     for each in (sound, numbers):
-        back.append(hydraulics.section(area, 100 * BAR, 200 * BAR, -1e9, each.axes[0, at.CHECK])[0])
-    forward = hydraulics.section(area, 200 * BAR, 100 * BAR, -1e9, 1.0)[0]
+        back.append(hydraulics.section(area, 100 * BAR, 200 * BAR, -1e9, each.axes[0, at.CHECK], 1e12)[0])
+    forward = hydraulics.section(area, 200 * BAR, 100 * BAR, -1e9, 1.0, 1e12)[0]
     assert (back[1] - back[0]) / forward == pytest.approx(-0.1)
     assert numbers.axes[1, at.CHECK] == sound.axes[1, at.CHECK]
     assert numbers.plant[at.REGEN_CHECK] == sound.plant[at.REGEN_CHECK]

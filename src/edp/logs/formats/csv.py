@@ -28,7 +28,9 @@ from edp.logs.formats.base import (
     load_column,
     time_factor,
 )
-from edp.logs.formats.csv_dates import dates_of
+from edp.logs.formats.csv_controldesk import controldesk_head, read_controldesk
+from edp.logs.formats.csv_dates import dates_of, is_date
+from edp.logs.formats.csv_encoding import encoding_of
 from edp.logs.formats.csv_messages import at_own_times, message_columns
 from edp.logs.formats.csv_preamble import TablePlace, find_table
 from edp.logs.formats.csv_scope import read_scope, scope_head
@@ -46,6 +48,7 @@ _DELIMITERS = (",", ";", "\t", "|")
 _BLANKS = " "
 """Delimiter of columns that any number of blanks parts; only where no other one makes columns."""
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")
+_BRACKETS = re.compile(r"[\[(]([^\])]{1,12})[\])]")
 NAME_BY_PLACE = re.compile(r"column_\d+")
 """Name of a column of a file that names none."""
 _STATED = re.compile(r'sep=([^\w\s"]|\t)', re.IGNORECASE)
@@ -75,6 +78,8 @@ class CsvFormat:
         lines, _, encoding, *_ = _first_lines(path)
         if (head := scope_head(path, lines)) is not None:
             return read_scope(path, head, lines[head.lines :], encoding)
+        if (desk := controldesk_head(path, lines, encoding)) is not None:
+            return read_controldesk(path, desk, encoding)
         layout = _layout(path, signal_map)
         table = CsvTable(path, layout)
         names = [name for name in layout.names if name]
@@ -168,8 +173,10 @@ def _number_of_any_kind(delimiter: str) -> Callable[[str], bool]:
 
 
 def _holds_numbers_only(head: list[str], decimal: str) -> bool:
+    """Whether a row has no names: numbers, and dates beside them."""
     filled = [cell for cell in head if cell.strip()]
-    return not filled or all(is_number(cell, decimal) for cell in filled)
+    others = [cell for cell in filled if not is_number(cell, decimal)]
+    return len(others) < max(len(filled), 1) and all(map(is_date, others))
 
 
 def _names_beside(
@@ -223,7 +230,7 @@ def _first_lines(path: Path) -> tuple[list[str], int, str, str | None, str]:
     for size in _HEAD_BYTES:
         with path.open("rb") as stream:
             head = stream.read(size)
-        encoding = _encoding(head)
+        encoding = encoding_of(head)
         text = head.decode(encoding, errors="replace")
         # As the parser behind counts lines; other signs of Unicode end none.
         lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
@@ -273,17 +280,6 @@ def _rows(path: Path, lines: list[str], delimiter: str) -> tuple[list[list[str]]
             f"{text_csv.field_size_limit()} characters: check the delimiter and the quotes"
         ) from error
     return rows, ends
-
-
-def _encoding(head: bytes) -> str:
-    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return "utf-16"
-    try:
-        # Whole lines only: the end of what was read may cut a character.
-        head[: head.rfind(b"\n") + 1].decode("utf-8")
-    except UnicodeDecodeError:
-        return "cp1252"
-    return "utf-8-sig" if head[:3] == b"\xef\xbb\xbf" else "utf-8"
 
 
 def _delimiter(path: Path, lines: list[str]) -> str:
@@ -343,7 +339,9 @@ def _header(rows: list[list[str]]) -> tuple[tuple[str, ...], tuple[str | None, .
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
     match = _NAME_UNIT.match(cell)
     if match is None:
-        return cell, None
+        # "Flow (GPM) - Plot 0": what stands behind a unit tells columns apart.
+        within = [normalise_unit(text) for text in _BRACKETS.findall(cell)]
+        return cell, next((unit for unit in within if unit in UNITS or unit in TIME_UNITS or unit in OTHER_UNITS), None)
     if match["square"] is not None:
         return match["name"], normalise_unit(match["square"])
     unit = normalise_unit(match["round"])

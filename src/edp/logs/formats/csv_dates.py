@@ -13,6 +13,8 @@ _GERMAN = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?:[ T]+(\d.*))?")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9})\d*)?)?")
 _AMERICAN = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})[ T]+(\d.*\d) ?([AP])M", re.IGNORECASE)
 """``06/29/2022 04:05:36.674 PM``: who writes AM and PM writes the month first."""
+_YEAR_FIRST = re.compile(r"(\d{4})[/.-](\d{1,2})[/.-](\d{1,2})(?:[ T]+(\d.*))?")
+"""``2025/1/31 13:00:00.5``: who writes the year first writes the day last."""
 _MIDNIGHT = "1970-01-01"
 """Of times of day without a date: only their differences count."""
 
@@ -24,6 +26,17 @@ def dates_of(cells: Sequence[str | None]) -> NDArray[np.datetime64]:
         ValueError: a cell is none of them.
     """
     return np.array([_iso(cell) for cell in cells], dtype="datetime64[ns]")
+
+
+def is_date(cell: str) -> bool:
+    """Whether a cell holds a date or a time of day with digits and signs between them, as no name does."""
+    text = cell.strip()
+    if not text[:1].isdigit() or not any(sign in text for sign in ":/.-"):
+        return False
+    try:
+        return not bool(np.isnat(dates_of([text])[0]))
+    except ValueError:
+        return False
 
 
 def _iso(cell: str | None) -> str:
@@ -39,6 +52,12 @@ def _iso(cell: str | None) -> str:
     if american is not None:
         month, day, year, clock, half = american.groups()
         return f"{year}-{int(month):02d}-{int(day):02d}T{_clock(clock, half.upper())}"
+    year_first = _YEAR_FIRST.fullmatch(text)
+    # What a time of day does not cover, as a zone, NumPy judges.
+    if year_first is not None and (year_first[4] is None or _CLOCK.fullmatch(year_first[4])):
+        year, month, day, clock = year_first.groups()
+        date = f"{year}-{int(month):02d}-{int(day):02d}"
+        return date if clock is None else f"{date}T{_clock(clock)}"
     if _CLOCK.fullmatch(text):
         return f"{_MIDNIGHT}T{_clock(text)}"
     # ISO 8601 allows a decimal comma, NumPy does not.

@@ -51,6 +51,8 @@ def find_table(
     width, count = Counter(len(row) for row in tail).most_common(1)[0]
     if width < 2 or count < _SAME_WIDTH * len(tail):
         return None
+    if _runs_on(rows[0], width, is_number):
+        return TablePlace(0, 1, -width)
     whole = [row for row in tail if len(row) == width]
     columns = [i for i in range(width) if _is_numeric([row[i] for row in whole], is_number)]
     first = next((i for i, row in enumerate(rows) if _is_data(row, width, columns, is_number)), None)
@@ -67,6 +69,16 @@ def find_table(
     usual = header == 0 and (first == 1 or (first == 2 and is_unit_row(list(rows[1]))))
     padding = width - len(rows[header])
     return None if (usual and not padding) or first - header > _MOST_HEADER_ROWS else TablePlace(header, first, padding)
+
+
+def _runs_on(row: Sequence[str], width: int, is_number: Callable[[str], bool]) -> bool:
+    """Whether names and the first numbers stand in one line, since a program forgot to end that of the names."""
+    names, numbers = row[:width], row[width:]
+    return (
+        len(numbers) == width
+        and all(cell.strip() and not is_number(cell) for cell in names)
+        and all(cell.strip() and is_number(cell) for cell in numbers)
+    )
 
 
 def _is_numeric(cells: list[str], is_number: Callable[[str], bool]) -> bool:

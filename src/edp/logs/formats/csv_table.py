@@ -64,6 +64,8 @@ def is_number(cell: str, decimal: str = ".") -> bool:
 
 _ON, _OFF = ("true", "on", "yes", "ein", "wahr"), ("false", "off", "no", "aus", "falsch")
 """Words for the states of a switch, in small letters."""
+_PREFIXES = {"": 1.0, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
+_WITH_PREFIX = r"^(?P<number>[-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)(?P<prefix>[pnuµmkMG]?)$"
 _REMARKS, _FEW_REMARKS = 0.001, 10
 """Share of rows that may end in a remark, or so many of few rows."""
 _GROUPED = r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?"
@@ -108,6 +110,18 @@ def _switched(cells: pa.Array) -> pa.Array | None:
     if not pc.all(pc.or_(pc.or_(on, off), missing), min_count=0).as_py():
         return None
     return pc.if_else(missing, pa.scalar(None, pa.float64()), pc.cast(on, pa.float64()))
+
+
+def _scaled(cells: pa.Array) -> pa.Array | None:
+    """Numbers with a prefix of SI behind them (``25.1m``), as panels of instruments write them; None for other text."""
+    cells = pc.utf8_trim_whitespace(cells)
+    cells = pc.if_else(pc.is_in(cells, pa.array(NULLS)), pa.scalar(None, pa.string()), cells)
+    if cells.null_count == len(cells) or not pc.all(pc.match_substring_regex(cells, _WITH_PREFIX)).as_py():
+        return None
+    parts = pc.extract_regex(cells, _WITH_PREFIX)
+    numbers = pc.cast(pc.replace_substring_regex(pc.struct_field(parts, "number"), r"^\+", ""), pa.float64())
+    places = pc.index_in(pc.struct_field(parts, "prefix"), pa.array(list(_PREFIXES)))
+    return pc.multiply(numbers, pc.take(pa.array(list(_PREFIXES.values())), places))
 
 
 def _all_numbers(cells: pa.Array, nulls: pa.Array, decimal: str) -> bool:
@@ -272,6 +286,7 @@ class CsvTable:
         """Numbers of a column of text: those that have points for thousands, or the states of a switch."""
         numbers = _without_groups(cells) if self.layout.decimal == "," else None
         numbers = _switched(cells) if numbers is None else numbers
+        numbers = _scaled(cells) if numbers is None and self.layout.decimal == "." else numbers
         if numbers is None:
             self.refuse_text(column_index)
         return numbers
@@ -328,7 +343,8 @@ class CsvTable:
         for batch in self.stream([key]):
             for cell in batch.column(key).to_pylist():
                 text = (cell or "").strip()
-                if not is_number(text, self.layout.decimal) and not (self.layout.decimal == "," and is_grouped(text)):
+                other_form = is_grouped(text) if self.layout.decimal == "," else re.fullmatch(_WITH_PREFIX, text)
+                if not is_number(text, self.layout.decimal) and not other_form:
                     raise DataError(
                         f"'{self.path}': column '{name}' holds text '{text[:40]}' in line {row}; "
                         "expected a number or an empty cell"

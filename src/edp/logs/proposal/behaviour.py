@@ -287,7 +287,14 @@ def is_steered_by(command: LogColumn, reference: LogColumn, measured: LogColumn)
     good = np.isfinite(own) & np.isfinite(target) & np.isfinite(rate)
     if good.sum() < 100 or _scatter(own[good]) == 0:
         return False
-    parts = np.column_stack([(target - actual)[good], rate[good], np.ones(int(good.sum()))])
-    fitted, *_ = np.linalg.lstsq(parts, own[good], rcond=None)
-    rest = own[good] - parts @ fitted
-    return bool(np.var(rest) < 0.1 * np.var(own[good]))
+    ones, reference_rate = np.ones(int(good.sum())), np.gradient(target)[good]
+    answer = _unexplained(own[good], np.column_stack([(target - actual)[good], rate[good], ones]))
+    # What the motion says by itself, or that which is asked for, is a velocity and no answer.
+    velocity = _unexplained(own[good], np.column_stack([rate[good], reference_rate, ones]))
+    return answer < 0.1 and velocity > max(0.02, 2.0 * answer)
+
+
+def _unexplained(own: Column, parts: Column) -> float:
+    """Share of the variance of a column that a linear combination of others, shape ``(rows, parts)``, leaves."""
+    fitted, *_ = np.linalg.lstsq(parts, own, rcond=None)
+    return float(np.var(own - parts @ fitted) / np.var(own))

@@ -77,9 +77,20 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
         behaviour = behaviours[column.name]
         # A name that says nothing of time is doubted more than no name at all.
         nameless = look.headerless or column is not look.columns[0]
+        if nameless and behaviour.counts and (second := _behind(column, look, behaviours)) is not None:
+            return second
         if column in rising and behaviour.climbs and (behaviour.even or (nameless and behaviour.steady)):
             return column
     return None
+
+
+def _behind(column: LogColumn, look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
+    """The column behind one that numbers the rows, where it climbs as a clock does."""
+    next_index = look.columns.index(column) + 1
+    second = look.columns[next_index] if next_index < len(look.columns) else None
+    if second is None or not behaviours[second.name].climbs or behaviours[second.name].counts:
+        return None
+    return second
 
 
 def _ticks(behaviour: Behaviour) -> bool:
@@ -139,7 +150,9 @@ def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> Clock
             step = behaviour.step
             check = "it begins anew within the log: are rows without gaps?"
             return ClockGuess(None, "s", step, 1.0 / step, None, (column.name,), 0.65, check)
-    return ClockGuess(None, "s", 1.0, 1.0, None, (), 0.3, "no time found: a row counts as 1 s; set sample_time_s")
+    still = [c.name for c in look.columns if behaviours[c.name].constant and is_time_name(c.name)]
+    reason = f"'{still[0][:40]}' stands still" if still else "no time found"
+    return ClockGuess(None, "s", 1.0, 1.0, None, (), 0.3, f"{reason}: a row counts as 1 s; set sample_time_s")
 
 
 def _brought_down(clock: ClockGuess, rows: int) -> ClockGuess:

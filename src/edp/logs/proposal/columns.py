@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
@@ -16,10 +16,13 @@ from edp.errors import DataError
 from edp.logs.detect import format_for, open_log
 from edp.logs.formats.base import Column, RawLog, RawSignal
 from edp.logs.formats.csv import NAME_BY_PLACE
+from edp.logs.timebase import Clock, judge
 from edp.signals import Kind, SignalMap
 
 TEXT_BYTES = 16_000_000
 """Of a text file that is looked at, 15 min of 20 channels at 100 Hz; text has no index, so this is its beginning."""
+_HEAD_BYTES = 1 << 20
+"""Of a text whose columns are compared with those of others."""
 MOST_COLUMNS = 400
 """Columns that are looked at; the others are left out and counted."""
 _ROWS = 30_000
@@ -38,6 +41,10 @@ _SLOWEST = 200.0
 """Steps of the fastest signal that one of a slower lasts at most."""
 _HELD_VALUES = 4 * _VALUES
 """Numbers held at the times of the fastest signal at most; of longer logs columns of one length are looked at."""
+_OF_THE_LOGGER = ("/rosout", "rosout", "/diagnostics", "/parameter_events", "/events/")
+"""Beginnings of names of what programs of ROS report about themselves."""
+_IDENTIFIERS = frozenset(("id", "can_id", "canid", "arbitration_id", "identifier", "pgn", "spn"))
+_BYTES = frozenset(("data", "payload", "bytes", "data bytes", "databytes", "data_bytes"))
 _TIME_WORDS = ("time", "zeit", "stamp", "date", "datum", "uhr")
 
 
@@ -52,6 +59,7 @@ class LogColumn:
         unit: as the file states it.
         kind: as the file states it (EDP's own).
         own_time: it has time stamps of its own, as signals of MDF and bags do.
+        clock: what these say; None where they are not looked at.
     """
 
     name: str
@@ -60,6 +68,7 @@ class LogColumn:
     unit: str | None = None
     kind: Kind | None = None
     own_time: bool = False
+    clock: Clock | None = None
 
     @property
     def values(self) -> Column:
@@ -108,7 +117,7 @@ def look_at_log(path: Path) -> LogLook:
     Raises:
         DataError: the file cannot be read, or holds no column of numbers.
     """
-    with _bounded(path) as (part, note):
+    with _bounded(path, TEXT_BYTES) as (part, note):
         try:
             return _look(path, part, note)
         except DataError as error:
@@ -116,18 +125,28 @@ def look_at_log(path: Path) -> LogLook:
             raise type(error)(str(error).replace(str(part), str(path))) from error
 
 
+def names_in_log(path: Path) -> frozenset[str]:
+    """Names of the columns of a log, by the beginning of a text.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    with _bounded(path, _HEAD_BYTES) as (part, _):
+        return frozenset(_of_the_machine(open_log(part, SignalMap(others=True, sample_time_s=1.0))).signals)
+
+
 @contextmanager
-def _bounded(path: Path) -> Iterator[tuple[Path, str]]:
-    """The log itself, or a file with the first lines of a long text."""
+def _bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
+    """The log itself, or a file with the first lines of a text of more than some bytes."""
     size = path.stat().st_size if path.is_file() else 0
-    if size <= TEXT_BYTES or format_for(path).name != "csv":
+    if size <= most or format_for(path).name != "csv":
         yield path, ""
         return
     with path.open("rb") as stream:
-        head = stream.read(TEXT_BYTES)
+        head = stream.read(most)
     end = head.rfind(b"\n") + 1
     if not end:
-        raise DataError(f"'{path}': no row ends within the first {TEXT_BYTES:,} bytes; it is no table")
+        raise DataError(f"'{path}': no row ends within the first {most:,} bytes; it is no table")
     with tempfile.TemporaryDirectory(prefix="edp_") as folder:
         part = Path(folder) / f"beginning{path.suffix.lower()}"
         part.write_bytes(head[:end])
@@ -136,7 +155,7 @@ def _bounded(path: Path) -> Iterator[tuple[Path, str]]:
 
 def _look(path: Path, part: Path, note: str) -> LogLook:
     # With a stated step no column is taken for time: all of them are looked at.
-    raw = open_log(part, SignalMap(others=True, sample_time_s=1.0))
+    raw = _of_the_machine(open_log(part, SignalMap(others=True, sample_time_s=1.0)))
     for time_name in (None, *islice((name for name in raw.signals if _is_time_word(name)), 1)):
         paced = _of_own_pace(path, part, note, time_name)
         if paced is not None:
@@ -154,8 +173,13 @@ def _look(path: Path, part: Path, note: str) -> LogLook:
     ranges = _ranges(length, first, min(_LATER_ROWS, first // 3))
     pieces = _pieces(numbers, ranges)
     time, step_s, owners = _time_of(part, raw, texts)
+    clocks = _clocks_of([signal for signal in numbers if signal.name in owners])
     columns = tuple(
-        LogColumn(signal.name, tuple(values), length, signal.unit, signal.kind, signal.name in owners)
+        LogColumn(
+            *(signal.name, tuple(values), length, signal.unit, signal.kind),
+            own_time=signal.name in owners,
+            clock=clocks.get(signal.name),
+        )
         for signal, values in zip(numbers, pieces)
     )
     return LogLook(
@@ -172,6 +196,12 @@ def _look(path: Path, part: Path, note: str) -> LogLook:
     )
 
 
+def _of_the_machine(raw: RawLog) -> RawLog:
+    """A log without what its programs report about themselves; whole where there is nothing else."""
+    own = {name: signal for name, signal in raw.signals.items() if not name.startswith(_OF_THE_LOGGER)}
+    return replace(raw, signals=own) if own else raw
+
+
 def _is_time_word(name: str) -> bool:
     return any(word in name.lower() for word in _TIME_WORDS)
 
@@ -179,7 +209,7 @@ def _is_time_word(name: str) -> bool:
 def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> LogLook | None:
     """A log whose signals have times of their own and differ in rate, at the times of the fastest; None for others."""
     try:
-        timed = open_log(part, SignalMap(others=True, time=time_name))
+        timed = _of_the_machine(open_log(part, SignalMap(others=True, time=time_name)))
     except DataError:
         return None
     signals = [s for s in timed.signals.values() if s.time_s is not None and s.samples > 2]
@@ -193,25 +223,45 @@ def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> Lo
     covering = [s for s in signals if _span_s(s) >= _COVERED * longest and _step_s(s) > 0]
     if not covering or longest <= 0:
         return None
-    fastest = min(covering, key=lambda s: (_step_s(s), -s.samples))
+    # Messages that come in bursts have short steps and few rows.
+    fastest = min(covering, key=lambda s: _span_s(s) / s.samples)
     step, stamps = _step_s(fastest), np.asarray(fastest.time_s, dtype=np.float64)
-    alike = [s for s in covering if _step_s(s) <= _SLOWEST * step]
+    alike = [s for s in covering if s.samples * _SLOWEST >= fastest.samples]
     numbers = alike[:MOST_COLUMNS]
     if len({s.samples for s in numbers}) < 2 or len(numbers) * len(stamps) > _HELD_VALUES:
         return None
     first = min(_ROWS, max(_VALUES // len(numbers) // 2, 100))
     ranges = _ranges(len(stamps), first, min(_LATER_ROWS, first // 3))
     columns = []
+    clocks = _clocks_of(numbers)
     for signal in numbers:
         values = _held(signal, stamps)
         pieces = tuple(values[start:stop] for start, stop in ranges)
-        columns.append(LogColumn(signal.name, pieces, len(stamps), signal.unit, signal.kind, True))
+        clock = clocks.get(signal.name)
+        columns.append(LogColumn(signal.name, pieces, len(stamps), signal.unit, signal.kind, True, clock))
     left_out = {
         "cover another time than the others, or come far more slowly": len(signals) - len(alike),
         "come after the first columns": len(alike) - len(numbers),
     }
     counted = {reason: count for reason, count in left_out.items() if count > 0}
     return LogLook(path, tuple(columns), texts, len(stamps), None, time_name, step, False, counted, note)
+
+
+def _clocks_of(signals: Sequence[RawSignal]) -> dict[str, Clock]:
+    """What the time stamps of signals say, by name; without those that reading refuses, in its own words."""
+    clocks: dict[str, Clock] = {}
+    judged: dict[int, tuple[Column, Clock]] = {}
+    for signal in signals:
+        stamps = signal.time_s
+        if stamps is None:
+            continue
+        if id(stamps) not in judged:
+            try:
+                judged[id(stamps)] = stamps, judge(np.asarray(stamps, dtype=np.float64), signal.name)
+            except DataError:
+                continue
+        clocks[signal.name] = judged[id(stamps)][1]
+    return clocks
 
 
 def _span_s(signal: RawSignal) -> float:
@@ -328,6 +378,18 @@ def _time_of(part: Path, raw: RawLog, texts: Sequence[str]) -> tuple[str | None,
 def holds_frames(look: LogLook) -> bool:
     """Whether the columns are those of a trace of a bus: an identifier and bytes."""
     names = {name.lower() for name in (*look.names, *look.texts)}
-    return bool(names & {"id", "can_id", "canid", "arbitration_id", "identifier"}) and bool(
-        names & {"data", "payload", "bytes", "data bytes", "d0", "d1", "data0"}
-    )
+    return not _IDENTIFIERS.isdisjoint(names) and bool(names & {*_BYTES, "d0", "d1", "data0"})
+
+
+def refuse_frames(look: LogLook) -> None:
+    """Refuse a trace of a bus, whose bytes stand as text beside their identifiers.
+
+    Raises:
+        DataError: it is one; its numbers are no signals.
+    """
+    texts = {name.lower() for name in look.texts}
+    if holds_frames(look) and not _BYTES.isdisjoint(texts):
+        raise DataError(
+            f"'{look.path}' holds raw frames of a bus ({', '.join(look.texts[:3])}), no signals: decode them with "
+            "their DBC file, as MDF 4 or CSV (in Python: asammdf or cantools)"
+        )

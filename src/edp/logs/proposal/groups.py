@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from edp.errors import DataError
-from edp.logs.proposal.columns import LogLook, look_at_log
+from edp.logs.proposal.columns import LogLook, look_at_log, names_in_log
 
 MOST_LOGS = 12
 """Logs that are looked at of a group of files: the first ones, the last ones and some between."""
@@ -24,10 +24,12 @@ class LogGroup:
     Attributes:
         looks: those that were looked at, the longest first.
         paths: all of them.
+        names: columns of those that were not looked at but compared.
     """
 
     looks: tuple[LogLook, ...]
     paths: tuple[Path, ...]
+    names: tuple[frozenset[str], ...] = ()
 
     @property
     def rows(self) -> int:
@@ -37,7 +39,7 @@ class LogGroup:
     @property
     def common(self) -> frozenset[str]:
         """Columns that all of them have."""
-        return frozenset.intersection(*(frozenset(look.names) for look in self.looks))
+        return frozenset.intersection(*(frozenset(look.names) for look in self.looks), *self.names)
 
 
 def group_logs(
@@ -75,14 +77,25 @@ def group_logs(
         first = next(iter(broken.values()))
         raise DataError(first if len(broken) == 1 else f"none of {len(broken)} logs can be read; the first: {first}")
     seen = {look.path for group in groups for look in group} | set(broken)
-    # Logs that were not looked at are taken for what the only group is; among several nobody knows.
-    unseen = [path for path in paths if path not in seen] if len(groups) == 1 else []
+    members: list[dict[Path, frozenset[str]]] = [{} for _ in groups]
+    for path in [path for path in paths if path not in seen]:
+        try:
+            names = names_in_log(path)
+        except DataError as error:
+            broken[path] = str(error)
+            continue
+        fitting_group = next((i for i, group in enumerate(groups) if _fits(group[0], names)), None)
+        if fitting_group is None:
+            broken[path] = f"'{path}' has other columns than the logs that were looked at"
+        else:
+            members[fitting_group][path] = names
     groups_of_logs = [
         LogGroup(
             tuple(sorted(group, key=lambda look: -look.rows)),
-            tuple(path for path in paths if path in {look.path for look in group} or path in unseen),
+            tuple(path for path in paths if path in {look.path for look in group} or path in others),
+            tuple(others.values()),
         )
-        for group in groups
+        for group, others in zip(groups, members)
     ]
     return sorted(groups_of_logs, key=lambda group: -group.rows), broken
 
@@ -91,6 +104,12 @@ def _some(paths: Sequence[Path]) -> list[Path]:
     """Paths spread evenly over all of them."""
     places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), MOST_LOGS)).round().astype(int))
     return [paths[index] for index in places]
+
+
+def _fits(look: LogLook, names: frozenset[str]) -> bool:
+    """Whether a log with some columns, time and text among them, belongs to one that was looked at."""
+    mine = {*look.names, *look.texts} | ({look.time} if look.time is not None else set())
+    return len(mine & names) >= _ALIKE * len(mine | names)
 
 
 def _alike(one: LogLook, other: LogLook) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from edp.logs.units import normalise_unit
 from edp.signals import UNITS, Kind
@@ -16,12 +16,12 @@ _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": 
 KIND_WORDS: Mapping[str, Kind] = {
     word: kind
     for kind, words in {
-        Kind.PILOT_PRESSURE: "pilot vorsteuerdruck",
+        Kind.PILOT_PRESSURE: "pilot vorsteuerdruck eppr",
         Kind.PRESSURE: "pressure press druck",
         Kind.ANGULAR_VELOCITY: "rpm drehzahl omega gyro angvel revs tacho tachometer",
         Kind.ACCELERATION: "acceleration accel acc beschleunigung",
         Kind.VELOCITY: "velocity vel speed geschwindigkeit geschw",
-        Kind.ANGLE: "angle winkel pitch roll yaw heading",
+        Kind.ANGLE: "angle ang winkel pitch roll yaw heading",
         Kind.POSITION: "position pos stroke hub weg displacement disp verschiebung hoehe abstand",
         Kind.FORCE: "force kraft",
         Kind.FLOW: "flow durchfluss volumenstrom",
@@ -58,13 +58,28 @@ ROLE_WORDS: Mapping[str, str] = {
     for role, words in {
         "reference": "soll sollwert ref reference set setpoint desired des target demand demanded requested vorgabe "
         "fuehrungsgroesse r",
-        "command": "command cmd ctrl control u valve ventil joystick lever hebel pilot pwm input stellgroesse pedal",
+        "command": "command cmd ctrl control u valve ventil joystick lever hebel pilot pwm duty input stellgroesse "
+        "pedal",
         "measured": "ist istwert act actual meas measured mess messwert fb feedback y output "
         "sensor cell transducer encoder gauge bus supply battery",
         "label": "flag status state mode id label condition fault error leak stable zustand fehler",
     }.items()
     for word in words.split()
 }
+_PARTS_OF_SETS = frozenset(["est", "val", "train", "test", "id"])
+_GLUED = re.compile(r"(pos|vel|acc|ang)(a|act|d|des|r|ref|m|meas|cmd)")
+"""A kind and a role in one word, as programs of robots write them."""
+_GLUED_ROLES = {
+    role: named
+    for named, roles in {"measured": "a act m meas", "reference": "d des r ref", "command": "cmd"}.items()
+    for role in roles.split()
+}
+_HYDRAULIC = frozenset(
+    ("cyl", "cylinder", "zylinder", "pump", "pumpe", "port", "chamber", "kammer", "rod", "head", "piston", "supply")
+)
+"""Words beside which a single P at the end of a name is a pressure."""
+_TURNS, _SPEEDS = frozenset(("ang", "angular")), frozenset(("vel", "velocity", "speed"))
+_ERRORS = frozenset(["error", "err", "deviation", "abweichung", "regelabweichung", "residual", "residuum"])
 _COUNTERS = frozenset(
     ("cycle", "zyklus", "index", "idx", "sample", "row", "zeile", "nr", "no", "number", "count", "counter")
 )
@@ -86,10 +101,26 @@ def words_of(name: str) -> tuple[str, ...]:
 def kind_by_word(name: str) -> Kind | None:
     """The kind that a word of a name means; None where no word does, or a rate of another kind is named."""
     words = words_of(name)
+    if not _TURNS.isdisjoint(words) and not _SPEEDS.isdisjoint(words):
+        return Kind.ANGULAR_VELOCITY
     for word, kind in KIND_WORDS.items():
         if word in words or (len(word) > _LONG and any(word in other for other in words)):
             return kind
-    return None
+    glued = _glued(words)
+    if glued is not None:
+        return KIND_WORDS.get(glued[1])
+    # Cyl_P, pump_p: what is said before tells that it is no gain.
+    return Kind.PRESSURE if words[-1:] == ("p",) and not _HYDRAULIC.isdisjoint(words[:-1]) else None
+
+
+def _glued(words: Sequence[str]) -> re.Match[str] | None:
+    """The first word taken apart where it is a kind with its role: ``posd``, ``velact``, ``accref``."""
+    return _GLUED.fullmatch(words[0]) if words else None
+
+
+def is_error_name(name: str) -> bool:
+    """Whether a name is that of a deviation, which follows from two other columns."""
+    return not _ERRORS.isdisjoint(words_of(name))
 
 
 def is_joint(name: str) -> bool:
@@ -124,7 +155,15 @@ def known_unit(stated: str | None) -> str | None:
 def role_by_word(name: str) -> str:
     """``reference``, ``command``, ``measured`` or ``label`` where a word says it; else empty."""
     words = words_of(name)
-    roles = {ROLE_WORDS[word] for word in words if word in ROLE_WORDS}
+    # A letter is a role where it begins a name; R is that of a rod, of a side or of a reference, which stands alone.
+    alone = all(word.isdigit() or word in _PARTS_OF_SETS for word in words[1:])
+    letters = words[:1] if alone or words[:1] != ("r",) else ()
+    roles = {
+        ROLE_WORDS[word] for word in (*letters, *words) if word in ROLE_WORDS and (len(word) > 1 or word in letters)
+    }
+    glued = _glued(words)
+    if not roles and glued is not None:
+        return _GLUED_ROLES[glued[2]]
     # A reference of a valve is a reference, its measured opening is measured.
     return next((role for role in ("reference", "measured", "label", "command") if role in roles), "")
 

@@ -7,11 +7,13 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_steered_by, relations_of, repeats
 from edp.logs.proposal.clocks import ClockGuess, clock_of
 from edp.logs.proposal.columns import LogColumn, LogLook
 from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change, with_article
-from edp.logs.proposal.names import is_counter_name, role_by_word, tag_family, words_of
+from edp.logs.proposal.names import is_counter_name, is_error_name, kind_by_word, role_by_word, tag_family, words_of
 from edp.signals import TABLE_A1, VOCABULARY, ChannelMap, Kind, SignalMap
 
 SURE = 0.85
@@ -21,6 +23,11 @@ MAPPED_ROLES = ("reference", "command", "measured", "label")
 _COMMANDS = (Kind.PILOT_PRESSURE, Kind.CURRENT, Kind.VOLTAGE, Kind.RATIO)
 _MEASURED = tuple(kind for kind in Kind if kind not in (*_COMMANDS, Kind.GENERIC))
 """Kinds that show what a machine does, however they move; names and what follows them tell their references."""
+_FOLLOWED = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.FLOW)
+"""Kinds that are references by their names only."""
+_NUMBERS = re.compile(r"\d+")
+_LEAST_SWITCHES = 3
+"""Changes at the rate of a label that a log is long enough for, before a command without them is one."""
 _PLAIN_NAME = re.compile(r"\w[\w .\-/()%]{0,63}")
 _MOST_CHANNELS = 200
 _SWITCHED_HZ = {"command": 0.01, "": 0.05, "label": 1.0}
@@ -86,7 +93,9 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
     moving = [c for c in look.columns if _is_free(c, behaviours[c.name], clock)]
     relations = relations_of(moving)
     behaviours = _where_they_move(behaviours, beside)
-    kinds = {c.name: kind_of(c, behaviours[c.name], families[tag_family(c.name)]) for c in look.columns}
+    ranges = _ranges_of_all(behaviours, beside)
+    kinds = {c.name: kind_of(c, ranges[c.name], families[tag_family(c.name)]) for c in look.columns}
+    kinds = _of_brothers(look.columns, kinds)
     for name, relation in relations.items():
         change = kind_of_change(relation, kinds[relation.other], clock.rate_hz)
         if change is not None and kinds[name].confidence < BOUND:
@@ -105,7 +114,9 @@ def propose_map(look: LogLook, common: Collection[str] | None = None, beside: Se
         guesses = [g if g.column in common else replace(g, channel="", check="not in all logs") for g in guesses]
     guesses = _named(_without_copies(guesses, beside))
     texts = [
-        ColumnGuess(name, "", "time" if name == clock.column else "text", _NO_KIND, 0.9, "holds text")
+        ColumnGuess(name, "", "time", _NO_KIND, clock.confidence, "dates", clock.check)
+        if name == clock.column
+        else ColumnGuess(name, "", "text", _NO_KIND, 0.9, "holds text")
         for name in look.texts
     ]
     columns = (*guesses, *texts)
@@ -130,6 +141,36 @@ def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]
             more = not other.constant if first.constant else not (other.constant or other.steps)
             moving[column.name] = other if more else first
     return moving
+
+
+def _ranges_of_all(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) -> dict[str, Behaviour]:
+    """Behaviours with the range that a column has in all logs of a group: in one that rests a unit cannot be told."""
+    ranges = dict(behaviours)
+    for column in (column for look in beside for column in look.columns):
+        numbers = column.values[np.isfinite(column.values)]
+        behaviour = ranges.get(column.name)
+        if behaviour is not None and len(numbers):
+            low, high = np.fmin(behaviour.low, numbers.min()), np.fmax(behaviour.high, numbers.max())
+            ranges[column.name] = replace(behaviour, low=float(low), high=float(high))
+    return ranges
+
+
+def _of_brothers(columns: Sequence[LogColumn], kinds: dict[str, KindGuess]) -> dict[str, KindGuess]:
+    """Kinds, with that of its brothers for a column of a row of axes whose own range leaves the unit open."""
+    rows: dict[str, list[LogColumn]] = {}
+    for column in columns:
+        rows.setdefault(_NUMBERS.sub("", column.name), []).append(column)
+    filled = dict(kinds)
+    for row in rows.values():
+        word = kind_by_word(row[0].name)
+        guessed = {(kinds[c.name].kind, kinds[c.name].unit): kinds[c.name] for c in row if kinds[c.name].kind is word}
+        if word is None or len(guessed) != 1:
+            continue
+        guess = next(iter(guessed.values()))
+        for column in row:
+            if kinds[column.name].confidence < BOUND and not column.unit and column.kind is None:
+                filled[column.name] = replace(guess, confidence=BOUND, why="as the others of its row")
+    return filled
 
 
 def _is_free(column: LogColumn, behaviour: Behaviour, clock: ClockGuess) -> bool:
@@ -161,7 +202,7 @@ def _column_guess(
     name = column.name
     if name == clock.column or name in clock.beside:
         return ColumnGuess(name, "", "time", _NO_KIND, clock.confidence, "time of the rows", clock.check)
-    aside = _aside(name, behaviour, kind, clock.rate_hz)
+    aside = _aside(name, behaviour, kind, clock.rate_hz, column.samples)
     if aside is not None:
         return aside
     role, sure, why = _role(column, behaviour, kind, relation, steered)
@@ -171,7 +212,7 @@ def _column_guess(
     return ColumnGuess(name, name, role, kind, min(sure, kind.confidence), why, check, relation)
 
 
-def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | None) -> ColumnGuess | None:
+def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | None, rows: int) -> ColumnGuess | None:
     """A column that holds no motion: a constant, a counter, a label; None for all others."""
     if behaviour.beside and not is_known(name):
         return ColumnGuess(
@@ -186,7 +227,10 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
     if behaviour.restarts and behaviour.even and behaviour.whole:
         return ColumnGuess(name, "", "counter", _NO_KIND, 0.7, "counts and begins anew", "a counter?")
     word = role_by_word(name)
-    if behaviour.switches and behaviour.changes * (rate_hz or 1.0) < _SWITCHED_HZ.get(word, 0.0):
+    seldom = behaviour.changes * (rate_hz or 1.0) < _SWITCHED_HZ.get(word, 0.0)
+    # In a log of a minute a valve that is tested opens once.
+    brief = word == "command" and rows < _LEAST_SWITCHES * (rate_hz or 1.0) / _SWITCHED_HZ[word]
+    if behaviour.switches and seldom and not brief:
         sure = min(0.85 if word == "label" else 0.7, max(kind.confidence, BOUND))
         check = kind.check if kind.kind is not Kind.GENERIC and kind.check else "a feature?"
         return ColumnGuess(name, name, "label", kind, sure, f"{behaviour.levels} values, seldom changed", check)
@@ -205,8 +249,11 @@ def _role(
     name, word = column.name, role_by_word(column.name)
     if name in TABLE_A1:
         return ("command" if kind.kind in _COMMANDS else "measured"), 0.95, "a name of Table A.1"
-    if relation is not None and relation.how == "reference":
+    # Chambers of cylinders at rest hold one level without following each other.
+    if relation is not None and relation.how == "reference" and (kind.kind not in _FOLLOWED or word == "reference"):
         return "reference", 0.85 if word == "reference" else 0.75, f"{relation.other[:24]} follows it"
+    if is_error_name(name):
+        return "measured", 0.7, "a deviation by its name"
     if relation is not None and relation.how == "follows":
         return "measured", 0.85 if word == "measured" else 0.75, f"follows {relation.other[:24]}"
     if name in steered:
@@ -283,8 +330,13 @@ def _signal_map(look: LogLook, clock: ClockGuess, columns: Sequence[ColumnGuess]
         sample_time_s=clock.sample_time_s,
         rate_hz=clock.wanted_hz,
         header=not look.headerless,
-        columns=look.names if look.headerless else (),
+        columns=tuple(sorted((*look.names, *look.texts), key=_place)) if look.headerless else (),
     )
+
+
+def _place(name: str) -> int:
+    """The place of a column that has no name but its place."""
+    return int(name.rpartition("_")[2])
 
 
 def plain_map(look: LogLook) -> SignalMap:

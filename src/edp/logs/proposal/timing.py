@@ -73,10 +73,12 @@ def timing_of(looks: Sequence[LogLook], clock: ClockGuess, mapped: Sequence[str]
     repairs, rates = {}, []
     for look in looks:
         clocks = _clocks(look, clock)
-        rates += [clocks[0].rate_hz] if clocks else []
         columns = [column for column in look.columns if column.name in mapped]
+        own = [column.clock for column in columns if column.clock is not None]
+        # Reading takes the fastest of several clocks.
+        rates += [clocks[0].rate_hz] if clocks else [max(one.rate_hz for one in own)] if own else []
         missing = ["nan=hold"] if any(not np.isfinite(column.values).all() for column in columns) else []
-        needed = (*missing, *sorted({repair for one in clocks for repair in _repairs(one)}))
+        needed = (*missing, *sorted({repair for one in (*clocks, *own) for repair in _repairs(one)}))
         if needed:
             repairs[look.path] = needed
     apart = len(rates) > 1 and clock.wanted_hz is None and max(rates) > _ONE_RATE * min(rates)

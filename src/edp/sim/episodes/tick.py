@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from edp.sim.episodes import blocks
 from edp.sim.machine import layout as at
-from edp.sim.physics import integrator, plant, terramechanics
+from edp.sim.physics import plant, terramechanics
+from edp.sim.physics import scratch as places
 from edp.sim.physics.jit import compiled, inlined, pasted, plainly_inlined
 from edp.sim.sensors import chain, logbook
 
@@ -36,19 +37,19 @@ def finite(value: float) -> bool:
 def scratch_of(scratch: Array) -> tuple[Array, ...]:
     """The work arrays of `integrator.new_work`, cut from one array of at least `SCRATCH` values."""
     ends = (
-        integrator.FROZEN,
-        integrator.FROZEN + 3,
-        integrator.FROZEN + 3 + 3 * at.OPENINGS,
-        integrator.FROZEN + 28 + 3 * at.OPENINGS,
-        integrator.FROZEN + 28 + 3 * at.OPENINGS + 4 * integrator.SLOPES,
-        integrator.FROZEN + 28 + 3 * at.OPENINGS + 4 * integrator.SLOPES + terramechanics.CONTACTS,
+        places.FROZEN,
+        places.FROZEN + 3,
+        places.FROZEN + 3 + 3 * at.OPENINGS,
+        places.FROZEN + 28 + 3 * at.OPENINGS,
+        places.FROZEN + 28 + 3 * at.OPENINGS + 4 * places.SLOPES,
+        places.FROZEN + 28 + 3 * at.OPENINGS + 4 * places.SLOPES + terramechanics.CONTACTS,
     )
     return (
         scratch[: ends[0]],
         scratch[ends[0] : ends[1]],
         scratch[ends[1] : ends[2]].reshape(3, at.OPENINGS),
         scratch[ends[2] : ends[3]].reshape(5, 5),
-        scratch[ends[3] : ends[4]].reshape(4, integrator.SLOPES),
+        scratch[ends[3] : ends[4]].reshape(4, places.SLOPES),
         scratch[ends[4] : ends[5]],
         scratch[ends[5] : ends[5] + at.STATES],
         scratch[ends[5] + at.STATES : ends[5] + 2 * at.STATES],
@@ -58,7 +59,7 @@ def scratch_of(scratch: Array) -> tuple[Array, ...]:
     )
 
 
-SCRATCH = integrator.FROZEN + 28 + 3 * at.OPENINGS + 4 * integrator.SLOPES + terramechanics.CONTACTS + 5 * at.STATES
+SCRATCH = places.FROZEN + 28 + 3 * at.OPENINGS + 4 * places.SLOPES + terramechanics.CONTACTS + 5 * at.STATES
 MOST_PAST = 256
 """Samples of dead time that a machine may have."""
 

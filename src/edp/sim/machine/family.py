@@ -203,6 +203,7 @@ def _cylinders(cylinders: Cylinders, s: float, linkage: Any, draws: Draws) -> Cy
         rod=_times(cylinders.rod, width),
         stroke=_times(cylinders.stroke, linkage),
         hose_volume=_times(cylinders.hose_volume, s**3 * draws.uniform(0.8, 1.25, 3)),
+        line_bore=_times(cylinders.line_bore, s * np.ones(3)),
         dead_length=cylinders.dead_length * s,
         cushion_length=_times(cylinders.cushion_length, linkage),
         stop_stiffness=cylinders.stop_stiffness * s,

@@ -1,7 +1,8 @@
 """Where each number lies in the flat arrays that the compiled code reads and writes.
 
 Compiled functions take four arrays: `axes` (one row per cylinder), `plant` (one value per name), `state`
-(the 19 plant states) and `valves` (one row per spool: boom, arm, bucket, then their conflux spools).
+(the 19 plant states, and 12 of the lines behind them) and `valves` (one row per spool: boom, arm, bucket, then their
+conflux spools).
 """
 
 from __future__ import annotations
@@ -13,7 +14,10 @@ SPOOLS = 6
 
 # state
 PSI, RATE, HEAD, ROD, PUMP, BRISTLE, DISPLACEMENT = 0, 3, 6, 9, 12, 14, 17
-STATES = 19
+LOGGED_STATES = 19
+# of the lines between valves and cylinders, behind the others: pressures at the valve, and flows towards the cylinder
+PORT_HEAD, PORT_ROD, FLOW_HEAD, FLOW_ROD = 19, 22, 25, 28
+STATES = 31
 
 # valves[spool, ...]: pilot (value, rate), play output, spool (value, rate), all as a share of full, extension positive
 PILOT, PILOT_RATE, PLAY, SPOOL, SPOOL_RATE = range(5)
@@ -29,8 +33,9 @@ PILOT, PILOT_RATE, PLAY, SPOOL, SPOOL_RATE = range(5)
     DEAD_BAND_EXTEND, DEAD_BAND_RETRACT, CONFLUX_DEAD_BAND_EXTEND, CONFLUX_DEAD_BAND_RETRACT,
     PRIMARY_PUMP, CONFLUX_PUMP, DEMAND_EXTEND, DEMAND_RETRACT, CONFLUX_SHARE_EXTEND, CONFLUX_SHARE_RETRACT,
     HYSTERESIS, CONFLUX_HYSTERESIS, WIDEST, CONFLUX_WIDEST,
-) = range(49)  # fmt: skip
-AXIS_VALUES = 49
+    PORT_VOLUME, LINE_WALL, LINE_INERTANCE, LINE_LAMINAR, LINE_TURBULENT,
+) = range(54)  # fmt: skip
+AXIS_VALUES = 54
 
 # plant[...]
 (
@@ -43,8 +48,9 @@ AXIS_VALUES = 49
     BULK_AT_45, THINNING, VISCOUS_SHARE, HEAT_CAPACITY, COOLING, AMBIENT, COMPENSATED,
     BOOM_OFFSET, ARM_OFFSET, LUG, LUG_ANGLE,
     RATED_FLOW, ENGINE_SPEED, ENGINE_DROOP, ENGINE_POWER, ENGINE_ENERGY,
-) = range(54)  # fmt: skip
-PLANT_VALUES = 54
+    LOAD_MARGIN, SECTION_DROP, LINES,
+) = range(57)  # fmt: skip
+PLANT_VALUES = 57
 
 # conductance[cylinder, ...]: openings of one step, m^3/s/sqrt(Pa)
 HEAD_IN_1, HEAD_IN_2, ROD_IN_1, ROD_IN_2, HEAD_OUT, ROD_OUT, HEAD_TO_ROD, ROD_TO_HEAD = range(8)
@@ -55,7 +61,7 @@ LOWEST_PRESSURE = 0.1e5 - ATMOSPHERE
 """Gauge pressure of 0.1 bar absolute: the floor at which pressures are clamped, and counted."""
 
 # columns of one logged sample: the plant state, then
-LOG_DEMAND = STATES
+LOG_DEMAND = LOGGED_STATES
 LOG_STROKE = LOG_DEMAND + SPOOLS
 LOG_VELOCITY = LOG_STROKE + AXES
 LOG_SPOOL = LOG_VELOCITY + AXES
@@ -66,7 +72,8 @@ LOG_OIL = LOG_PAYLOAD + 1  # degC
 LOG_EVENTS = LOG_OIL + 1
 RELIEF, CAVITATION, REGENERATION, POWER_LIMITED, SOIL_CONTACT = range(5)
 EVENTS = 5
-LOG_COLUMNS = LOG_EVENTS + EVENTS
+LOG_PORT = LOG_EVENTS + EVENTS  # pressures of heads and rods at the valve (Pa); the chambers' where there are no lines
+LOG_COLUMNS = LOG_PORT + 2 * AXES
 LOG_GROUND = LOG_COLUMNS
 """First of the ground's height columns, `GROUND_POINTS` of them, which a log has only where there is ground."""
 

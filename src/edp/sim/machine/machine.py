@@ -49,7 +49,14 @@ class BucketLinkage:
 
 @dataclass(frozen=True)
 class Cylinders:
-    """Sizes, cushions, stops and leakage; SI units."""
+    """Sizes, cushions, stops and leakage; SI units.
+
+    What `edp.sim.physics.lines` needs may be left out; then a line is a part of its chamber.
+
+    Attributes:
+        line_bore: bore of the line from the valve to each chamber, m; its length follows from `hose_volume`.
+        line_modulus: bulk modulus of each line's walls (pressure over relative growth of its volume), Pa; 0 if rigid.
+    """
 
     count: Triple
     bore: Triple
@@ -63,6 +70,8 @@ class Cylinders:
     stop_damping: float
     piston_leakage: Triple
     spool_leakage: Triple
+    line_bore: Triple = (0.0, 0.0, 0.0)
+    line_modulus: Triple = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -93,11 +102,12 @@ class Oil:
 
 @dataclass(frozen=True)
 class Pumps:
-    """Two equal pumps with electronic positive control; SI units.
+    """Two equal pumps with electronic positive control, or with load sensing; SI units.
 
     The numbers of the engine may be left out; then it turns at one speed, whatever the load.
 
     Attributes:
+        load_margin: Pa by which each pump stays above its highest load; 0 for positive control.
         engine_droop: share of the governed speed by which the engine falls from no load to its full power.
         engine_power: its full power, W.
         engine_inertia: of engine, flywheel and pumps, kg m^2.
@@ -118,11 +128,17 @@ class Pumps:
     engine_power: float = 0.0
     engine_inertia: float = 0.0
     engine_speed_rpm: float = 0.0
+    load_margin: float = 0.0
 
 
 @dataclass(frozen=True)
 class Valves:
-    """Command path and main control valve; ratings are (L/min, bar) at full opening."""
+    """Command path and main control valve; ratings are (L/min, bar) at full opening.
+
+    Attributes:
+        flow_sharing: one of `edp.sim.machine.parameters.FLOW_SHARING`.
+        compensator_drop: Pa that a pressure compensator leaves across its section; for `pre_compensated` alone.
+    """
 
     pilot_pressure: float
     pilot_frequency: Triple
@@ -157,6 +173,7 @@ class Valves:
     port_relief_slope: float
     anti_cavitation: Rating
     flow_sharing: str
+    compensator_drop: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -223,6 +240,7 @@ class Sensors:
         can_jitter: rms of the latency, s.
         can_loss: share of frames lost.
         instance_seed: with the machine's name, the seed of the instance: offsets, clock phases, latencies.
+        pressure_at: where the transmitters sit, at the "cylinder" or, where lines are modelled, at the "valve".
     """
 
     velocity: float
@@ -242,6 +260,7 @@ class Sensors:
     can_jitter: float
     can_loss: float
     instance_seed: int
+    pressure_at: str = "cylinder"
 
 
 @dataclass(frozen=True)

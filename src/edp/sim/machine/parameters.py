@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine, Rating
-from edp.sim.physics import thermal
+from edp.sim.physics import lines, thermal
 
 Array = NDArray[np.float64]
 REFERENCE_PRESSURE = 343e5
 """Main relief, Pa: friction is given as a share of head area times this."""
 
 
-FLOW_SHARING = ("parallel", "compensated")
+FLOW_SHARING = ("parallel", "compensated", "pre_compensated")
+"""Orifices side by side; behind them compensators that show the highest load; before them ones of a drop each."""
+UNBOUNDED = 1e12
+"""Pa: the drop across a section that nothing limits."""
 
 
 def conductance(rating: Rating) -> float:
@@ -57,8 +60,12 @@ def _pack_cylinders(machine: Machine, axes: Array) -> None:
     axes[:, at.STROKE] = cylinders.stroke
     closed = (machine.boom_cylinder, machine.arm_cylinder, machine.bucket_linkage)
     axes[:, at.CLOSED] = [part.closed_length for part in closed]
-    axes[:, at.HEAD_DEAD] = cylinders.dead_length * axes[:, at.HEAD_AREA] + cylinders.hose_volume
-    axes[:, at.ROD_DEAD] = cylinders.dead_length * axes[:, at.ROD_AREA] + cylinders.hose_volume
+    hoses = np.array(cylinders.hose_volume)
+    if lines.modelled(cylinders):
+        lines.pack_lines(machine, axes)
+        hoses -= axes[:, at.PORT_VOLUME]
+    axes[:, at.HEAD_DEAD] = cylinders.dead_length * axes[:, at.HEAD_AREA] + hoses
+    axes[:, at.ROD_DEAD] = cylinders.dead_length * axes[:, at.ROD_AREA] + hoses
     axes[:, at.CUSHION_LENGTH] = cylinders.cushion_length
     axes[:, at.CUSHION_AREA] = cylinders.cushion_area
     axes[:, at.STOP_STIFFNESS] = cylinders.stop_stiffness
@@ -162,4 +169,7 @@ def _pack_supply(machine: Machine, plant: Array) -> None:
             f"machine {machine.name} [valves]: flow_sharing = {valves.flow_sharing!r} must be one of "
             f"{', '.join(FLOW_SHARING)}"
         )
-    plant[at.COMPENSATED] = FLOW_SHARING.index(valves.flow_sharing)
+    plant[at.COMPENSATED] = valves.flow_sharing == "compensated"
+    plant[at.SECTION_DROP] = valves.compensator_drop if valves.flow_sharing == "pre_compensated" else UNBOUNDED
+    plant[at.LOAD_MARGIN] = pumps.load_margin
+    plant[at.LINES] = lines.modelled(machine.cylinders)

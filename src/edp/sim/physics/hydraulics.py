@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
+from edp.sim.physics import lines
 from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
 SMOOTH2 = 1e5**2
 """Square of the pressure (Pa) below which an orifice turns laminar."""
+UNLOADING = 1.5
+"""Margins above the highest load at which a block for load sensing unloads its pump."""
 
 
 @inlined
@@ -61,13 +64,18 @@ def port_flows(pressure: float, relief: float, leak: float, plant: Array) -> tup
 
 
 @inlined
-def section(area: float, supply: float, load: float, highest: float, leak: float) -> tuple[float, float, float]:
+def section(
+    area: float, supply: float, load: float, highest: float, leak: float, most: float
+) -> tuple[float, float, float]:
     """Flow from a pump line through a load check into a chamber, and its slopes by pump pressure and by load.
 
-    `highest` is the pressure that a pressure-compensated section shows its pump instead of its own lower load.
+    `highest` is the pressure that a section with its compensator behind the spool shows its pump instead of its own
+    lower load; `most` the drop (Pa) that a compensator before the spool leaves it, whatever pump and load.
     """
     if area <= 0.0:
         return 0.0, 0.0, 0.0
+    if supply - load > most:
+        return area * check_orifice(most, leak)[0], 0.0, 0.0
     # Behind a compensator that shows the higher load, the flow does not depend on the section's own load.
     q, d = check_orifice(supply - max(load, highest), leak)
     return area * q, area * d, (area * d if load >= highest else 0.0)
@@ -91,7 +99,7 @@ def cylinder_flows(
     axes: Array,
     plant: Array,
 ) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float, float, float, float]]:
-    """All flows of cylinder `i` at head, rod and both pump pressures (Pa).
+    """All flows of cylinder `i` at head, rod and both pump pressures (Pa), those of its lines' ends at the valve.
 
     Returns:
         Net inflow of head and rod chamber and what is drawn from either pump, m^3/s; then the slopes: head by head,
@@ -101,13 +109,15 @@ def cylinder_flows(
     check, regeneration_check, tank = axes[i, at.CHECK], plant[at.REGEN_CHECK], plant[at.TANK]
     head_leak = axes[i, at.HEAD_LEAK] * plant[at.THINNING]
     rod_leak = axes[i, at.ROD_LEAK] * plant[at.THINNING]
-    leak = axes[i, at.PISTON_LEAK] * plant[at.THINNING]
+    # Where lines lie between, the pistons leak at their other ends (`integrator.rates`).
+    leak = 0.0 if plant[at.LINES] > 0.0 else axes[i, at.PISTON_LEAK] * plant[at.THINNING]
+    most = plant[at.SECTION_DROP]
     h, h_h = port_flows(head, axes[i, at.RELIEF_HEAD], head_leak, plant)
     r, r_r = port_flows(rod, axes[i, at.RELIEF_ROD], rod_leak, plant)
-    head_1, h_1, h_load_1 = section(opened[i, at.HEAD_IN_1], pump_1, head, highest[0], check)
-    head_2, h_2, h_load_2 = section(opened[i, at.HEAD_IN_2], pump_2, head, highest[1], check)
-    rod_1, r_1, r_load_1 = section(opened[i, at.ROD_IN_1], pump_1, rod, highest[0], check)
-    rod_2, r_2, r_load_2 = section(opened[i, at.ROD_IN_2], pump_2, rod, highest[1], check)
+    head_1, h_1, h_load_1 = section(opened[i, at.HEAD_IN_1], pump_1, head, highest[0], check, most)
+    head_2, h_2, h_load_2 = section(opened[i, at.HEAD_IN_2], pump_2, head, highest[1], check, most)
+    rod_1, r_1, r_load_1 = section(opened[i, at.ROD_IN_1], pump_1, rod, highest[0], check, most)
+    rod_2, r_2, r_load_2 = section(opened[i, at.ROD_IN_2], pump_2, rod, highest[1], check, most)
     # Spools open to tank have no check valve: 1.0 lets a cavitating chamber draw oil back.
     head_out, h_out = drain(opened[i, at.HEAD_OUT], head - tank, 1.0)
     rod_out, r_out = drain(opened[i, at.ROD_OUT], rod - tank, 1.0)
@@ -120,23 +130,36 @@ def cylinder_flows(
 
 
 @inlined
-def highest_load(m: int, state: Array, opened: Array) -> float:
+def highest_load(m: int, state: Array, opened: Array, plant: Array) -> float:
     """Largest pressure (Pa) among the chambers that pump `m` is open to; far below any where there is none."""
-    most = -1e9
+    most, port = -1e9, lines.at_valve(plant)
     for i in range(at.AXES):
         if opened[i, at.HEAD_IN_1 + m] > 0.0:
-            most = max(most, state[at.HEAD + i])
+            most = max(most, state[port + i])
         if opened[i, at.ROD_IN_1 + m] > 0.0:
-            most = max(most, state[at.ROD + i])
+            most = max(most, state[port + at.AXES + i])
     return most
 
 
 @inlined
-def pump_outflow(pressure: float, bypass: float, plant: Array) -> tuple[float, float]:
-    """Flow (m^3/s) from a pump line through open centre and main relief, and its slope."""
+def relief_of(highest: float, plant: Array) -> float:
+    """Pressure (Pa) above which a pump line opens to tank: the main relief's, or an unloading valve's above the load.
+
+    A pump that senses loads swings back late; until then a valve set to `UNLOADING` margins above the `highest` load
+    takes its oil, as in closed-centre blocks.
+    """
+    relief: float = plant[at.PUMP_RELIEF]
+    if plant[at.LOAD_MARGIN] > 0.0:
+        relief = min(relief, max(highest, plant[at.TANK]) + UNLOADING * plant[at.LOAD_MARGIN])
+    return relief
+
+
+@inlined
+def pump_outflow(pressure: float, bypass: float, relief: float, plant: Array) -> tuple[float, float]:
+    """Flow (m^3/s) from a pump line through open centre and a valve that opens at `relief` (Pa), and its slope."""
     q, d = orifice(pressure - plant[at.TANK])
     flow, slope = bypass * q, bypass * d
-    if pressure > plant[at.PUMP_RELIEF]:
-        flow += plant[at.RELIEF_SLOPE] * (pressure - plant[at.PUMP_RELIEF])
+    if pressure > relief:
+        flow += plant[at.RELIEF_SLOPE] * (pressure - relief)
         slope += plant[at.RELIEF_SLOPE]
     return flow, slope

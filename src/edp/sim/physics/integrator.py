@@ -1,9 +1,10 @@
 """One step of the plant: Strang splitting around a two-stage, L-stable Rosenbrock method (ROS2).
 
 Within a step the geometry, the mass matrix, the spools and the soil are frozen at mid-step; ROS2 advances
-w = (psi', p_head, p_rod, p_pump, z). Chamber pressures and bristles are eliminated in closed form, which leaves
-three joint rates and two pump pressures. ROS2 keeps order 2 for any Jacobian (Verwer et al., SIAM J. Sci. Comput.
-20, 1999), so derivatives of the bulk modulus and of the Coriolis terms are left out of it.
+w = (psi', p_head, p_rod, p_pump, z), and the pressures and flows of long lines where a machine has them. Chamber
+pressures, lines and bristles are eliminated in closed form, which leaves three joint rates and two pump pressures.
+ROS2 keeps order 2 for any Jacobian (Verwer et al., SIAM J. Sci. Comput. 20, 1999), so derivatives of the bulk modulus
+and of the Coriolis terms are left out of it.
 """
 
 from __future__ import annotations
@@ -15,31 +16,37 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
-from edp.sim.physics import dynamics, friction, hydraulics, linkage, pump, terrain, terramechanics, valve
+from edp.sim.physics import (
+    dynamics,
+    friction,
+    hydraulics,
+    line_step,
+    lines,
+    linkage,
+    pump,
+    terrain,
+    terramechanics,
+    valve,
+)
 from edp.sim.physics.jit import inlined
+
+# Side by side, as they are in their file: one a line would be a page.
+# isort: off
+from edp.sim.physics.scratch import (
+    ACROSS, ANCHOR, ANCHOR_COS, ANCHOR_SIN, ANGLES, BRISTLE_K, BYPASS, C_HEAD, C_PUMP_1, C_ROD, CONTACT, F_BY_V,
+    F_BY_Z, FROZEN, FROZEN_W, GRAVITY_T, H_BY_1, H_BY_2, H_BY_W, HEAD_BY_1, HEAD_BY_2, HEAD_BY_HEAD, HEAD_K, K1,
+    K2, LEVERS, LOST_1, LU, MASS, OPENED, PER_HEAD, PER_ROD, PORT_H_BY_W, PORT_HEAD_K, PORT_ROD_K, PUMP_ROW,
+    R_BY_1, R_BY_2, R_BY_W, RATES, RHS, ROD_BY_1, ROD_BY_2, ROD_BY_ROD, ROD_K, SINES, SLOPE, SLOPES, STAGE,
+    STROKES_W, T_HH, T_HR, T_RH, T_RR, Z_BY_V, Z_BY_W, Z_BY_Z, Z_LEFT,
+)  # fmt: skip
+# isort: on
 
 Array = NDArray[np.float64]
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
 """One of the two values at which ROS2 is L-stable; the other, 1 + 1/sqrt(2), has the larger error constant."""
 
-# frozen[...]: numbers of one step; three of a kind stand together, one per cylinder
-LEVERS, GRAVITY_T, PER_HEAD, PER_ROD, SINES, MASS, BYPASS, ANGLES = 0, 3, 6, 9, 12, 15, 21, 23
-ANCHOR, ANCHOR_COS, ANCHOR_SIN = 29, 32, 35
-FROZEN = 38
 ANCHORED = 0.03
 """Turn (rad) from its anchor up to which the series of `turned` are exact to rounding."""
-# slopes[cylinder, ...]: Jacobian pieces and elimination factors of one cylinder
-(
-    C_HEAD, C_ROD, HEAD_BY_HEAD, ROD_BY_ROD, ACROSS, HEAD_BY_1, HEAD_BY_2, ROD_BY_1, ROD_BY_2,
-    F_BY_Z, F_BY_V, Z_BY_V, Z_BY_Z,
-    T_HH, T_HR, T_RH, T_RR, H_BY_W, H_BY_1, H_BY_2, R_BY_W, R_BY_1, R_BY_2, Z_BY_W, Z_LEFT,
-    HEAD_K, ROD_K, BRISTLE_K,
-) = range(28)  # fmt: skip
-SLOPES = 28
-# slopes[PUMP_ROW, ...]: slope of the flow lost from each pump line, then stiffness over volume
-PUMP_ROW, LOST_1, C_PUMP_1 = 3, 0, 2
-# work: numbers of the step, strokes, openings, LU factors, slopes, contact with the soil, vectors of one state each
-FROZEN_W, STROKES_W, OPENED, LU, SLOPE, CONTACT, RATES, RHS, K1, K2, STAGE = range(11)
 
 
 @inlined
@@ -92,11 +99,11 @@ def freeze_geometry(state: Array, axes: Array, plant: Array, strokes: Array, s: 
 def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian: bool) -> None:
     """F(w) into `work[RATES]`: torque balance (not yet divided by M), pressure and bristle rates.
 
-    `w` is a state vector; only its part from RATE to BRISTLE is used. Derivatives go to `work[SLOPE]` if asked for.
+    `w` is a state vector; its part from RATE to BRISTLE is used, and that of the lines where there are any. Derivatives
+    go to `work[SLOPE]` if asked for.
     """
     s, strokes, opened, e, out = work[FROZEN_W], work[STROKES_W], work[OPENED], work[SLOPE], work[RATES]
-    w1, w2, w3 = w[at.RATE], w[at.RATE + 1], w[at.RATE + 2]
-    pump_1, pump_2 = w[at.PUMP], w[at.PUMP + 1]
+    w1, w2, w3, pump_1, pump_2 = w[at.RATE], w[at.RATE + 1], w[at.RATE + 2], w[at.PUMP], w[at.PUMP + 1]
     bias = dynamics.coriolis_terms(s[SINES], s[SINES + 1], s[SINES + 2], w1, w2, w3)
     out[at.RATE], out[at.RATE + 1], out[at.RATE + 2] = -bias[0], -bias[1], -bias[2]
     if work[CONTACT][terramechanics.ON] > 0.0:
@@ -105,19 +112,26 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
         out[at.RATE + 1] += soil[1]
         out[at.RATE + 2] += soil[2]
     # Parallel orifices see their own load only: no section may find a higher pressure here.
-    highest = (-1e9, -1e9)
+    highest = loads = (-1e9, -1e9)
+    if plant[at.COMPENSATED] > 0.0 or plant[at.LOAD_MARGIN] > 0.0:
+        loads = (hydraulics.highest_load(0, w, opened, plant), hydraulics.highest_load(1, w, opened, plant))
     if plant[at.COMPENSATED] > 0.0:
-        highest = (hydraulics.highest_load(0, w, opened), hydraulics.highest_load(1, w, opened))
+        highest = loads
+    long, port = plant[at.LINES] > 0.0, lines.at_valve(plant)
     drawn_1 = drawn_2 = 0.0
     for i in range(at.AXES):
         head, rod, v = w[at.HEAD + i], w[at.ROD + i], s[LEVERS + i] * w[at.RATE + i]
-        q, by = hydraulics.cylinder_flows(i, (head, rod, pump_1, pump_2), highest, opened, axes, plant)
+        ends = (w[port + i], w[port + at.AXES + i], pump_1, pump_2)
+        q, by = hydraulics.cylinder_flows(i, ends, highest, opened, axes, plant)
         drawn_1 += q[2]
         drawn_2 += q[3]
         c_head = hydraulics.stiffness(head, plant) * s[PER_HEAD + i]
         c_rod = hydraulics.stiffness(rod, plant) * s[PER_ROD + i]
-        out[at.HEAD + i] = c_head * (q[0] - axes[i, at.HEAD_AREA] * v)
-        out[at.ROD + i] = c_rod * (q[1] + axes[i, at.ROD_AREA] * v)
+        if long:
+            c_head, c_rod = line_step.line_rates(i, v, q, w, axes, plant, work)
+        else:
+            out[at.HEAD + i] = c_head * (q[0] - axes[i, at.HEAD_AREA] * v)
+            out[at.ROD + i] = c_rod * (q[1] + axes[i, at.ROD_AREA] * v)
         viscous = axes[i, at.VISCOUS] * plant[at.VISCOUS_SHARE]
         drag, z_rate, f_by_z, f_by_v, z_by_z, z_by_v = friction.lugre(v, w[at.BRISTLE + i], axes, i, viscous)
         stop, stop_by_v = friction.end_stop(strokes[i], v, axes, i)
@@ -132,7 +146,8 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
             e[i, F_BY_Z], e[i, F_BY_V], e[i, Z_BY_Z], e[i, Z_BY_V] = f_by_z, f_by_v - stop_by_v, z_by_z, z_by_v
     for m in range(2):
         p = w[at.PUMP + m]
-        lost, lost_slope = hydraulics.pump_outflow(p, s[BYPASS + m], plant)
+        relief = hydraulics.relief_of(loads[m], plant)
+        lost, lost_slope = hydraulics.pump_outflow(p, s[BYPASS + m], relief, plant)
         supply = plant[at.EFFICIENCY + m] * plant[at.MAX_FLOW] * w[at.DISPLACEMENT + m]
         c_pump = hydraulics.stiffness(p, plant) / plant[at.LINE_VOLUME]
         out[at.PUMP + m] = c_pump * (supply - lost - (drawn_1 if m == 0 else drawn_2))
@@ -165,10 +180,19 @@ def eliminate(g: float, axes: Array, s: Array, e: Array) -> None:
 
 
 @inlined
-def factorise(g: float, axes: Array, work: tuple[Array, ...]) -> None:
-    """Factor what is left of I - g J, 5x5, into `work[LU]`; no pivoting, its diagonal dominates."""
+def factorise(g: float, axes: Array, long: bool, work: tuple[Array, ...]) -> None:
+    """Factor what is left of I - g J, 5x5, into `work[LU]`; no pivoting, its diagonal dominates.
+
+    `long` says whether lines lie between valves and chambers.
+    """
     s, lu, e, contact = work[FROZEN_W], work[LU], work[SLOPE], work[CONTACT]
-    eliminate(g, axes, s, e)
+    # The pumps feel what the sections see: the chambers, or the lines' ends at the valve.
+    seen = H_BY_W
+    if long:
+        line_step.eliminate_lines(g, axes, s, e)
+        seen = PORT_H_BY_W
+    else:
+        eliminate(g, axes, s, e)
     # Rows of the joint rates stay multiplied by M: no inverse of the mass matrix is needed.
     lu[0, 0], lu[0, 1], lu[0, 2] = s[MASS], s[MASS + 1], s[MASS + 2]
     lu[1, 0], lu[1, 1], lu[1, 2] = s[MASS + 1], s[MASS + 3], s[MASS + 4]
@@ -188,12 +212,14 @@ def factorise(g: float, axes: Array, work: tuple[Array, ...]) -> None:
         h_1, h_2, r_1, r_2 = e[i, HEAD_BY_1], e[i, HEAD_BY_2], e[i, ROD_BY_1], e[i, ROD_BY_2]
         lu[i, 3] = -arm * (head_area * e[i, H_BY_1] - rod_area * e[i, R_BY_1])
         lu[i, 4] = -arm * (head_area * e[i, H_BY_2] - rod_area * e[i, R_BY_2])
-        lu[3, i] = -gc_1 * (h_1 * e[i, H_BY_W] + r_1 * e[i, R_BY_W])
-        lu[4, i] = -gc_2 * (h_2 * e[i, H_BY_W] + r_2 * e[i, R_BY_W])
-        l33 += gc_1 * (h_1 + r_1 - h_1 * e[i, H_BY_1] - r_1 * e[i, R_BY_1])
-        l34 -= gc_1 * (h_1 * e[i, H_BY_2] + r_1 * e[i, R_BY_2])
-        l43 -= gc_2 * (h_2 * e[i, H_BY_1] + r_2 * e[i, R_BY_1])
-        l44 += gc_2 * (h_2 + r_2 - h_2 * e[i, H_BY_2] - r_2 * e[i, R_BY_2])
+        h_by_w, h_by_1, h_by_2 = e[i, seen], e[i, seen + 1], e[i, seen + 2]
+        r_by_w, r_by_1, r_by_2 = e[i, seen + 3], e[i, seen + 4], e[i, seen + 5]
+        lu[3, i] = -gc_1 * (h_1 * h_by_w + r_1 * r_by_w)
+        lu[4, i] = -gc_2 * (h_2 * h_by_w + r_2 * r_by_w)
+        l33 += gc_1 * (h_1 + r_1 - h_1 * h_by_1 - r_1 * r_by_1)
+        l34 -= gc_1 * (h_1 * h_by_2 + r_1 * r_by_2)
+        l43 -= gc_2 * (h_2 * h_by_1 + r_2 * r_by_1)
+        l44 += gc_2 * (h_2 + r_2 - h_2 * h_by_2 - r_2 * r_by_2)
     lu[3, 3], lu[3, 4], lu[4, 3], lu[4, 4] = l33, l34, l43, l44
     for k in range(5):
         inverse = 1.0 / lu[k, k]
@@ -206,20 +232,28 @@ def factorise(g: float, axes: Array, work: tuple[Array, ...]) -> None:
 
 
 @inlined
-def solve(g: float, axes: Array, work: tuple[Array, ...], out: Array) -> None:
-    """Solve (I - g J) k = work[RHS] (rows of the joint rates multiplied by M); k goes to `out`, laid out as a state."""
+def solve(g: float, axes: Array, long: bool, work: tuple[Array, ...], out: Array) -> None:
+    """Solve (I - g J) k = work[RHS] (rows of the joint rates multiplied by M); k goes to `out`, laid out as a state.
+
+    `long` says whether lines lie between valves and chambers.
+    """
     s, lu, e, r = work[FROZEN_W], work[LU], work[SLOPE], work[RHS]
     b3, b4 = r[at.PUMP], r[at.PUMP + 1]
     gc_1, gc_2 = g * e[PUMP_ROW, C_PUMP_1], g * e[PUMP_ROW, C_PUMP_1 + 1]
     for i in range(at.AXES):
-        head = e[i, T_HH] * r[at.HEAD + i] + e[i, T_HR] * r[at.ROD + i]
-        rod = e[i, T_RH] * r[at.HEAD + i] + e[i, T_RR] * r[at.ROD + i]
+        if long:
+            head, rod = line_step.known_lines(i, g, r, e)
+            seen_head, seen_rod = e[i, PORT_HEAD_K], e[i, PORT_ROD_K]
+        else:
+            head = e[i, T_HH] * r[at.HEAD + i] + e[i, T_HR] * r[at.ROD + i]
+            rod = e[i, T_RH] * r[at.HEAD + i] + e[i, T_RR] * r[at.ROD + i]
+            seen_head, seen_rod = head, rod
         z = r[at.BRISTLE + i] * e[i, Z_LEFT]
         e[i, HEAD_K], e[i, ROD_K], e[i, BRISTLE_K] = head, rod, z
         force = axes[i, at.HEAD_AREA] * head - axes[i, at.ROD_AREA] * rod - e[i, F_BY_Z] * z
         r[at.RATE + i] += g * s[LEVERS + i] * force
-        b3 += gc_1 * (e[i, HEAD_BY_1] * head + e[i, ROD_BY_1] * rod)
-        b4 += gc_2 * (e[i, HEAD_BY_2] * head + e[i, ROD_BY_2] * rod)
+        b3 += gc_1 * (e[i, HEAD_BY_1] * seen_head + e[i, ROD_BY_1] * seen_rod)
+        b4 += gc_2 * (e[i, HEAD_BY_2] * seen_head + e[i, ROD_BY_2] * seen_rod)
     b0, b1, b2 = r[at.RATE], r[at.RATE + 1], r[at.RATE + 2]
     b1 -= lu[1, 0] * b0
     b2 -= lu[2, 0] * b0 + lu[2, 1] * b1
@@ -236,23 +270,31 @@ def solve(g: float, axes: Array, work: tuple[Array, ...], out: Array) -> None:
         out[at.HEAD + i] = e[i, HEAD_K] + e[i, H_BY_W] * k + e[i, H_BY_1] * b3 + e[i, H_BY_2] * b4
         out[at.ROD + i] = e[i, ROD_K] + e[i, R_BY_W] * k + e[i, R_BY_1] * b3 + e[i, R_BY_2] * b4
         out[at.BRISTLE + i] = e[i, BRISTLE_K] + e[i, Z_BY_W] * k
+        if long:
+            line_step.fill_lines(i, r, e, out)
 
 
 @inlined
 def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Array, ...]) -> None:
     """ROS2 on w: (I - gJ) k1 = F(w), (I - gJ) k2 = F(w + h k1) - 2 k1, w += 1.5 h k1 + 0.5 h k2, g = gamma h."""
     s, rhs, f, k1, k2, stage = work[FROZEN_W], work[RHS], work[RATES], work[K1], work[K2], work[STAGE]
-    g = GAMMA * h
+    g, long = GAMMA * h, plant[at.LINES] > 0.0
     rates(state, axes, plant, work, True)
-    factorise(g, axes, work)
+    factorise(g, axes, long, work)
     for n in range(at.RATE, at.DISPLACEMENT):
         rhs[n] = f[n]
-    solve(g, axes, work, k1)
+    if long:
+        for n in range(at.PORT_HEAD, at.STATES):
+            rhs[n] = f[n]
+    solve(g, axes, long, work, k1)
     for n in range(at.RATE, at.DISPLACEMENT):
         stage[n] = state[n] + h * k1[n]
     # Displacements have exact half steps of their own and are constant for ROS2.
     for m in range(2):
         stage[at.DISPLACEMENT + m] = state[at.DISPLACEMENT + m]
+    if long:
+        for n in range(at.PORT_HEAD, at.STATES):
+            stage[n] = state[n] + h * k1[n]
     rates(stage, axes, plant, work, False)
     for n in range(at.HEAD, at.DISPLACEMENT):
         rhs[n] = f[n] - 2.0 * k1[n]
@@ -261,9 +303,15 @@ def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Ar
     rhs[at.RATE] = f[at.RATE] - s[MASS] * a - s[MASS + 1] * b - s[MASS + 2] * c
     rhs[at.RATE + 1] = f[at.RATE + 1] - s[MASS + 1] * a - s[MASS + 3] * b - s[MASS + 4] * c
     rhs[at.RATE + 2] = f[at.RATE + 2] - s[MASS + 2] * a - s[MASS + 4] * b - s[MASS + 5] * c
-    solve(g, axes, work, k2)
+    if long:
+        for n in range(at.PORT_HEAD, at.STATES):
+            rhs[n] = f[n] - 2.0 * k1[n]
+    solve(g, axes, long, work, k2)
     for n in range(at.RATE, at.DISPLACEMENT):
         state[n] += h * (1.5 * k1[n] + 0.5 * k2[n])
+    if long:
+        for n in range(at.PORT_HEAD, at.STATES):
+            state[n] += h * (1.5 * k1[n] + 0.5 * k2[n])
 
 
 @inlined
@@ -274,9 +322,14 @@ def begin_sample(state: Array, work: tuple[Array, ...]) -> None:
 
 
 @inlined
-def clamp_pressures(state: Array) -> int:
-    """Lift pressures below 0.1 bar absolute to it; returns how many."""
+def clamp_pressures(state: Array, long: bool) -> int:
+    """Lift pressures below 0.1 bar absolute to it, in lines, too, where they are `long`; returns how many."""
     lifted = 0
+    if long:
+        for n in range(at.PORT_HEAD, at.FLOW_HEAD):
+            if state[n] < at.LOWEST_PRESSURE:
+                state[n] = at.LOWEST_PRESSURE
+                lifted += 1
     for n in range(at.HEAD, at.BRISTLE):
         if state[n] < at.LOWEST_PRESSURE:
             state[n] = at.LOWEST_PRESSURE
@@ -329,7 +382,7 @@ def step(
     valve.spool_half_step(filters, valves)
     valve.pilot_half_step(demand, filters, axes, valves)
     # Last: within a step the stages may pass below vacuum, and a clamp there would break the order.
-    return clamp_pressures(state)
+    return clamp_pressures(state, plant[at.LINES] > 0.0)
 
 
 def new_work() -> tuple[Array, ...]:

@@ -21,9 +21,10 @@ OPTIONS: dict[str, Any] = {
 
 
 def fingerprinted() -> tuple[Path, ...]:
-    """The source files that compiled code comes from: those that import this one, `layout`, and this one."""
+    """The source files that compiled code comes from: those that import this one, those of places, and this one."""
     room = Path(__file__).parents[1]
-    return (*files_with(room, "from edp.sim.physics.jit import"), room / "machine" / "layout.py", Path(__file__))
+    places = room / "machine" / "layout.py", room / "physics" / "scratch.py"
+    return (*files_with(room, "from edp.sim.physics.jit import"), *places, Path(__file__))
 
 
 compiler = Compiler("sim", fingerprinted, OPTIONS, facts=str(GROUND_POINTS))

@@ -12,7 +12,7 @@ from edp.errors import ConfigError
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
-from edp.sim.physics import dynamics, engine, integrator, linkage, soil, terrain, terramechanics, thermal, valve
+from edp.sim.physics import dynamics, engine, integrator, lines, linkage, soil, terrain, terramechanics, thermal, valve
 from edp.sim.physics.jit import compiled, inlined
 from edp.sim.sensors import logbook
 
@@ -283,6 +283,8 @@ class Plant:
     def place(self, strokes: Array, velocities: Array, pressures: Array) -> None:
         """Put cylinders and oil where they were measured; valves, displacements and friction go on as they were.
 
+        Oil in long lines begins at rest, at the chambers' pressures.
+
         Args:
             strokes: m, shape (3,); held within the stroke.
             velocities: of the cylinders, m/s, shape (3,).
@@ -295,6 +297,7 @@ class Plant:
             self.state[at.RATE + i] = velocities[i] / linkage.cylinder(i, psi, self.plant)[1]
         finite = np.isfinite(pressures)
         self.state[at.HEAD : at.BRISTLE][finite] = np.maximum(pressures[finite], at.LOWEST_PRESSURE)
+        lines.rest(self.state, self.plant)
 
     def _advance(self, levers: Array, hand_s: float) -> Array:
         """Run with levers that the hand smooths at steps of `hand_s`; 0 for levers as they are."""
@@ -332,4 +335,5 @@ def resting_state(strokes: Array, axes: Array, plant: Array) -> Array:
         state[at.HEAD + i], state[at.ROD + i] = head, rod
     state[at.PUMP : at.PUMP + 2] = RESTING_PRESSURE
     state[at.DISPLACEMENT : at.DISPLACEMENT + 2] = plant[at.MIN_DISPLACEMENT]
+    lines.rest(state, plant)
     return state

@@ -1,4 +1,15 @@
-"""Two pumps: electronic positive control, common power limit, first-order displacement, open-centre bypass."""
+"""Two pumps: positive control or load sensing, common power limit, first-order displacement, open-centre bypass.
+
+Load sensing (Krus, On Load Sensing Fluid Power Systems, Linkoping 1988; Merritt 1967, pressure-compensated pumps):
+a valve at each pump compares its pressure p with the highest load p_L of its open sections and swings the pump so that
+p stays `load_margin` above, or at the main relief's pressure if that is lower:
+
+    x = (min(p_L + margin, relief) - p) / (DROOP margin), held within the least displacement and 1,
+
+behind the first-order lag of the displacement; the power limit stays. With `DROOP` the margin falls by that share from
+no flow to full. In want of oil (full displacement or power limit) p falls towards the loads: what then moves is decided
+by the sections, see `flow_sharing`. The open centre is a bleed orifice that does not close.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
+from edp.sim.physics import lines
 from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
+DROOP = 0.3
+"""Share of the margin by which a pump that senses loads falls from no flow to its full one; usual 20 to 30 %."""
 
 
 @inlined
@@ -32,9 +46,47 @@ def demand(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
 
 
 @inlined
+def sensed_loads(state: Array, valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
+    """Highest pressure (Pa) of the chambers that either pump's spools are open to; that of the tank if none is."""
+    first = second = plant[at.TANK]
+    port = lines.at_valve(plant)
+    for j in range(at.SPOOLS):
+        i, spool = j % at.AXES, valves[j, at.SPOOL]
+        if j < at.AXES:
+            extend, retract = axes[i, at.DEAD_BAND_EXTEND], axes[i, at.DEAD_BAND_RETRACT]
+            pump = axes[i, at.PRIMARY_PUMP]
+        else:
+            extend, retract = axes[i, at.CONFLUX_DEAD_BAND_EXTEND], axes[i, at.CONFLUX_DEAD_BAND_RETRACT]
+            pump = axes[i, at.CONFLUX_PUMP]
+        load = plant[at.TANK]
+        if spool > extend:
+            load = state[port + i]
+        elif -spool > retract:
+            load = state[port + at.AXES + i]
+        if pump == 0.0:
+            first = max(first, load)
+        else:
+            second = max(second, load)
+    return first, second
+
+
+@inlined
+def asked(state: Array, valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
+    """Displacement asked for, as a share of full, for both pumps: by the pilots or by the loads."""
+    margin, least = plant[at.LOAD_MARGIN], plant[at.MIN_DISPLACEMENT]
+    if margin <= 0.0:
+        return demand(valves, axes, plant)
+    first, second = sensed_loads(state, valves, axes, plant)
+    per_band = 1.0 / (DROOP * margin)
+    first = (min(first + margin, plant[at.PUMP_RELIEF]) - state[at.PUMP]) * per_band
+    second = (min(second + margin, plant[at.PUMP_RELIEF]) - state[at.PUMP + 1]) * per_band
+    return min(max(first, least), 1.0), min(max(second, least), 1.0)
+
+
+@inlined
 def displacement_step(state: Array, valves: Array, axes: Array, plant: Array, share: float) -> None:
     """Move both displacements towards demand under the power limit; `share` = exp(-step / time constant)."""
-    first, second = demand(valves, axes, plant)
+    first, second = asked(state, valves, axes, plant)
     # A line below tank pressure takes no power from the other pump's share.
     power = plant[at.MAX_FLOW] * (first * max(state[at.PUMP], 0.0) + second * max(state[at.PUMP + 1], 0.0))
     # At least 1 W: idle pumps do not divide by zero.
@@ -46,8 +98,13 @@ def displacement_step(state: Array, valves: Array, axes: Array, plant: Array, sh
 
 @inlined
 def bypass_conductances(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
-    """Open centre of both pumps: closes as any spool of a pump moves, product of (1 - |s| / s_closed)^2."""
+    """Open centre of both pumps: closes as any spool of a pump moves, product of (1 - |s| / s_closed)^2.
+
+    With load sensing it is a bleed orifice that stays.
+    """
     first = second = plant[at.BYPASS]
+    if plant[at.LOAD_MARGIN] > 0.0:
+        return first, second
     per_closed = 1.0 / plant[at.BYPASS_CLOSED]
     for j in range(at.SPOOLS):
         left = max(1.0 - abs(valves[j, at.SPOOL]) * per_closed, 0.0)

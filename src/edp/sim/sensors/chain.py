@@ -32,9 +32,9 @@ DRAWS = 18
 # numbers[...]: sizes of one machine's sensors at one rate
 (
     NOISY, STEP_S, PILOT_FULL, DERIVATIVE, LAGGED, LAG, RANGE, QUANTUM, DRIFT, ANGLE_QUANTUM, LEVERED, PLAYING, PLAY,
-    OFFSET,
-) = 0, 1, 2, 3, 8, 9, 12, 13, 14, 15, 16, 17, 18, 21  # fmt: skip
-SENSOR_NUMBERS = 27
+    OFFSET, PRESSURES_FROM,
+) = 0, 1, 2, 3, 8, 9, 12, 13, 14, 15, 16, 17, 18, 21, 27  # fmt: skip
+SENSOR_NUMBERS = 28
 # memory[...]: play of the pins (offset, speed, force), first pressures and state of their lag, first velocities and
 # states of their derivative
 PIN, PIN_SPEED, PIN_FORCE, FIRST_PRESSURE, LAG_STATE, FIRST_VELOCITY, DERIVATIVE_STATE = 0, 3, 6, 9, 15, 21, 24
@@ -69,7 +69,7 @@ def remember(sample: Array, kelvin: float, tick: int, setup: Setup, memory: Arra
             memory[PIN_FORCE + i] = now
         row[VELOCITY + i], row[ANGLE + i], row[RATE + i] = v, sample[0, at.PSI + i], sample[0, at.RATE + i]
     for n in range(6):
-        p = sample[0, at.HEAD + n]
+        p = sample[0, int(numbers[PRESSURES_FROM]) + n]
         if numbers[LAGGED] > 0.0:
             if tick == 0:
                 memory[FIRST_PRESSURE + n], memory[LAG_STATE + n] = p, 0.0
@@ -185,7 +185,7 @@ def sense(
         for i in range(at.AXES):
             out[i] = sample[0, at.LOG_VELOCITY + i]
         for n in range(6):
-            out[6 + n] = sample[0, at.HEAD + n]
+            out[6 + n] = sample[0, int(numbers[PRESSURES_FROM]) + n]
         read_pilots(float(tick), numbers[PILOT_FULL], history, out)
     for i in range(at.AXES):
         out[STROKES + i] = sample[0, at.LOG_STROKE + i]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
 from edp.sim.sensors import alterations, can, chain, filters, transducers
@@ -124,5 +125,6 @@ def pack_sensors(machine: Machine, rate_hz: float, noisy: bool, faults: Array | 
     numbers[chain.PLAYING] = any(own.pin_backlash)
     numbers[chain.PLAY : chain.PLAY + 3] = own.pin_backlash
     numbers[chain.OFFSET : chain.OFFSET + 6] = instance_of(machine).pressure_offset
+    numbers[chain.PRESSURES_FROM] = at.HEAD if own.pressure_at == "cylinder" else at.LOG_PORT
     axes, plant = pack(machine)
     return numbers, axes, plant, np.zeros((0, alterations.COLUMNS)) if faults is None else faults

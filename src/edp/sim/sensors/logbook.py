@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
-from edp.sim.physics import linkage, pump
+from edp.sim.physics import lines, linkage, pump
 from edp.sim.physics.jit import compiled
 
 Array = NDArray[np.float64]
@@ -18,8 +18,9 @@ Array = NDArray[np.float64]
 def write_events(state: Array, valves: Array, axes: Array, plant: Array, memory: Array, row: Array) -> None:
     """Flags 0 or 1: relief, cavitation, regeneration, power limit, soil contact."""
     relief = cavitation = regeneration = limited = 0.0
+    port = lines.at_valve(plant)
     for i in range(at.AXES):
-        head, rod, spool = state[at.HEAD + i], state[at.ROD + i], valves[i, at.SPOOL]
+        head, rod, spool = state[port + i], state[port + at.AXES + i], valves[i, at.SPOOL]
         if head > axes[i, at.RELIEF_HEAD] or rod > axes[i, at.RELIEF_ROD]:
             relief = 1.0
         if head < 0.0 or rod < 0.0:
@@ -31,7 +32,7 @@ def write_events(state: Array, valves: Array, axes: Array, plant: Array, memory:
     for m in range(2):
         if state[at.PUMP + m] > plant[at.PUMP_RELIEF]:
             relief = 1.0
-    first, second = pump.demand(valves, axes, plant)
+    first, second = pump.asked(state, valves, axes, plant)
     # Demand, not displacement: the limit acts where more power is asked for than there is.
     power = plant[at.MAX_FLOW] * (first * state[at.PUMP] + second * state[at.PUMP + 1])
     if power > plant[at.POWER_LIMIT]:
@@ -62,8 +63,11 @@ def write_log(
 ) -> None:
     """One sample: plant state, demands, strokes (m from closed), velocities (m/s), then what else is true."""
     heights, memory = ground[3], ground[4]
-    for n in range(at.STATES):
+    for n in range(at.LOGGED_STATES):
         row[n] = state[n]
+    port = lines.at_valve(plant)
+    for n in range(2 * at.AXES):
+        row[at.LOG_PORT + n] = state[port + n]
     for j in range(at.SPOOLS):
         row[at.LOG_DEMAND + j] = demand[j]
         row[at.LOG_SPOOL + j] = valves[j, at.SPOOL]
