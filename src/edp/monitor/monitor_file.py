@@ -24,18 +24,17 @@ from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_json, write_json
+from edp.storage.headers import HASH, header_digest
+from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
-    HASH,
     Bundle,
     as_damage,
     check_hash,
-    header_digest,
     load_bundle,
     read_arrays,
     save_bundle,
     write_arrays,
 )
-from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.twin_bundle import HEADER as TWIN_HEADER
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
