@@ -70,6 +70,7 @@ SMALL = {
     "cylinder_gate": [BLOCKS["cylinder_gate"](), BLOCKS["cylinder_gate"](form="linear")],
     "attention_bridge": [BLOCKS["attention_bridge"](heads=2)],
     "squeeze_excitation": [BLOCKS["squeeze_excitation"](reduction=2)],
+    "machine_code": [BLOCKS["machine_code"](size=3)],
     "mlp": [MlpHead(hidden=6), MlpHead(hidden=5, layers=2)],
     "glu": [GluHead(hidden=4), GluHead(hidden=4, layers=2)],
     "linear": [LinearHead(dead_band=True)],

@@ -177,6 +177,15 @@ def test_the_same_samples_under_another_name():
     assert (found.first, found.second, found.identical, found.share) == ("b", "copy", True, 1.0)
 
 
+def test_copies_are_named_beside_the_first_and_repeat_others_once():
+    copies = [sketch(replace(OTHERS[1], name=f"copy {number}")) for number in range(3)]
+    part = sketch(replace(OTHERS[1], name="part", values=np.ascontiguousarray(OTHERS[1].values[2007:9007])))
+    found = find_repeats([sketch(OTHERS[1]), *copies, part])
+    pairs = {(repeat.first, repeat.second, repeat.identical) for repeat in found}
+    assert pairs == {*(("b", copy.name, True) for copy in copies), ("b", "part", False)}
+    assert len(found) == len(pairs)
+
+
 def test_a_shifted_part_at_half_the_rate_and_another_scale():
     part = OTHERS[1].values[2007:9007:2] * 3.0 + 1.0
     (found,) = repeats(replace(OTHERS[1], name="part", values=np.ascontiguousarray(part), rate_hz=50.0))

@@ -22,7 +22,7 @@ from edp.logs.proposal.columns import LogLook, refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.names import is_error_name
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
-from edp.logs.proposal.shapes import shape_notes
+from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.recording import Recording
@@ -164,7 +164,8 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     proposal, timing = _timed(group, proposal)
     notes = [*_notes(group, others, broken, proposal), *timing.notes, *_of_copies(copies)]
     targets, more = _targets(proposal)
-    notes += more
+    chosen = {guess.column for guess in proposal.columns if guess.channel in targets}
+    notes += [*more, *pace_notes(proposal.look, proposal.clock, chosen), *beside_notes(source, paths)]
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
     if len(channels) > MOST_FEATURES:
         notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")

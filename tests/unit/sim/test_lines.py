@@ -200,9 +200,10 @@ def test_an_environment_is_the_recording_of_its_levers_to_the_bit(tmp_path):
 @pytest.mark.parametrize(
     ("cylinders", "sensors", "words"),
     [
-        ("line_bore = [0.025, 0.0, 0.02]", "", "above 0 for all"),
+        ("line_bore = [0.025, 0.0, 0.02]", "", "at least 0.001 m for all"),
         ("line_bore = [0.025, 0.025, 0.002]", "", r"line_bore\[bucket\] = 0.002 m makes of hose_volume"),
         ("line_bore = [0.15, 0.025, 0.02]", "", r"line_bore\[boom\]"),
+        ("line_bore = [1e-300, 0.025, 0.02]", "", "at least 0.001 m for all"),
         ("line_bore = [0.5, 0.025, 0.02]", "", "from 0 to 0.2"),
         ("line_bore = [nan, 0.025, 0.02]", "", "line_bore"),
         ("line_bore = [0.025, 0.025]", "", "line_bore"),

@@ -77,7 +77,7 @@ LOG_COLUMNS = LOG_PORT + 2 * AXES
 LOG_GROUND = LOG_COLUMNS
 """First of the ground's height columns, `GROUND_POINTS` of them, which a log has only where there is ground."""
 
-# memory[...]: what the ground remembers
+# memory[...]: what the ground remembers; behind it the depth of the rut (m) at each of its points
 (
     FORCE_X, FORCE_Y, PAYLOAD, HEAP, DISTANCE, CHIP, SHEAR, HEEL_SET, PITCH, PITCH_RATE, DIGS, IN_SOIL, TOUCHED,
 ) = range(13)  # fmt: skip

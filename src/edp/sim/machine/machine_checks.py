@@ -13,16 +13,15 @@ import numpy as np
 from edp.errors import ConfigError
 from edp.settings.tree import SettingsTree
 from edp.sim.machine import layout as at
+from edp.sim.machine import option_checks
 from edp.sim.machine.machine import Machine, Rating, Ratings, Triple
-from edp.sim.machine.parameters import FLOW_SHARING, conductance, pack
-from edp.sim.physics import lines, linkage
+from edp.sim.machine.option_checks import CYLINDERS as CYLINDERS
+from edp.sim.machine.parameters import FLOW_SHARING, pack
+from edp.sim.physics import linkage
 
-CYLINDERS = ("boom", "arm", "bucket")
 MACHINE_FILE = SettingsTree(what="machine file", positions={Triple: CYLINDERS, Ratings: CYLINDERS})
 BEYOND_STOPS = math.radians(4.0)
 """How far beyond its stops a joint must still have a lever arm: impacts push it there."""
-MOST_BLED = 0.1
-"""Largest share of a pump's flow that the bleed of a load-sensing block takes at its margin."""
 LEAST_LEVER = 0.08
 """Least lever arm |dx/dpsi| (m/rad) as a share of the stroke (m): below it an impact can turn the linkage over."""
 
@@ -170,10 +169,6 @@ BOUNDS: Mapping[str, ParameterBound] = {
 """By `section.key`; a number without an entry must be finite."""
 WORDS: Mapping[str, tuple[str, ...]] = {"flow_sharing": FLOW_SHARING, "pressure_at": ("cylinder", "valve")}
 """What a key that takes a word may say."""
-SOFTEST = 1e7
-"""Pa, bulk modulus of walls that give way more than any hose's, 1e8 to 1e9 Pa."""
-LINE_LENGTHS = ParameterBound(0.3, 60.0)
-"""m: shorter lines are a part of their chamber, longer ones are no excavator's."""
 FLOWING = ("meter_in_extend", "meter_in_retract", "meter_out_extend", "meter_out_retract")
 """Ratings without which a cylinder could not move."""
 
@@ -254,9 +249,9 @@ def _check_pairs(machine: Machine, where: str) -> None:
                 f"machine file {where} [cylinders]: cushion_length[{name}] = {cylinders.cushion_length[i]!r} m must be "
                 f"at most half of stroke[{name}] = {cylinders.stroke[i]!r} m"
             )
-    _check_engine(machine, where)
-    _check_load_sensing(machine, where)
-    _check_lines(machine, where)
+    option_checks.check_engine(machine, where)
+    option_checks.check_load_sensing(machine, where)
+    option_checks.check_lines(machine, where)
     for key, (low, high) in (
         ("pressure_offset", machine.sensors.pressure_offset),
         ("can_latency", machine.sensors.can_latency),
@@ -270,87 +265,6 @@ def _check_pairs(machine: Machine, where: str) -> None:
             f"machine file {where} [friction]: static_fraction = {friction.static_fraction!r} must be at least "
             f"coulomb_fraction = {friction.coulomb_fraction!r}"
         )
-
-
-def _check_engine(machine: Machine, where: str) -> None:
-    """All numbers of the engine or none, and power enough for the pumps: they would stall it otherwise."""
-    pumps = machine.pumps
-    keys = ("engine_droop", "engine_power", "engine_inertia", "engine_speed_rpm")
-    absent = [key for key in keys if getattr(pumps, key) == 0.0]
-    if absent and len(absent) < len(keys):
-        raise ConfigError(
-            f"machine file {where} [pumps]: {', '.join(absent)} must be above 0 where the other numbers of the engine "
-            f"are; give all of {', '.join(keys)}, or none for an engine that turns at one speed"
-        )
-    if not absent and pumps.engine_power < pumps.power_limit:
-        raise ConfigError(
-            f"machine file {where} [pumps]: engine_power = {pumps.engine_power!r} W must be at least power_limit = "
-            f"{pumps.power_limit!r} W, or the pumps stall the engine"
-        )
-
-
-def _check_load_sensing(machine: Machine, where: str) -> None:
-    """A bleed that carries the least flow below the margin and little more, and compensators that can regulate."""
-    pumps, valves = machine.pumps, machine.valves
-    if (valves.compensator_drop > 0.0) != (valves.flow_sharing == "pre_compensated"):
-        raise ConfigError(
-            f"machine file {where} [valves]: compensator_drop = {valves.compensator_drop!r} Pa with flow_sharing = "
-            f"{valves.flow_sharing!r}; must be above 0 with 'pre_compensated', and 0 or left out with any other"
-        )
-    if pumps.load_margin == 0.0:
-        return
-    if valves.compensator_drop > pumps.load_margin:
-        raise ConfigError(
-            f"machine file {where} [valves]: compensator_drop = {valves.compensator_drop!r} Pa must be at most "
-            f"load_margin = {pumps.load_margin!r} Pa of [pumps], or no compensator ever regulates"
-        )
-    if pumps.load_margin >= pumps.relief:
-        raise ConfigError(
-            f"machine file {where} [pumps]: load_margin = {pumps.load_margin!r} Pa must be below relief = "
-            f"{pumps.relief!r} Pa"
-        )
-    bled = conductance(pumps.bypass) * math.sqrt(pumps.load_margin)
-    least, most = pumps.min_displacement * pumps.max_flow, MOST_BLED * pumps.max_flow
-    if not least <= bled <= most:
-        raise ConfigError(
-            f"machine file {where} [pumps]: bypass = {list(pumps.bypass)!r} bleeds {bled * 6e4:.3g} L/min at "
-            f"load_margin = {pumps.load_margin!r} Pa; with load sensing the centre is closed but for a bleed, from "
-            f"{least * 6e4:.3g} L/min (min_displacement, which must go somewhere) to {most * 6e4:.3g} L/min "
-            f"({MOST_BLED:g} of max_flow); change bypass or min_displacement"
-        )
-
-
-def _check_lines(machine: Machine, where: str) -> None:
-    """Bores of all lines or of none, and lengths that can be; what only lines have is refused without them."""
-    cylinders = machine.cylinders
-    if not lines.modelled(cylinders):
-        for section, key, given in (
-            ("cylinders", "line_modulus", any(cylinders.line_modulus)),
-            ("sensors", "pressure_at", machine.sensors.pressure_at == "valve"),
-        ):
-            if given:
-                raise ConfigError(
-                    f"machine file {where} [{section}]: {key} = {getattr(getattr(machine, section), key)!r} asks for "
-                    "lines between valve and cylinders; give line_bore in [cylinders], too, or leave it out"
-                )
-        return
-    if not all(cylinders.line_bore):
-        raise ConfigError(
-            f"machine file {where} [cylinders]: line_bore = {list(cylinders.line_bore)!r} must be above 0 for all "
-            "cylinders, or for none"
-        )
-    for name, modulus in zip(CYLINDERS, cylinders.line_modulus, strict=True):
-        if 0.0 < modulus < SOFTEST:
-            raise ConfigError(
-                f"machine file {where} [cylinders]: line_modulus[{name}] = {modulus!r} Pa must be at least "
-                f"{SOFTEST:g}, or 0 for a rigid line"
-            )
-    for name, bore, length in zip(CYLINDERS, cylinders.line_bore, lines.lengths(cylinders), strict=True):
-        if not LINE_LENGTHS.holds(length):
-            raise ConfigError(
-                f"machine file {where} [cylinders]: line_bore[{name}] = {bore!r} m makes of hose_volume[{name}] a line "
-                f"of {length:.3g} m; must be {LINE_LENGTHS} m"
-            )
 
 
 def _check_triangle(axis: int, axes: Any, plant: Any, where: str) -> None:

@@ -15,11 +15,11 @@ from edp.settings.bounds import above, check_bounds, span
 from edp.settings.tree import SettingsTree
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
-from edp.sim.physics import terramechanics
+from edp.sim.physics import ground_profile, terramechanics
 from edp.storage import SETTINGS_BYTES, parse_toml, read_text
 
 Array = NDArray[np.float64]
-SPACING_M = 0.05
+SPACING_M = ground_profile.SPACING
 """Cell (m) of the height profile."""
 BEYOND_M = 1.0
 """How far the ground goes on beyond the machine's reach."""
@@ -44,6 +44,7 @@ BOUNDS = {
     "roughness_length": span(0.02, 5.0),
     "stones_per_m": span(0.0, 10.0),
     "sawtooth": span(0.0, 0.9),
+    "compaction": span(0.0, 1.0),
 }
 """Of a material; the softest mud has a cone index of some kPa, rock has no cone index."""
 
@@ -60,6 +61,7 @@ class Material:
         roughness: spread of the logarithm of the resistance along the way.
         roughness_length: length over which it varies, m.
         sawtooth: share of the resistance lost when a chip breaks off.
+        compaction: share of the heel's lasting sinkage, up to 0.1 m of it, that stays as a rut once the heel has left.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -83,6 +85,7 @@ class Material:
     roughness_length: float
     stones_per_m: float
     sawtooth: float
+    compaction: float = 0.0
 
     def __post_init__(self) -> None:
         check_bounds("material", self, **BOUNDS)
@@ -128,7 +131,8 @@ def parse_material(text: str, where: str) -> Material:
 class Ground:
     """The ground before one machine: a height profile along its reach, the load in the bucket, and the soil's numbers.
 
-    Heights are of soil at bank density, so that the mass of soil in profile, heap and bucket stays the same.
+    Heights are of soil at bank density, so that the mass of soil in profile, heap and bucket stays the same; the
+    surface lies lower where the heel has pressed it.
 
     Args:
         material: what it is made of.
@@ -147,7 +151,8 @@ class Ground:
         uneven = np.interp(np.arange(points) / 20.0, np.arange(len(bends)), bends)
         # The origin is the boom foot, which stands above level ground.
         self.heights: Array = uneven - machine.chassis.boom_foot_height
-        self.memory: Array = np.zeros(at.MEMORY)
+        # Behind what one contact remembers: the depth of the rut at each point.
+        self.memory: Array = np.zeros(at.MEMORY + points)
         self.numbers = terramechanics.pack_soil(material, machine, rng.uniform(*material.cone_index))
         self.tables = terramechanics.cutting_table(material)
         self.course = terramechanics.draw_course(material, rng)
@@ -158,6 +163,11 @@ class Ground:
         return float(self.memory[at.PAYLOAD])
 
     @property
+    def ruts_m(self) -> Array:
+        """Depth of the rut at each point of the profile, live."""
+        return self.memory[at.MEMORY :]
+
+    @property
     def mass_kg(self) -> float:
         """All soil: profile (above 0 of the boom-foot frame counts positive), heap before the edge, bucket."""
         profile = self.material.density * self.numbers[terramechanics.WIDTH] * SPACING_M * float(self.heights.sum())
@@ -166,7 +176,7 @@ class Ground:
 
     def height(self, x: float) -> float:
         """Height (m above the boom foot) at a distance (m) in front of it."""
-        return float(terramechanics.height_at(x - self.start_m, self.heights))
+        return float(terramechanics.height_at(x - self.start_m, self.heights - self.ruts_m))
 
     def redraw(self, rng: np.random.Generator) -> None:
         """Draw the resistance that is still to be met anew; what the edge is in now goes on from its present value."""
@@ -179,7 +189,7 @@ class Ground:
 
 def no_ground() -> tuple[Array, ...]:
     """Stand-in of `Ground.arrays` in free air."""
-    return np.zeros(terramechanics.NUMBERS), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(2), np.zeros(at.MEMORY)
+    return np.zeros(terramechanics.NUMBERS), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(2), np.zeros(at.MEMORY + 2)
 
 
 def redraw_course(material: Material, numbers: Array, memory: Array, course: Array, rng: np.random.Generator) -> None:

@@ -1,6 +1,7 @@
 """Soil that is moved: swept cells, the load and its spilling, the heap before the edge, slopes that slide.
 
-Heights count soil at bank density: what leaves one place arrives at another, and the mass stays the same.
+Heights count soil at bank density: what leaves one place arrives at another, and the mass stays the same. What the
+heel has pressed lies lower by its rut; a cut takes the pressed soil with its mass, and leaves soil that bore nothing.
 """
 
 from __future__ import annotations
@@ -55,13 +56,15 @@ def sweep(c: Array, moved: float, numbers: Array, heights: Array, memory: Array)
     before = cell_of(x + moved, heights)
     cut = 0.0
     for n in range(k + 1, before + 1):
-        if heights[n] > y:
+        if heights[n] - memory[at.MEMORY + n] > y:
             cut += heights[n] - y
             heights[n] = y
-    if heights[k] > y:
+            memory[at.MEMORY + n] = 0.0
+    if heights[k] - memory[at.MEMORY + k] > y:
         inside = min(moved, tm.SPACING)
         # Of the edge's own cell only the part passed in this step; 1e-12 avoids 0 / 0 at a cell's border.
         slice_ = (heights[k] - y) * inside / (inside + left + 1e-12)
+        memory[at.MEMORY + k] *= 1.0 - inside / (inside + left + 1e-12)
         heights[k] -= slice_
         cut += slice_
     mass = cut * numbers[tm.DENSITY] * numbers[tm.WIDTH] * tm.SPACING

@@ -1,8 +1,11 @@
 """Forces of soil on the bucket: cutting, edge, heel and the chassis that gives way. The reaction of soil: `terrain`.
 
 Cutting follows the earthmoving equation of Reece and McKyes, heel contact Bekker's pressure-sinkage law with elastic
-unloading and Janosi's shear. Every force that depends on velocity opposes it or stands across it, so that soil never
-gives energy; directions are regularised over `CREEP`. The front's frame is the boom foot: x forward, y up.
+unloading and Janosi's shear. Where soil keeps what the heel has pressed (`compaction`), repeated loading follows Wong
+(Terramechanics and Off-Road Vehicle Engineering, repetitive loading): along a place's own unloading line up to the
+sinkage that it has borne, along Bekker's curve beyond. Every force that depends on velocity opposes it or stands across
+it, so that soil never gives energy; directions are regularised over `CREEP`. The front's frame is the boom foot:
+x forward, y up.
 """
 
 from __future__ import annotations
@@ -15,6 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
+from edp.sim.physics.ground_profile import SPACING as SPACING
+from edp.sim.physics.ground_profile import height_at as height_at
+from edp.sim.physics.ground_profile import press, pressed_at
 from edp.sim.physics.jit import compiled, inlined
 from edp.sim.sensors import filters
 
@@ -30,9 +36,9 @@ Four = tuple[float, float, float, float]
     ACTIVE, WIDTH, DENSITY, SWELL, COHESION, ADHESION, BEKKER, EXPONENT, SHEAR_LENGTH, CONE, STEEPEST, REPOSE,
     ROUGHNESS, COURSE_STEP, SAWTOOTH, CAPACITY, FLOOR_COS, FLOOR_SIN, FLOOR_LENGTH, EDGE_AREA, LOAD_X, LOAD_Y,
     BUCKET_MASS, BUCKET_X, BUCKET_Y, BUCKET_INERTIA, PITCH_INERTIA, PITCH_STIFFNESS, PITCH_DAMPING, LIFT_MOMENT,
-    UNLOADING, HEEL_DAMPING, HEAP_LIMIT, BEARING_LIMIT, METAL_COS, METAL_SIN,
-) = range(36)  # fmt: skip
-NUMBERS = 36
+    UNLOADING, HEEL_DAMPING, HEAP_LIMIT, BEARING_LIMIT, METAL_COS, METAL_SIN, COMPACTION,
+) = range(37)  # fmt: skip
+NUMBERS = 37
 # contact[...]: what one step needs; Jacobians of tip and heel hold one value per joint
 (ON, DRAG, ACROSS, EDGE, EDGE_X, EDGE_Y, NORMAL, NORMAL_DAMPING, SLIDE, DEPTH, HEEL_DEPTH) = range(11)
 TIP_JX, TIP_JY, HEEL_JX, HEEL_JY, PITCHED, POINTS, DAMPING = 11, 14, 17, 20, 23, 27, 31
@@ -40,8 +46,6 @@ CONTACTS = 40
 GRAVITY = 9.81
 CREEP = 0.02
 """Speed (m/s) over which the direction of soil forces is smoothed."""
-SPACING = 0.05
-"""Cell (m) of the profile, as `soil.SPACING_M`, which cannot be imported from here."""
 STONE_STEP = 0.005
 """Travel (m) a cell of the stones' column."""
 COURSE = 8192
@@ -163,21 +167,12 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
         # 2 zeta sqrt(k m) with a tenth of critical damping, for twice the mass of the bucket.
         HEEL_DAMPING: 0.2 * math.sqrt(unloading * 2.0 * bodies.mass[2]),
         HEAP_LIMIT: heap_area * bucket.width * loose,
+        COMPACTION: material.compaction,
         BEARING_LIMIT: 0.25 * cone_index * bucket.width * HEEL_CONTACT,  # E: bearing capacity, a quarter of the cone's
     }
     numbers = np.zeros(NUMBERS)
     numbers[list(values)] = list(values.values())
     return numbers
-
-
-@inlined
-def height_at(x: float, heights: Array) -> float:
-    """Height (m) of the ground at `x`, linear between its points."""
-    # Just below the last point, so that k + 1 exists.
-    cell = min(max(x / SPACING, 0.0), heights.shape[0] - 1.000001)
-    k = int(cell)
-    height: float = heights[k] + (cell - k) * (heights[k + 1] - heights[k])
-    return height
 
 
 @compiled
@@ -237,14 +232,19 @@ def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Ar
 
 
 @compiled
-def engage_heel(numbers: Array, memory: Array, c: Array) -> None:
-    """Normal force and sliding friction of the floor plate's heel in `c`, from its depth."""
-    depth = c[HEEL_DEPTH]
+def engage_heel(numbers: Array, heights: Array, memory: Array, c: Array) -> None:
+    """Normal force and sliding friction of the floor plate's heel in `c`, from its depth below the profile."""
+    depth, borne = c[HEEL_DEPTH], memory[at.HEEL_SET]
+    if numbers[COMPACTION] > 0.0:
+        borne = max(borne, pressed_at(c[POINTS + 2], heights, memory))
     bearing = min(numbers[BEKKER] * depth ** numbers[EXPONENT], numbers[BEARING_LIMIT])
-    elastic = numbers[UNLOADING] * (depth - memory[at.HEEL_SET])
+    elastic = numbers[UNLOADING] * (depth - borne)
     if elastic > bearing:
         memory[at.HEEL_SET] = depth - bearing / numbers[UNLOADING]
         elastic = bearing
+        if numbers[COMPACTION] > 0.0:
+            bottom = c[POINTS + 3] + bearing / numbers[UNLOADING]
+            press(c[POINTS + 2], bottom, numbers[COMPACTION], heights, memory)
     normal = max(elastic, 0.0)
     c[NORMAL] = normal
     c[NORMAL_DAMPING] = numbers[HEEL_DAMPING] if normal > 0.0 else 0.0
@@ -283,14 +283,20 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
     # 1.5 cells ahead: the cell of the edge itself is cut down to it already.
     uncut = inward * height_at(c[POINTS] - 1.5 * SPACING, heights)
     uncut += (1.0 - inward) * height_at(c[POINTS] + 1.5 * SPACING, heights)
-    c[DEPTH] = min(uncut - c[POINTS + 1], DEEPEST)
     c[HEEL_DEPTH] = height_at(c[POINTS + 2], heights) - c[POINTS + 3]
+    if numbers[COMPACTION] > 0.0:
+        uncut -= inward * pressed_at(c[POINTS] - 1.5 * SPACING, heights, memory)
+        uncut -= (1.0 - inward) * pressed_at(c[POINTS] + 1.5 * SPACING, heights, memory)
+        # Within its rut the heel touches nothing.
+        if c[HEEL_DEPTH] <= pressed_at(c[POINTS + 2], heights, memory):
+            c[HEEL_DEPTH] = 0.0
+    c[DEPTH] = min(uncut - c[POINTS + 1], DEEPEST)
     if c[DEPTH] > 0.0:
         c[ON] = 1.0
         engage_edge(inward, ground, (floor_x, floor_y), c)
     if c[HEEL_DEPTH] > 0.0:
         c[ON] = 1.0
-        engage_heel(numbers, memory, c)
+        engage_heel(numbers, heights, memory, c)
     if c[ON] > 0.0:
         hold(w1, w2, w3, c)
         damp(c)

@@ -81,4 +81,5 @@ def write_log(
     row[at.LOG_OIL] = plant[at.OIL_TEMPERATURE]
     write_events(state, valves, axes, plant, memory, row)
     for k in range(row.shape[0] - at.LOG_GROUND):
-        row[at.LOG_GROUND + k] = heights[(k * (heights.shape[0] - 1)) // (at.GROUND_POINTS - 1)]
+        point = (k * (heights.shape[0] - 1)) // (at.GROUND_POINTS - 1)
+        row[at.LOG_GROUND + k] = heights[point] - memory[at.MEMORY + point]

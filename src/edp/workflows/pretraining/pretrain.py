@@ -21,6 +21,7 @@ from edp.storage import write_json
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.pretraining.methods import PRETRAININGS
+from edp.workflows.pretraining.methods.base import HasModel
 from edp.workflows.pretraining.spec import MetaSpec
 from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
 
@@ -86,6 +87,8 @@ def pretrain(
             'split.kind = "machines"'
         )
     method = PRETRAININGS[order.method]()
+    if isinstance(method, HasModel):
+        experiment = replace(experiment, model=method.model(experiment.model))
     begun, frozen = (None, {}) if order.start is None else _start(order.start)
     strategy = method.strategy(order.meta, begun)
     data = prepare_data(source, experiment, frozen)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
-from edp.networks.predictor import Predictor
+from edp.networks.predictor import ModelSpec, Predictor
 from edp.registry import Registry
 from edp.training.strategy import TrainingStrategy
 from edp.workflows.pretraining.spec import MetaSpec
@@ -23,6 +23,19 @@ class Pretraining(Protocol):
 
         Raises:
             ConfigError: options that the method has no use for.
+        """
+        ...
+
+
+@runtime_checkable
+class HasModel(Protocol):
+    """A method that needs parts which the network may lack."""
+
+    def model(self, spec: ModelSpec) -> ModelSpec:
+        """The network with them.
+
+        Raises:
+            ConfigError: it has no place for them.
         """
         ...
 

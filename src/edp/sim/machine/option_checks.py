@@ -1,0 +1,101 @@
+"""What must hold of a machine's options: engine, pumps that sense loads, long lines; contradictions are refused."""
+
+from __future__ import annotations
+
+import math
+
+from edp.errors import ConfigError
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import conductance
+from edp.sim.physics import lines
+
+CYLINDERS = ("boom", "arm", "bucket")
+MOST_BLED = 0.1
+"""Largest share of a pump's flow that the bleed of a load-sensing block takes at its margin."""
+LEAST_BORE = 1e-3
+"""m: below it a line is an orifice, and its length has no meaning."""
+SOFTEST = 1e7
+"""Pa, bulk modulus of walls that give way more than any hose's, 1e8 to 1e9 Pa."""
+LINE_LENGTHS = 0.3, 60.0
+"""m: shorter lines are a part of their chamber, longer ones are no excavator's."""
+
+
+def check_engine(machine: Machine, where: str) -> None:
+    """All numbers of the engine or none, and power enough for the pumps: they would stall it otherwise."""
+    pumps = machine.pumps
+    keys = ("engine_droop", "engine_power", "engine_inertia", "engine_speed_rpm")
+    absent = [key for key in keys if getattr(pumps, key) == 0.0]
+    if absent and len(absent) < len(keys):
+        raise ConfigError(
+            f"machine file {where} [pumps]: {', '.join(absent)} must be above 0 where the other numbers of the engine "
+            f"are; give all of {', '.join(keys)}, or none for an engine that turns at one speed"
+        )
+    if not absent and pumps.engine_power < pumps.power_limit:
+        raise ConfigError(
+            f"machine file {where} [pumps]: engine_power = {pumps.engine_power!r} W must be at least power_limit = "
+            f"{pumps.power_limit!r} W, or the pumps stall the engine"
+        )
+
+
+def check_load_sensing(machine: Machine, where: str) -> None:
+    """A bleed that carries the least flow below the margin and little more, and compensators that can regulate."""
+    pumps, valves = machine.pumps, machine.valves
+    if (valves.compensator_drop > 0.0) != (valves.flow_sharing == "pre_compensated"):
+        raise ConfigError(
+            f"machine file {where} [valves]: compensator_drop = {valves.compensator_drop!r} Pa with flow_sharing = "
+            f"{valves.flow_sharing!r}; must be above 0 with 'pre_compensated', and 0 or left out with any other"
+        )
+    if pumps.load_margin == 0.0:
+        return
+    if valves.compensator_drop > pumps.load_margin:
+        raise ConfigError(
+            f"machine file {where} [valves]: compensator_drop = {valves.compensator_drop!r} Pa must be at most "
+            f"load_margin = {pumps.load_margin!r} Pa of [pumps], or no compensator ever regulates"
+        )
+    if pumps.load_margin >= pumps.relief:
+        raise ConfigError(
+            f"machine file {where} [pumps]: load_margin = {pumps.load_margin!r} Pa must be below relief = "
+            f"{pumps.relief!r} Pa"
+        )
+    bled = conductance(pumps.bypass) * math.sqrt(pumps.load_margin)
+    least, most = pumps.min_displacement * pumps.max_flow, MOST_BLED * pumps.max_flow
+    if not least <= bled <= most:
+        raise ConfigError(
+            f"machine file {where} [pumps]: bypass = {list(pumps.bypass)!r} bleeds {bled * 6e4:.3g} L/min at "
+            f"load_margin = {pumps.load_margin!r} Pa; with load sensing the centre is closed but for a bleed, from "
+            f"{least * 6e4:.3g} L/min (min_displacement, which must go somewhere) to {most * 6e4:.3g} L/min "
+            f"({MOST_BLED:g} of max_flow); change bypass or min_displacement"
+        )
+
+
+def check_lines(machine: Machine, where: str) -> None:
+    """Bores of all lines or of none, and lengths that can be; what only lines have is refused without them."""
+    cylinders = machine.cylinders
+    if not lines.modelled(cylinders):
+        for section, key, present in (
+            ("cylinders", "line_modulus", any(cylinders.line_modulus)),
+            ("sensors", "pressure_at", machine.sensors.pressure_at == "valve"),
+        ):
+            if present:
+                raise ConfigError(
+                    f"machine file {where} [{section}]: {key} = {getattr(getattr(machine, section), key)!r} asks for "
+                    "lines between valve and cylinders; give line_bore in [cylinders], too, or leave it out"
+                )
+        return
+    if min(cylinders.line_bore) < LEAST_BORE:
+        raise ConfigError(
+            f"machine file {where} [cylinders]: line_bore = {list(cylinders.line_bore)!r} must be at least "
+            f"{LEAST_BORE:g} m for all cylinders, or 0 for all"
+        )
+    for name, modulus in zip(CYLINDERS, cylinders.line_modulus, strict=True):
+        if 0.0 < modulus < SOFTEST:
+            raise ConfigError(
+                f"machine file {where} [cylinders]: line_modulus[{name}] = {modulus!r} Pa must be at least "
+                f"{SOFTEST:g}, or 0 for a rigid line"
+            )
+    for name, bore, length in zip(CYLINDERS, cylinders.line_bore, lines.lengths(cylinders), strict=True):
+        if not LINE_LENGTHS[0] <= length <= LINE_LENGTHS[1]:
+            raise ConfigError(
+                f"machine file {where} [cylinders]: line_bore[{name}] = {bore!r} m makes of hose_volume[{name}] a line "
+                f"of {length:.3g} m; must be from {LINE_LENGTHS[0]:g} to {LINE_LENGTHS[1]:g} m"
+            )
