@@ -2,7 +2,9 @@
 
 Machines of the simulator's family: geometry and bores are told, as a tape measure tells them; every other guess is
 M22's, which for a machine of another size is far off. Of each number that the logs tell: the error against the truth;
-of each that moved from the guess: whether its interval holds the truth.
+of each that moved from the guess: whether its interval holds the truth. --work keeps what is finished, a file for each
+machine, and --only names some of them: the parts may run apart, and a last run over all with their files in one folder
+gives the tables.
 """
 
 from __future__ import annotations
@@ -16,13 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from common import finish, parser, table, verdict
+from common import finish, in_folder, kept, parser, table, verdict
 from edp.config.twin import load_twin_experiment
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes
+from edp.storage.runs import environment
 from edp.workflows.identify import Identified, identify
 from edp.workflows.identify.bodies import Poses, base_parameters, load_by_base
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
@@ -45,31 +48,51 @@ def main() -> None:
     arguments_of.add_argument("--machines", type=int, default=5, help="how many of the family")
     arguments_of.add_argument("--ticks", type=int, default=40_000, help="of a round of the fit")
     arguments_of.add_argument("--starts", type=int, default=3, help="of the first stage of the fit")
-    arguments = arguments_of.parse_args()
-    quick, seed = arguments.quick, arguments.seed
-    minutes, recordings = (4.0, 8) if quick else (40.0, 16)
-    fit = f"twin.fit.ticks={arguments.ticks}", f"twin.fit.starts={arguments.starts}"
-    changes = QUICK if quick else (*fit, "judge.at_s=[1, 10, 60]")
-    details: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as temporary:
-        for index in range(1 if quick else arguments.machines):
-            name, folder = f"family-{seed}-{index}", Path(temporary)
-            source = (arguments.data or folder) / name
-            order = SimulationOrder(machine=name, minutes=minutes, recordings=recordings, seed=seed + 1)
-            simulate_data_set(source, order, workers=1)
-            truth = load_machine(name)
-            write_bytes(folder / f"{name}_measured.toml", machine_text(measured(truth), [], {}).encode())
-            began = time.process_time()
-            result = identify(
-                DataSource.of(source),
-                folder / f"{name}_found.toml",
-                str(folder / f"{name}_measured.toml"),
-                load_twin_experiment(None, ["twin.kind=greybox", *changes]),
-                on_event=lambda e: print(f"round {e.update}/{e.updates}, validation {e.validation:.4f}", flush=True),
+    arguments_of.add_argument("--only", type=int, nargs="*", default=None, help="machines of the family, from 0 on")
+    arguments_of.add_argument("--work", type=Path, default=None, help="folder that keeps what is finished")
+    given = arguments_of.parse_args()
+    in_folder(given.work, lambda work: run(given, work))
+
+
+def run(given: Any, work: Path) -> None:
+    """All machines that were asked for; some of the family take no whole result's place."""
+    every = range(1 if given.quick else given.machines)
+    chosen, form = every if given.only is None else given.only, "_quick" if given.quick else ""
+    asked, details = {"ticks": given.ticks, "starts": given.starts}, {}
+    for index in chosen:
+        name = f"family-{given.seed}-{index}"
+        file = work / f"{name}{form}.json"
+        details[name] = kept(file, lambda name=name: one_machine(given, name) | asked | {"environment": environment(0)})
+        if any(details[name][key] != value for key, value in asked.items()):
+            raise SystemExit(
+                f"{file} was measured with other --ticks or --starts: give these, or another --work folder"
             )
-            details[name] = compared(truth, measured(truth), result) | {"seconds": time.process_time() - began}
-            show(name, details[name])
-    finish("identify", verdicts(details, quick), seed, details)
+        show(name, details[name])
+    finish("identify", verdicts(details, given.quick), given.seed, details, keep=given.only is None)
+
+
+def one_machine(given: Any, name: str) -> dict[str, Any]:
+    """A machine of the family, simulated, identified and compared."""
+    quick, seed = given.quick, given.seed
+    minutes, recordings = (4.0, 8) if quick else (40.0, 16)
+    fit = f"twin.fit.ticks={given.ticks}", f"twin.fit.starts={given.starts}"
+    changes = QUICK if quick else (*fit, "judge.at_s=[1, 10, 60]")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        source = (given.data or folder) / name
+        order = SimulationOrder(machine=name, minutes=minutes, recordings=recordings, seed=seed + 1)
+        simulate_data_set(source, order, workers=1)
+        truth = load_machine(name)
+        write_bytes(folder / f"{name}_measured.toml", machine_text(measured(truth), [], {}).encode())
+        began = time.process_time()
+        result = identify(
+            DataSource.of(source),
+            folder / f"{name}_found.toml",
+            str(folder / f"{name}_measured.toml"),
+            load_twin_experiment(None, ["twin.kind=greybox", *changes]),
+            on_event=lambda e: print(f"round {e.update}/{e.updates}, validation {e.validation:.4f}", flush=True),
+        )
+        return compared(truth, measured(truth), result) | {"seconds": time.process_time() - began}
 
 
 def measured(truth: Machine) -> Machine:

@@ -11,7 +11,9 @@ the static map, ARX, a subspace model and a NARX model beside it, fitted in the 
 
 The recordings are no part of the repository: the folder of the leagues is given by --shared or EDP_SHARED_DATA, that
 of the sets from outside by --outside: drive, ballbeam, damper and dryer (.mat) as github.com/RomanFoell/DRGP-VSS has
-them in matlab/data_raw. --work keeps what is finished, so that a run may be stopped, and divided by --only.
+them in matlab/data_raw. --work keeps what is finished, so that a run may be stopped, and divided: each part is a run
+of its own with --only and --seed, also on another machine, all with one --work folder (or with folders whose files are
+put together); a last run over all sets and seeds with that folder reads them, and gives the tables.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ from edp.networks.twin.lumped.parts import MassElement, TankElement
 from edp.recording import Recording
 from edp.settings.tree import read_toml
 from edp.signals import Channel, Kind
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, RunFolder, environment
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from published_leagues import verdicts_of
@@ -95,10 +97,9 @@ class OutsideSet:
 
 
 TWO_TANKS = ElementsBox(
-    tanks=(TankElement(name="upper", source="command"), TankElement(name="lower", source="upper", level="stroke")),
-    starts=2, rounds=25,
-)  # fmt: skip
-AXIS = ElementsBox(masses=(MassElement(name="axis", command="command", velocity="velocity"),), starts=2, rounds=15)
+    tanks=(TankElement(name="upper", source="command"), TankElement(name="lower", source="upper", level="stroke"))
+)
+AXIS = ElementsBox(masses=(MassElement(name="axis", command="command", velocity="velocity"),))
 SETS = {
     "tanks.toml": LeagueSet("u", "y", "", "stroke", 5, TWO_TANKS),
     "emps.toml": LeagueSet("u", "q", "", "stroke", 20, AXIS),
@@ -233,15 +234,23 @@ class Judged:
         began = time.process_time()
         result, facts, experiment = self.chosen(seed, quick)
         error = free_run_rmse(result.fitted.twin, self.test, self.which.target)
-        facts |= {"error": error, "coverage": self.coverage(result, experiment)}
+        facts |= {"error": error, "coverage": self.coverage(result, experiment), "minutes": self.minutes}
+        facts |= {"environment": environment(0)}
         return facts | {"processor_s": round(time.process_time() - began, 1)}
 
 
 def summary(judged: Judged, seeds: Sequence[int], factor: float, quick: bool, work: Path, name: str) -> dict[str, Any]:
     """All seeds of a set, in the unit of its table, and its rivals."""
     form = "_quick" if quick else ""
-    rows = {seed: kept(work / f"{name}_{seed}{form}.json", lambda seed=seed: judged.measure(seed, quick))
-            for seed in seeds}  # fmt: skip
+    rows = {}
+    for seed in seeds:
+        file = work / f"{name}_{seed}{form}.json"
+        rows[seed] = kept(file, lambda seed=seed: judged.measure(seed, quick))
+        if rows[seed]["minutes"] != judged.minutes:
+            raise SystemExit(
+                f"{file} was measured with --minutes {rows[seed]['minutes']:g}, and {judged.minutes:g} were asked "
+                "for: give these, or another --work folder"
+            )
     rivals = kept(work / f"{name}_rivals.json", lambda: judged.rivals(seeds[0]))
     ours = {seed: factor * row["error"] for seed, row in rows.items()}
     return {
@@ -275,13 +284,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.add_argument("--shared", type=Path, default=None, help=f"folder of the recordings (else ${VARIABLE})")
     options.add_argument("--outside", type=Path, default=None, help="folder of the sets from outside; else left out")
     options.add_argument("--seeds", type=int, default=5)
-    options.add_argument("--minutes", type=float, default=0.0, help="as of edp twin; 0: no bound")
+    options.add_argument(
+        "--minutes", nargs="*", default=[], help="as of edp twin, for all or as tanks=1; else no bound"
+    )
     options.add_argument("--only", nargs="*", default=None, help="sets by name, such as tanks or drive")
     options.add_argument("--work", type=Path, default=None, help="folder that keeps what is finished")
     given = options.parse_args(arguments)
     if shared_folder(given.shared) is None:
         return
     in_folder(given.work, lambda work: run(given, work))
+
+
+def minutes_of(given: Sequence[str], name: str) -> float:
+    """Budget of a set: its own, else that of all, else none."""
+    own = dict(text.split("=") if "=" in text else ("", text) for text in given)
+    return float(own.get(name, own.get("", 0.0)))
 
 
 def run(given: Any, work: Path) -> None:
@@ -293,7 +310,9 @@ def run(given: Any, work: Path) -> None:
         name = Path(entry["data"]).stem
         if given.only is not None and name not in given.only:
             continue
-        judged = Judged.of(DataSource.of(EXAMPLES / entry["data"]), SETS[entry["data"]], given.minutes)
+        judged = Judged.of(
+            DataSource.of(EXAMPLES / entry["data"]), SETS[entry["data"]], minutes_of(given.minutes, name)
+        )
         factor = 1000.0 if entry["unit"] == "mm" else 1.0
         found = summary(judged, seeds, factor, given.quick, work, name)
         show(entry["title"], found, entry["published"])
@@ -303,7 +322,7 @@ def run(given: Any, work: Path) -> None:
     for name, which in OUTSIDE.items() if given.outside else ():
         if given.only is not None and name not in given.only:
             continue
-        judged = Judged.of(outside_source(name, given.outside, work), which.machine, given.minutes)
+        judged = Judged.of(outside_source(name, given.outside, work), which.machine, minutes_of(given.minutes, name))
         title = f"{which.what} ({name})"
         found = summary(judged, seeds, 1.0, given.quick, work, name)
         show(title, found, {})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
+from edp.cli.console import BEATEN, JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
@@ -17,10 +17,6 @@ if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
     from edp.logs.source import DataSource
     from edp.workflows.executors import Workforce
-
-# Scripts can tell a network that should not be used without reading JSON.
-BEATEN = 6
-"""Exit code where a baseline has less error than the network."""
 
 
 def evaluate(

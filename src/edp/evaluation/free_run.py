@@ -36,7 +36,8 @@ class FreeRunJudgeSpec:
         seconds: length of a free run; cut to what the longest recording has.
         starts: free runs in each recording, evenly spread.
         at_s: times after the start at which strokes are compared.
-        floors: formulations that are fitted to the same recordings and judged beside it.
+        floors: formulations that are fitted to the same recordings and judged beside it; one that does not suit them
+            is left out.
         coverage: share of free runs that an interval is meant to hold.
         covered_at_s: times after the start at which coverage is counted.
         calibration_starts: free runs in each validation recording that calibrate the intervals.
@@ -49,7 +50,7 @@ class FreeRunJudgeSpec:
     seconds: float = 60.0
     starts: int = 4
     at_s: tuple[float, ...] = (1.0, 5.0, 10.0, 30.0, 60.0)
-    floors: tuple[str, ...] = ("static", "arx")
+    floors: tuple[str, ...] = ("static", "arx", "n4sid")
     coverage: float = 0.9
     covered_at_s: tuple[float, ...] = (0.1, 1.0, 10.0, 60.0)
     calibration_starts: int = 16

@@ -36,7 +36,8 @@ class FittedGround:
 
     def facts(self) -> dict[str, Any]:
         """What provenance says of it."""
-        return {"ground": {"explained": self.explained, "seconds": round(self.seconds, 2)}}
+        kind = GROUNDS.name_of(self.law)
+        return {"ground": {"kind": kind, "explained": self.explained, "seconds": round(self.seconds, 2)}}
 
 
 def fit_ground(

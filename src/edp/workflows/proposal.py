@@ -22,7 +22,7 @@ from edp.logs.proposal.columns import LogLook, refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
 from edp.logs.proposal.names import is_error_name
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
-from edp.logs.proposal.shapes import shape_notes
+from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.recording import Recording
@@ -164,7 +164,8 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     proposal, timing = _timed(group, proposal)
     notes = [*_notes(group, others, broken, proposal), *timing.notes, *_of_copies(copies)]
     targets, more = _targets(proposal)
-    notes += more
+    chosen = {guess.column for guess in proposal.columns if guess.channel in targets}
+    notes += [*more, *pace_notes(proposal.look, proposal.clock, chosen), *beside_notes(source, paths)]
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
     if len(channels) > MOST_FEATURES:
         notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")
@@ -291,8 +292,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     notes = [] if not look.part else [f"{look.path.name}: looked at {look.part}"]
     notes += [f"{count} column(s) {reason}: left out" for reason, count in look.left_out.items()]
     notes += shape_notes(look)
-    if clock.check:
-        notes.append(f"time: {clock.check}")
+    notes += [f"time: {clock.check}"] if clock.check else []
     rows = sum(look.rows for look in group.looks) * len(group.paths) / len(group.looks)
     rate = clock.wanted_hz or clock.rate_hz
     rows *= rate / clock.rate_hz if rate and clock.rate_hz else 1.0
@@ -305,6 +305,8 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     for other in others:
         names = ", ".join(path.name[:40] for path in other.paths[:3])
         notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")
+    roles = {guess.role for guess in proposal.columns}
+    notes += ["labels: those that are known while the machine works may be features"] * ("label" in roles)
     notes += [f"not readable: {reason[:300]}" for reason in list(broken.values())[:3]]
     if len(broken) > 3:
         notes.append(f"{len(broken) - 3} more logs are not readable")

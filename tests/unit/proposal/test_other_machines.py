@@ -165,6 +165,25 @@ def test_a_matrix_of_cycles_is_said_to_be_none_of_channels(tmp_path):
     assert any("a row seems to hold samples of one signal" in note for note in notes)
 
 
+@pytest.mark.parametrize(("hz", "told"), [(5.0, False), (40.0, True)])
+def test_motion_that_a_lower_rate_loses_is_named(tmp_path, hz, told):
+    time = np.arange(16_000) / 1000
+    columns = {"time": time, "speed": np.sin(2 * np.pi * hz * time) + 0.1 * np.sin(2 * np.pi * time), "u": np.sin(time)}
+    found = propose(table(tmp_path / "fast.csv", columns))
+    assert found.proposal.signal_map.rate_hz == 100.0
+    notes = [note for note in found.notes if "of the motion of speed is faster than" in note]
+    assert bool(notes) == told
+    assert not told or "set rate_hz = 200" in notes[0]
+
+
+def test_tables_of_text_beside_other_logs_are_named(tmp_path):
+    table(tmp_path / "log.csv", {"time": TIME, "u": SWING, "y": OTHER})
+    (tmp_path / "README.txt").write_text("These logs, of a rig,\nare of May.\n\nAsk us, please.\n")
+    assert not any("text files beside" in note for note in propose(tmp_path).notes)
+    table(tmp_path / "stand.txt", {"a": SWING[:20], "b": OTHER[:20]})
+    assert any("not looked at: stand.txt; give" in note for note in propose(tmp_path).notes)
+
+
 def test_a_clock_that_stands_still_is_named(tmp_path):
     found = propose(table(tmp_path / "log.csv", {"time": 0 * TIME, "u": SWING, "y": OTHER}))
     assert "'time' stands still: a row counts as 1 s" in found.proposal.clock.check

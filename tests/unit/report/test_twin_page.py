@@ -14,7 +14,7 @@ from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores
 from edp.networks.twin import calibrate
 from edp.report.common.interactive import plots
 from edp.report.twin.charts import twin_charts
-from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles
+from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles, verdict
 from edp.report.twin.page import render
 from edp.signals import Channel, Kind
 from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
@@ -45,6 +45,26 @@ def facts_of(**options):
     scores, runs, intervals = judged(**options)
     content = {"schema": 2, "channels": channel_facts(runs.channels), "models": json.loads(json.dumps(scores))}
     return FreeRunFacts("m22", content, shown_runs(runs, intervals))
+
+
+@pytest.mark.parametrize(
+    ("ground", "says"),
+    [
+        ({"kind": "drag", "explained": {"train": 0.62, "validation": 0.5}}, "'drag': explains 62 % (train) and 50 %"),
+        ({"kind": ["x"], "explained": {"train": float("nan"), "validation": "all"}}, "ground: explains nothing of"),
+    ],
+)
+def test_a_ground_is_told_with_what_it_explains(ground, says):
+    lines = verdict(replace(facts_of(), provenance={"ground": ground, "ground_data": {"source": "loam"}}))
+    (line,) = (one for one in lines if "ground" in one)
+    assert says in line.replace("\xa0", " ")
+    assert line.endswith("free runs and errors of this page are in free air.")
+
+
+def test_a_ground_of_a_stranger_is_text():
+    text = render(replace(facts_of(), provenance={"ground": {"kind": HOSTILE}, "ground_data": {"source": HOSTILE}}))
+    assert "<img src=x" not in text
+    assert not any("ground" in line for line in verdict(replace(facts_of(), provenance={"ground": [HOSTILE]})))
 
 
 def plots_of(facts):

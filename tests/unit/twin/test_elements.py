@@ -14,7 +14,7 @@ from edp.training.elements_fit import _Problem, fit_elements
 
 TANKS = ElementsBox(
     tanks=(TankElement(name="upper", source="pump"), TankElement(name="lower", source="upper", level="level")),
-    prefix_ticks=10, starts=1, rounds=10,
+    prefix_ticks=10, starts=1, rounds=40,
 )  # fmt: skip
 CHANNELS = TwinChannels(
     (Channel("pump", Kind.RATIO),), (Channel("rate", Kind.VELOCITY),), (Channel("level", Kind.POSITION),), (), 0.25
@@ -29,7 +29,7 @@ def tanks():
     targets = np.stack([rng.normal(0, 0.05, 150), rng.uniform(0, 10, 150)], axis=1).astype(np.float32)
     scales = fit_scales(CHANNELS, [Series("scales", pump, targets)])
     twin = TANKS.start(CHANNELS, scales, [], 0)
-    true = twin.with_numbers(np.array([0.02, 0.2, 0.04, 0.6, 0.5, 0.05, 0.5, 0.04, 0.55, 10.0]))
+    true = twin.with_numbers(np.array([0.02, 0.2, 0.04, 0.6, 0.5, 0.05, 0.5, 0.04, 0.55, 10.0, 0.1]))
     answers, _ = true.rollout(pump[None, :-1], true.initial_state(pump[:1], np.array([[0.0, 5.0]], np.float32)))
     rows = np.concatenate([[[0.0, 5.0]], answers[0]]).astype(np.float32)
     series = Series("run", pump, rows)
@@ -99,7 +99,7 @@ def test_long_logs_are_fitted_in_as_many_runs_as_the_memory_holds(tanks, monkeyp
     twin, _, series = tanks
     monkeypatch.setattr("edp.training.elements_fit.MOST_TICKS", 20)
     assert _Problem(twin, [series]).truth.shape[:2] == (8, 20)
-    monkeypatch.setattr("edp.training.elements_fit.MOST_VALUES", 3 * 11 * 20 * 2)
+    monkeypatch.setattr("edp.training.elements_fit.MOST_VALUES", 3 * 12 * 20 * 2)
     assert _Problem(twin, [series]).truth.shape[:2] == (3, 20)
 
 

@@ -13,11 +13,13 @@ from edp.errors import ConfigError, ExportError
 from edp.logs.source import DataSource
 from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
+from edp.report.twin.ground import ground_line
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.testing.control import sample_excavator_twin, sample_grey_box
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.deployment import load_exported
 from edp.workflows.twin import train_twin
+from edp.workflows.twin.ground_twin import JUDGED
 
 GROUND = ("ground=drag", "judge.floors=[]")
 
@@ -29,6 +31,8 @@ def start(tmp_path_factory):
     save_twin(replace(sample_grey_box(), scores={"twin": {}}), run / "twin")
     row = {"element": "pump", "name": "flow", "unit": "m^3/s", "value": 1.0, "low": 0.9, "high": 1.1, "excited": True}
     (run / "datasheet.json").write_text(json.dumps({"schema": 1, "basis": "", "numbers": [row]}))
+    for name in JUDGED:
+        (run / name).write_bytes(f"what judged {name}".encode())
     return run
 
 
@@ -57,6 +61,9 @@ def test_a_run_with_a_ground_keeps_equations_and_scores(grounded, start, loam):
     rows = json.loads((run / "datasheet.json").read_text())["numbers"]
     assert [row["element"] for row in rows] == ["pump", *["ground"] * 13]
     assert "ground.inwards_edge" in (run / "datasheet.txt").read_text()
+    # The page of a run needs no evaluation before it.
+    assert all((run / name).read_bytes() == (start / name).read_bytes() for name in JUDGED)
+    assert ground_line(after.provenance).startswith("ground 'drag': explains ")
     assert train_twin(loam, load_twin_experiment(None, GROUND), run, start=start).resumed
 
 

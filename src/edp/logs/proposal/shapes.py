@@ -1,15 +1,30 @@
-"""Tables that are no logs with a channel a column, though their numbers can be read: what a person is told of them."""
+"""What speaks against a proposal though the numbers can be read: rows that are no samples, a rate that loses motion."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from itertools import islice
+from pathlib import Path
+
 import numpy as np
 
-from edp.logs.proposal.columns import LogLook
+from edp.errors import DataError
+from edp.logs.formats.base import Column
+from edp.logs.proposal.clocks import ClockGuess
+from edp.logs.proposal.columns import LogLook, names_in_log
 
 _LEAST_COLUMNS = 20
 """Columns without names from which a row may hold samples of one signal."""
 _ALIKE, _MOST = 0.97, 0.9
 """Correlation of neighbours that continue each other, and share of the neighbours that do."""
+
+_SLOWER, _LOST, _FEW = 4.0, 0.25, 0.1
+"""A rate is this many times the motion that it shows well; share of faster motion from which a person is told, and
+that a better rate leaves. Eight samples a period would be plenty, two are lost between samples."""
+_LEAST_ROWS = 500
+_MOST_TEXTS = 8
+"""Text files beside logs of other endings that are tried."""
+_RATES_HZ = (200.0, 500.0, 1000.0, 2000.0, 5000.0)
 
 
 def shape_notes(look: LogLook) -> list[str]:
@@ -37,3 +52,59 @@ def _neighbours_continue(look: LogLook) -> bool:
         return False
     alike = np.mean(moved[1:] * moved[:-1], axis=1) / (size[1:] * size[:-1])
     return bool(np.mean(alike > _ALIKE) > _MOST)
+
+
+def pace_notes(look: LogLook, clock: ClockGuess, targets: Collection[str]) -> list[str]:
+    """Whether what is to be predicted moves faster than the rate that a fast log is brought to shows.
+
+    Args:
+        look: what was looked at.
+        clock: of its rows.
+        targets: columns to predict.
+    """
+    rate, wanted_hz = clock.rate_hz, clock.wanted_hz
+    if rate is None or wanted_hz is None or wanted_hz >= rate:
+        return []
+    pieces = {column.name: column.pieces[0] for column in look.columns if column.name in targets}
+    lost = {name: _faster(piece, rate, wanted_hz / _SLOWER) for name, piece in pieces.items()}
+    if max(lost.values(), default=0.0) < _LOST:
+        return []
+    name = max(lost, key=lambda one: lost[one])
+    better = next((hz for hz in _RATES_HZ if hz < rate and _faster(pieces[name], rate, hz / _SLOWER) < _FEW), rate)
+    return [
+        f"{lost[name]:.0%} of the motion of {name[:40]} is faster than {wanted_hz / _SLOWER:g} Hz, which "
+        f"{wanted_hz:g} Hz show badly: set rate_hz = {better:g} in the map if it matters"
+    ]
+
+
+def _faster(values: Column, rate_hz: float, limit_hz: float) -> float:
+    """Share of the variance of a column, without its trend, above a frequency."""
+    values = values[np.isfinite(values)]
+    if len(values) < _LEAST_ROWS:
+        return 0.0
+    rows = np.arange(len(values))
+    moved = values - np.polyval(np.polyfit(rows, values, 1), rows)
+    power = np.square(np.abs(np.fft.rfft(moved)))
+    total = float(power.sum())
+    return float(power[np.fft.rfftfreq(len(values), 1.0 / rate_hz) > limit_hz].sum()) / total if total > 0 else 0.0
+
+
+def beside_notes(source: Path, paths: Collection[Path]) -> list[str]:
+    """Text files that hold tables beside logs of other endings, which are passed over for the remarks among them.
+
+    Args:
+        source: what was asked about.
+        paths: the logs that were found there.
+    """
+    if not source.is_dir() or any(path.suffix.lower() == ".txt" for path in paths):
+        return []
+    tables = [path for path in sorted(islice(source.rglob("*.txt"), _MOST_TEXTS)) if _is_table(path)]
+    named = ", ".join(path.name[:40] for path in tables[:3])
+    return [f"text files beside these logs are not looked at: {named}; give such logs on their own"] if tables else []
+
+
+def _is_table(path: Path) -> bool:
+    try:
+        return path.is_file() and len(names_in_log(path)) > 1
+    except DataError:
+        return False

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
@@ -15,10 +13,7 @@ from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
 from edp.networks.twin.lumped.lowering import lowered_answers
 from edp.networks.twin.lumped.parts import (
-    EDGE,
     MOST_ELEMENTS,
-    SLIP,
-    SPILL,
     Doubles,
     LagElement,
     LumpedNumber,
@@ -29,11 +24,10 @@ from edp.networks.twin.lumped.parts import (
     default_parts,
     lumped_numbers,
 )
+from edp.networks.twin.lumped.run import Values, Wiring, free_run, measured_run
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_UPDATES, check_bounds, check_count, integer, span
 
-Values = NDArray[Any]
-"""Real, or complex where the imaginary part carries a derivative (a complex step is exact to rounding)."""
 PRIOR = 0.2
 """Plausible deviation of a level that is not measured, as a share of the tank's height."""
 
@@ -91,7 +85,8 @@ class ElementsBox:
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """All numbers."""
         parts = self.parts(channels)
-        return {"numbers": (5 * len(parts.tanks) + 5 * len(parts.masses) + 3 * len(parts.lags),)}
+        tanks = sum(6 if tank.level else 5 for tank in parts.tanks)
+        return {"numbers": (tanks + 5 * len(parts.masses) + 3 * len(parts.lags),)}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> ElementsTwin:
         """The elements with these numbers."""
@@ -99,13 +94,6 @@ class ElementsBox:
         if not (twin.numbers[[n.positive for n in twin.table]] > 0).all():
             raise ValueError("one of its numbers is not positive")
         return twin
-
-
-def ramp(values: Values, width: float | Values) -> Values:
-    """A smooth maximum of zero and the values, rounded over the width."""
-    share = values / width
-    up = share.real > 0
-    return np.asarray(width * (np.log1p(np.exp(np.where(up, -share, share))) + np.where(up, share, 0.0)))
 
 
 class ElementsTwin(Twin):
@@ -120,6 +108,7 @@ class ElementsTwin(Twin):
         self.inputs = {c.name: i for i, c in enumerate(channels.commands)}
         self.hidden = [tank.name for tank in self.elements.tanks if not tank.level]
         self.places = {(n.element, n.name): i for i, n in enumerate(self.table)}
+        self.wiring = self._wiring()
 
     def with_numbers(self, numbers: Doubles) -> ElementsTwin:
         """The same elements with other numbers, rounded as they are kept."""
@@ -163,107 +152,39 @@ class ElementsTwin(Twin):
 
     def free_run(self, numbers: Values, commands: Doubles, answer: Values, hidden: Values) -> Values:
         """Answers ``(batch, tick, answer)`` by numbers ``(number,)`` or ``(batch, number)``; complex: with slopes."""
-        answers = []
-        for t in range(commands.shape[1]):
-            answer, hidden = self.tick(numbers, commands[:, t], answer, hidden)
-            answers.append(answer)
-        return np.stack(answers, axis=1)
+        kind = np.result_type(numbers, answer, hidden, np.float64)
+        lanes = np.broadcast_to(numbers, (len(answer), len(self.table)))
+        values = (np.ascontiguousarray(part, dtype=kind) for part in (lanes, answer, hidden))
+        own, first, levels = values
+        return np.asarray(free_run(own, np.ascontiguousarray(commands, np.float64), first, levels, self.wiring))
 
-    def tick(self, numbers: Values, command: Doubles, answer: Values, hidden: Values) -> tuple[Values, Values]:
-        """One tick from what the ports read and the levels that are not measured."""
-        after = np.array(answer)
-        rows = numbers if numbers.ndim == 2 else numbers[None]
-        self._move_masses(rows, command, answer, after)
-        for lag in self.elements.lags:
-            gain, offset, lag_s = (rows[:, self.places[lag.name, n]] for n in ("gain", "offset", "lag"))
-            goal = gain * command[:, self.inputs[lag.command]] + offset
-            share = 1.0 - np.exp(-1.0 / (lag_s * self.channels.rate_hz))
-            column = self.columns[lag.pressure]
-            after[:, column] = self._held(answer[:, column] + share * (goal - answer[:, column]), column)
-        return after, self._fill_tanks(rows, command, answer, after, hidden)
+    def _wiring(self) -> Wiring:
+        """How the elements are connected, as compiled code reads it."""
+        parts, channels, scales = self.elements, self.channels, self.scales
+        names, unseen = [tank.name for tank in parts.tanks], iter(range(len(self.hidden)))
+        lags = [(self.inputs[lag.command], self.columns[lag.pressure], self._first(lag.name)) for lag in parts.lags]
+        masses = [(self.inputs[m.command], self.columns[m.velocity], self._first(m.name)) for m in parts.masses]
+        tanks = []
+        for tank in parts.tanks:
+            pump = self.inputs.get(tank.source, -1)
+            above = -1 if pump >= 0 else names.index(tank.source)
+            level = (self.columns[tank.level], -1) if tank.level else (-1, next(unseen))
+            tanks.append((pump, above, *level, self._first(tank.name)))
+        rows = (np.array(some, np.int64).reshape(-1, wide) for some, wide in ((lags, 3), (masses, 3), (tanks, 5)))
+        low, high, widths = (part.astype(np.float64) for part in (scales.low, scales.high, scales.command_width))
+        facts = (self.spec.steps, len(channels.velocities), bool(channels.strokes))
+        first, second, third = rows
+        return first, second, third, low, high, widths, facts, float(channels.rate_hz)
 
-    def _held(self, values: Values, column: int) -> Values:
-        """Within the bounds of an answer; a slope passes where no bound acts."""
-        low, high = float(self.scales.low[column]), float(self.scales.high[column])
-        return np.where(values.real < low, low, np.where(values.real > high, high, values))
-
-    def _move_masses(self, rows: Values, command: Doubles, answer: Values, after: Values) -> None:
-        """Velocities by a half-implicit step; strokes by the trapezoidal rule, held at the end stops."""
-        step, count = 1.0 / (self.channels.rate_hz * self.spec.steps), len(self.channels.velocities)
-        for mass in self.elements.masses:
-            names = ("gain", "viscous", "viscous_asymmetry", "coulomb", "offset")
-            gain, viscous, skew, coulomb, offset = (rows[:, self.places[mass.name, n]] for n in names)
-            column = self.columns[mass.velocity]
-            slip = SLIP * float(self.scales.high[column])
-            push = gain * command[:, self.inputs[mass.command]] - offset
-            velocity = answer[:, column]
-            for _ in range(self.spec.steps):
-                side = np.tanh(velocity / slip)
-                damping = viscous * (1.0 + skew * side)
-                steep = damping + (coulomb + viscous * skew * velocity) * (1.0 - side * side) / slip
-                velocity = velocity + step * (push - damping * velocity - coulomb * side) / (1.0 + step * steep)
-            velocity = self._held(velocity, column)
-            if self.channels.strokes:
-                stroke_at = count + column
-                low, high = float(self.scales.low[stroke_at]), float(self.scales.high[stroke_at])
-                stroke = answer[:, stroke_at] + 0.5 * (answer[:, column] + velocity) / self.channels.rate_hz
-                into = ((stroke.real > high) & (velocity.real > 0)) | ((stroke.real < low) & (velocity.real < 0))
-                velocity = np.where(into, 0.0, velocity)
-                after[:, stroke_at] = self._held(stroke, stroke_at)
-            after[:, column] = velocity
-
-    def _fill_tanks(self, rows: Values, command: Doubles, answer: Values, after: Values, hidden: Values) -> Values:
-        """Levels by the midpoint rule; the velocity of a measured one is its mean over the tick."""
-        tanks, rate = self.elements.tanks, self.channels.rate_hz
-        if not tanks:
-            return hidden
-        step, unseen = 1.0 / (rate * self.spec.steps), iter(range(len(self.hidden)))
-        now = [answer[:, self.columns[tank.level]] if tank.level else hidden[:, next(unseen)] for tank in tanks]
-        for _ in range(self.spec.steps):
-            half = [a + 0.5 * step * b for a, b in zip(now, self._flows(rows, command, now), strict=True)]
-            now = [a + step * b for a, b in zip(now, self._flows(rows, command, half), strict=True)]
-        left = []
-        for tank, level in zip(tanks, now, strict=True):
-            if tank.level:
-                stroke_at = self.columns[tank.level]
-                after[:, stroke_at] = self._held(level, stroke_at)
-                speed = stroke_at - len(self.channels.velocities)
-                after[:, speed] = self._held((after[:, stroke_at] - answer[:, stroke_at]) * rate, speed)
-            else:
-                left.append(np.where(level.real < 0, 0.0, level))
-        return np.stack(left, axis=1) if left else hidden
-
-    def _flows(self, rows: Values, command: Doubles, levels: Sequence[Values]) -> list[Values]:
-        """Rates of the levels, m/s."""
-        leaving: dict[str, tuple[Values, Values]] = {}
-        rates = []
-        for tank, level in zip(self.elements.tanks, levels, strict=True):
-            inflow, outflow, exponent = (rows[:, self.places[tank.name, n]] for n in ("inflow", "outflow", "exponent"))
-            edge = rows[:, self.places[tank.name, "edge"]] if tank.level else 1.0
-            if tank.source in self.inputs:
-                which = self.inputs[tank.source]
-                width = EDGE * float(self.scales.command_width[which])
-                filled = inflow * ramp(command[:, which] - rows[:, self.places[tank.name, "inflow_offset"]], width)
-            else:
-                out, over = leaving[tank.source]
-                filled = inflow * (out + rows[:, self.places[tank.name, "spilled_into"]] * over)
-            share = level / edge
-            out = ramp(share, EDGE) ** exponent
-            over = SPILL * self.channels.rate_hz * ramp(share - 1.0, EDGE)
-            leaving[tank.name] = out, over / outflow
-            rates.append(edge * (filled - outflow * out - over))
-        return rates
+    def _first(self, element: str) -> int:
+        """Place of the first number of an element."""
+        return min(index for (owner, _), index in self.places.items() if owner == element)
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
-        answer, hidden = state["answer"], state["hidden"]
-        answers = np.empty(measured.shape, np.float32)
-        for t in range(commands.shape[1]):
-            read = np.where(np.isnan(measured[:, t]), answer, measured[:, t]).astype(np.float64)
-            after, levels = self.tick(self.numbers, commands[:, t].astype(np.float64), read, hidden.astype(np.float64))
-            # Rounded at each tick, so that a run that goes on from a kept state is the same one.
-            answer, hidden = after.astype(np.float32), levels.astype(np.float32)
-            answers[:, t] = answer
-        return answers, {"answer": answer.copy(), "hidden": hidden.copy()}
+        answer, hidden = (np.array(state[name], np.float32, order="C") for name in ("answer", "hidden"))
+        driven, read = (np.ascontiguousarray(part, np.float32) for part in (commands, measured))
+        answers = np.asarray(measured_run(self.numbers, driven, read, answer, hidden, self.wiring))
+        return answers, {"answer": answer, "hidden": hidden}
 
     def lower_answers(self, build: Builder, commands: str, fed: str) -> str:
         return lowered_answers(build, self, fed)

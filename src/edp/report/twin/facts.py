@@ -30,6 +30,7 @@ from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent, short_label
 from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
+from edp.report.twin.ground import ground_line
 from edp.report.twin.steps import read_steps
 from edp.storage import read_object
 
@@ -239,6 +240,8 @@ def verdict(facts: FreeRunFacts) -> list[str]:
         else f"{twin['runs']} free runs of {twin['seconds']:g} s."
     ]
     lines += [f"It is {sentence}" for sentence in (choice_sentence(facts.candidates),) if sentence]
+    ground = ground_line(facts.provenance)
+    lines += [f"It stands on a {ground}; free runs and errors of this page are in free air."] if ground else []
     plain = _plain_answers(facts)
     for name, scores in facts.models.items():
         if name != TWIN and plain:

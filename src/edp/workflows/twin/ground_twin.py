@@ -12,16 +12,19 @@ from edp.errors import ConfigError
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
-from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
+from edp.networks.twin.grey.ground import check_grounded
 from edp.networks.twin.greybox import GreyBox
 from edp.storage import object_with, read_json, write_bytes, write_json
 from edp.storage.runs import RunFolder, run_key
 from edp.training.ground_fit import fit_ground
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
 from edp.workflows.twin.continue_twin import BaseTwin
+from edp.workflows.twin.judge_twin import SCORES, SHOWN, STEPS
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 FOLDER, DATASHEET = "twin", "datasheet"
+JUDGED = (SCORES, SHOWN, STEPS)
+"""What the judgement of a twin leaves in its run."""
 GROUND_BASIS = (
     "those of the ground from least squares on forces along logs in soil, errors of 2 s taken as one; numbers of a "
     "direction are not below zero, whatever their intervals say"
@@ -37,7 +40,7 @@ def ground_twin(
 ) -> tuple[TwinBundle, bool]:
     """Fit a law of the ground and write a run folder: the twin of `start` with it, settings, datasheet.
 
-    Equations, scores and intervals stay those of free air.
+    Equations, scores and intervals stay those of free air, and so do the free runs that its page shows.
 
     Args:
         source: recordings in soil.
@@ -73,19 +76,13 @@ def ground_twin(
             fitted.facts() | base.provenance() | {"ground_data": {"source": str(source.path), "digest": data.digest}}
         )
         bundle = replace(base.bundle, ground=fitted.law, provenance={**base.bundle.provenance, **facts})
+        for name in JUDGED:
+            # In free air it is the twin that was judged there, so its page needs no evaluation of its own.
+            if (base.folder / name).is_file():
+                write_bytes(run.file(name), (base.folder / name).read_bytes())
         save_twin(bundle, run.file(FOLDER))
         run.write_status("finished")
     return bundle, False
-
-
-def ground_sentence(bundle: TwinBundle) -> str:
-    """What a law explains, in a sentence."""
-    facts = object_with(bundle.provenance.get("ground", {}), (), "its ground")
-    parts = object_with(facts.get("explained", {}), (), "its ground")
-    texts = [f"{share:.0%} ({part})" for part, share in parts.items() if isinstance(share, float)]
-    law: GroundLaw | None = bundle.ground
-    name = "none" if law is None else GROUNDS.name_of(law)
-    return f"ground '{name}': explains {', '.join(texts) or 'nothing'} of the squares of the forces where the tip digs"
 
 
 def _base(start: str | Path | None) -> tuple[BaseTwin, str]:

@@ -16,7 +16,7 @@ from edp.data.derived_velocities import matched
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.errors import DataError
+from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scores
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
 from edp.evaluation.step_response import step_responses
@@ -64,8 +64,14 @@ def judge_twin(
     for name in spec.floors:
         tell(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
-        floor = floor_spec.start(twin.channels, twin.scales, [*data.train, *data.validation], experiment.training.seed)
-        floor_runs = free_runs(floor, data.test, spec.seconds, spec.starts)
+        taught, seed = [*data.train, *data.validation], experiment.training.seed
+        try:
+            floor = floor_spec.start(twin.channels, twin.scales, taught, seed)
+            floor_runs = free_runs(floor, data.test, spec.seconds, spec.starts)
+        except (ConfigError, DataError, NotFiniteError) as problem:
+            # What such a log is too short for is no rival on it, and no reason to have no twin.
+            tell(f"the floor {name} is left out: {problem}")
+            continue
         scores[name] = free_run_scores(floor_runs, spec, None, labels) | _ahead(floor, data, spec)
     return scores, runs
 

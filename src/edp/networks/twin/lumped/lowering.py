@@ -13,7 +13,8 @@ from edp.ir.base import INPUT
 from edp.ir.layers import Activate, BinaryOperation, Clip, Function, ScaleShift
 from edp.ir.memory import Feed, Feedback
 from edp.networks.twin.lowering import stopped_strokes
-from edp.networks.twin.lumped.parts import EDGE, SLIP, SPILL, Doubles
+from edp.networks.twin.lumped.constants import EDGE, EMPTY, SLIP, SPILL
+from edp.networks.twin.lumped.parts import Doubles
 
 if TYPE_CHECKING:
     from edp.networks.twin.elements import ElementsTwin
@@ -24,8 +25,6 @@ ADD, SUBTRACT, MULTIPLY, DIVIDE = (
     BinaryOperation.MULTIPLY,
     BinaryOperation.DIVIDE,
 )
-EMPTY = 1e-30
-"""Share of a tank's height below which it counts as this full: a logarithm has no zero."""
 
 Values = NDArray[np.floating]
 
@@ -82,7 +81,7 @@ class _Tick:
 
 
 def lowered_answers(build: Builder, twin: ElementsTwin, fed: str) -> str:
-    """Scaled answers within their bounds, from SI commands and what the ports read (scaled); see `ElementsTwin.tick`.
+    """Scaled answers within their bounds, from SI commands and what the ports read (scaled); see `lumped.run`.
 
     Levels that are not measured are a second feedback edge, which starts where a reset of the twin does.
     """
@@ -209,13 +208,14 @@ def _rates(tick: _Tick, levels: str, pumped: str) -> str:
     twin, build, tanks = tick.twin, tick.build, tick.twin.elements.tanks
     names, rate = [tank.name for tank in tanks], twin.channels.rate_hz
     inflow, outflow, exponent = (tick.numbers(names, n) for n in ("inflow", "outflow", "exponent"))
-    edge = tick.numbers(names, "edge", 1.0)
-    full = tick.of(Function.SOFTPLUS, "full", tick.line("share", levels, 1.0 / (edge * EDGE)))
+    edge, zero = tick.numbers(names, "edge", 1.0), tick.numbers(names, "zero", 0.0)
+    gain, shift = 1.0 / (edge * EDGE), -zero / (edge * EDGE)
+    full = tick.of(Function.SOFTPLUS, "full", tick.line("share", levels, gain, shift))
     bound = np.full(len(tanks), EMPTY)
     share = build.add(Clip, "not_empty", tick.line("height", full, EDGE), low=bound, high=1.0 / bound)
     logarithm = tick.of(Function.LOG, "logarithm", share)
     out = tick.of(Function.EXP, "out", tick.line("exponent", logarithm, exponent))
-    beyond = tick.line("beyond", levels, 1.0 / (edge * EDGE), -1.0 / EDGE)
+    beyond = tick.line("beyond", levels, gain, shift - 1.0 / EDGE)
     over = tick.line("over", tick.of(Function.SOFTPLUS, "spill", beyond), SPILL * rate * EDGE)
     above = [names.index(tank.source) if tank.source in names else i for i, tank in enumerate(tanks)]
     fed = np.array([tank.source not in twin.inputs for tank in tanks])

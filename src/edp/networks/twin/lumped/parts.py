@@ -15,12 +15,8 @@ from edp.networks.twin.scales import TwinScales
 Doubles = NDArray[np.float64]
 MOST_ELEMENTS = 32
 """Of a kind; tangents of all numbers run side by side, and twice the elements take four times as long."""
-SLIP = 0.005
-"""Share of the fastest velocity over which friction turns round; less makes the fit stiff, more lets loads creep."""
-EDGE = 0.01
-"""Share of a tank's height over which its overflow sets in; a hard edge leaves the fit in valleys of its own."""
-SPILL = 0.8
-"""Share of what stands above the edge that leaves in a tick; explicit steps stay stable below 2 a step."""
+ZERO = 0.04
+"""Plausible height of a gauge's zero above the orifice, or below it, as a share of the highest level."""
 LONGEST_NAME = 64
 """Of an element: a line of the datasheet holds it."""
 
@@ -196,6 +192,8 @@ def lumped_numbers(parts: Parts, channels: TwinChannels, scales: TwinScales) -> 
             LumpedNumber(tank.name, "edge", "m", 1.03 * full, 0.1)
             if tank.level
             else LumpedNumber(tank.name, "start", "1", 0.6, 0.3),
+            # A gauge reads zero somewhere near the orifice, not at it.
+            *([LumpedNumber(tank.name, "zero", "m", 0.0, ZERO * full, False)] if tank.level else []),
         ]
     for mass in parts.masses:
         i = answers.index(mass.velocity)
