@@ -4,6 +4,10 @@ Only what a newcomer has is given: the folder, and then the commands that `edp i
 training. What each column is stands below, from the descriptions of the sets; a column that `edp init` leaves as a
 number without a unit and says so ("unsure") is mapped right where its role is, since nothing in such a log tells more;
 a kind that it names must be the true one. The sets are shared data that this repository does not hold.
+
+A person's time is a model, not a measurement, since no person was watched (`person_seconds`): keys, words and questions
+are counted from what the commands really print, and priced with published rates of people. Two figures are given: for
+what asks for decisions, and for a person who types every command and reads every printed word.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ import sys
 import time
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +30,19 @@ from common import finish, in_folder, kept, parser, table, verdict
 MOST_COMMANDS = 5
 WAYS_OUT = {"inspect": (0, 3), "evaluate": (0, 6)}
 """Exit codes that say something of the data or the model: 3, the logs have faults; 6, a baseline is better."""
+MOST_PERSON_S = 180.0
+DECIDING = ("init", "inspect")
+"""Commands whose answers ask for decisions."""
+KEY_S, PREPARED_S = 0.28, 1.35
+"""A keystroke of an average typist who is no secretary, and the thought ahead of a command: the keystroke-level model
+(Card, Moran and Newell 1980)."""
+COPIED_S = 5.0
+"""To mark, copy and paste a printed line: 4.6 s by the same model (hand to the mouse and back, two pointings, a button
+down and up, five keys)."""
+WORD_S = 60 / 238
+"""Silent reading of English prose, mean of 190 studies (Brysbaert 2019)."""
+QUESTION_S = 3.0
+"""To answer a question that `edp init` puts behind a column, or to leave it open: an assumption, from no source."""
 
 
 @dataclass(frozen=True)
@@ -122,23 +140,29 @@ class Newcomer:
     steps: list[dict[str, Any]]
 
     def edp(self, *words: str) -> str:
-        """Run a command; its standard output."""
+        """Run a command that the person types, see `run`."""
+        step, printed = self.run(*words)
+        self.steps.append(step)
+        return printed
+
+    def run(self, *words: str) -> tuple[dict[str, Any], str]:
+        """Run a command; its figures, and its standard output."""
         began, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
         variables = {**os.environ, "COLUMNS": "80", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         call = [sys.executable, "-m", "edp", *words]
         done = subprocess.run(call, cwd=self.folder, env=variables, capture_output=True, text=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        self.steps.append(
-            {
-                "command": words[0],
-                "exit_code": done.returncode,
-                "wall_s": time.monotonic() - began,
-                "processor_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
-                "widest_line": max((len(line) for line in done.stdout.splitlines()), default=0),
-                "last_words": (done.stdout + done.stderr).strip().splitlines()[-1:],
-            }
-        )
-        return done.stdout
+        step = {
+            "command": words[0],
+            "keys": len(shlex.join(["edp", *words])) + 1,
+            "words": len(done.stdout.split()),
+            "exit_code": done.returncode,
+            "wall_s": time.monotonic() - began,
+            "processor_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+            "widest_line": max((len(line) for line in done.stdout.splitlines()), default=0),
+            "last_words": (done.stdout + done.stderr).strip().splitlines()[-1:],
+        }
+        return step, done.stdout
 
     @property
     def stuck(self) -> list[str]:
@@ -150,10 +174,31 @@ class Newcomer:
         ]  # fmt: skip
 
 
+def person_seconds(result: dict[str, Any]) -> dict[str, float]:
+    """What a person's part would take by a model, in seconds; the waiting is not the person's.
+
+    Returns:
+        ``deciding``: the first command is typed and the printed ones are copied; all that `edp init` and `edp inspect`
+        print is read, since it asks for decisions, and of the others the last line. ``reading_all``: every command is
+        typed and every printed word is read, progress apart, which is rewritten in place.
+    """
+    steps = result["steps"]
+    fixed = PREPARED_S * len(steps) + QUESTION_S * result["questions"]
+    keys = [KEY_S * step["keys"] for step in steps]
+    last = [sum(len(line.split()) for line in step["last_words"]) for step in steps]
+    words = [step["words"] if step["command"] in DECIDING else some for step, some in zip(steps, last)]
+    return {
+        "deciding": fixed + sum(keys[:1]) + COPIED_S * len(keys[1:]) + WORD_S * sum(words),
+        "reading_all": fixed + sum(keys) + WORD_S * result["words"],
+    }
+
+
 def first_hour(logs: Path, columns: dict[str, Truth], folder: Path, minutes: float) -> dict[str, Any]:
     """The whole way on one set: what was mapped how, and each command's figures."""
     person = Newcomer(folder)
-    facts = json.loads(person.edp("init", str(logs), "--yes", "--overwrite", "--json") or "{}")
+    person.edp("init", str(logs), "--yes")
+    # Once more for this script: a person reads the text.
+    facts = json.loads(person.run("init", str(logs), "--yes", "--overwrite", "--json")[1] or "{}")
     guesses = {guess["column"]: guess for guess in facts.get("columns", [])}
     fates = {name: judged(guesses[name], truth) if name in guesses else "wrong" for name, truth in columns.items()}
     unknown = sorted(set(guesses) - set(columns))
@@ -165,18 +210,30 @@ def first_hour(logs: Path, columns: dict[str, Truth], folder: Path, minutes: flo
         if person.stuck:
             break
     report = next(iter(folder.glob("runs/*/report.html")), None)
+    asked = [(one["sure"], one["role"], one["unit"], one["check"]) for one in guesses.values() if one["check"]]
+    # Columns side by side of which the same is likely are one question; each of which it is unsure is one.
+    questions = sum(one[0] == "unsure" or one != before for before, one in pairwise([None, *asked]) if one[0] != "sure")
     return {
         "channels": len(columns),
         **{fate: sum(one == fate for one in fates.values()) for fate in ("right", "said", "wrong")},
         "unit_left_open": sum(guess["sure"] == "unsure" for guess in guesses.values()),
         "not_right": {name: fate for name, fate in fates.items() if fate != "right"} | dict.fromkeys(unknown, "extra"),
         "commands": len(person.steps),
+        "keys": sum(step["keys"] for step in person.steps),
+        "words": sum(step["words"] for step in person.steps),
+        "questions": questions,
         "stuck": person.stuck,
         "report_bytes": report.stat().st_size if report else 0,
         "wall_s": sum(step["wall_s"] for step in person.steps),
         "processor_s": sum(step["processor_s"] for step in person.steps),
         "steps": person.steps,
     }
+
+
+def shown_of(result: dict[str, Any]) -> dict[str, Any]:
+    """What is kept of a set: the commands' last words name folders of this machine."""
+    facts = {key: value for key, value in result.items() if key != "steps"}
+    return facts | {"person_model_s": person_seconds(result)}
 
 
 def main() -> None:
@@ -198,24 +255,29 @@ def main() -> None:
             logs = (arguments.shared / name).resolve()
             way = partial(first_hour, logs, SETS[name], folder / name, arguments.minutes)
             results[name] = kept(folder / f"{name}.json", way)
-            facts = {key: value for key, value in results[name].items() if key != "steps"}
+            facts = shown_of(results[name])
             print(f"{name}: {json.dumps(facts)}", flush=True)
 
     in_folder(arguments.data, run)
     shown = ("channels", "right", "said", "wrong", "unit_left_open", "commands", "report_bytes", "processor_s")
-    table(["set", *shown], [[name, *(one[key] for key in shown)] for name, one in results.items()])
+    rows = [[name, *(one[key] for key in shown), *person_seconds(one).values()] for name, one in results.items()]
+    table(["set", *shown, "deciding_s", "reading_all_s"], rows)
+    print("deciding_s, reading_all_s: a person's time by a model of keys, words and questions, not measured on persons")
     quick = arguments.quick
     least = min(one["right"] / one["channels"] for one in results.values())
     silent = sum(one["wrong"] for one in results.values())
     most = max(one["commands"] for one in results.values())
+    longest = max(person_seconds(one)["deciding"] for one in results.values())
     finished = sum(bool(one["report_bytes"]) and not one["stuck"] for one in results.values())
     verdicts = [
         verdict("channels mapped right, worst set (against 90 %)", least, 0.9, ">= 1", "share", quick),
         verdict("columns silently wrong and one (against one)", silent + 1, 1, "<= 1", "columns", quick),
         verdict("commands to the report, worst set (against 5)", most, MOST_COMMANDS, "<= 1", "commands", quick),
+        verdict("person's time by a model, worst set (against 3 min)", longest, MOST_PERSON_S, "<= 1", "s", quick),
         verdict("sets with a report (against all)", finished, len(results), ">= 1", "sets", quick),
     ]
-    finish("first_hour", verdicts, arguments.seed, results, keep=not arguments.names)
+    details = {name: shown_of(one) for name, one in results.items()}
+    finish("first_hour", verdicts, arguments.seed, details, keep=not arguments.names)
 
 
 if __name__ == "__main__":

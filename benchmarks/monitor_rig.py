@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.monitor.detectors import EwmaSpec, statistics
-from edp.monitor.fitting import ChainSpec, blocks_of, fit_from_blocks, fit_summaries
+from edp.monitor.fitting import ChainSpec, fit_from_blocks
 from edp.monitor.residuals.base import FitMaterial
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
+from edp.monitor.session_blocks import blocks_of, fit_summaries
 from edp.monitor.watches import WatchSpec
 from edp.recording import Recording
 from edp.signals import Channel, Kind
@@ -103,7 +104,7 @@ def our_score(rig: Rig, training: Sequence[int], seed: int) -> Score:
     if source is None:
         raise DataError("no sensor of the rig follows from the others")
     rest = sessions[1::2]
-    summaries = fit_summaries(RIG_CHAIN, (source,), channels, rest)
+    summaries = fit_summaries(RIG_CHAIN.block_s, (source,), channels, rest)
     summaries = replace(summaries, moving=summaries.moving[:0], level=summaries.level[:0])
     parts = [blocks_of(summaries, (source,), channels, session) for session in rest]
     # The limit is not used: areas compare statistics.

@@ -22,7 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.monitor.residuals.base import SideBySide
 from edp.recording import Recording
+from edp.sandbox.helpers import Helpers
 from edp.signals import TABLE_A1, VOCABULARY
 from edp.sim import Scenario, simulate
 from edp.sim.excitation import EXCITATIONS
@@ -30,7 +32,8 @@ from edp.sim.excitation.base import AXES, Excitation
 from edp.sim.faults import FAULTS, fault_text, ladder
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
-from edp.sim.plan import DEFAULT_MIX, hand_out, ordered
+from edp.sim.plan import DEFAULT_MIX, hand_out
+from edp.sim.scenario import SimulationError
 from edp.sim.view import View
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.workflows.identify.machine_text import machine_text
@@ -294,12 +297,12 @@ def _write(job: _Job) -> str:
     return job.plan.name
 
 
-def write_sessions(plans: Sequence[SessionPlan], folder: Path, workers: int) -> None:
+def write_sessions(plans: Sequence[SessionPlan], folder: Path, side_by_side: SideBySide = map) -> None:
     """Simulate what is not in the folder yet."""
     make_folder(folder)
     jobs = [_Job(plan, folder, plan.name) for plan in plans if not (folder / f"{plan.name}.json").exists()]
-    for number, _ in enumerate(ordered(_write, jobs, workers) if jobs else (), start=1):
-        if number % 20 == 0 or number == len(jobs):
+    for number, _ in enumerate(side_by_side(_write, jobs), start=1):
+        if number % 50 == 0 or number == len(jobs):
             print(f"{folder.name}: {number} of {len(jobs)}", flush=True)
 
 
@@ -337,14 +340,20 @@ def plans_of(part: str, counts: dict[str, int], seconds: float = DURATION_S) -> 
     return plans
 
 
+def died(label: str) -> SimulationError:
+    """What is raised where a process ended by itself."""
+    return SimulationError(f"a process died at '{label}', out of memory or stopped from outside: take fewer workers")
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--data", type=Path, required=True, help="folder of the sessions; a folder a part")
     options.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     options.add_argument("--workers", type=int, default=2)
     given = options.parse_args()
-    for part in given.parts:
-        write_sessions(plans_of(part, COUNTS[part]), given.data / part, given.workers)
+    with Helpers(given.workers, died) as helpers:
+        for part in given.parts:
+            write_sessions(plans_of(part, COUNTS[part]), given.data / part, helpers.ordered)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
@@ -17,17 +16,16 @@ from edp.config.monitor import MonitorExperiment, load_monitor_experiment
 from edp.errors import DataError
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
-from edp.monitor.fitting import SessionBlocks, blocks_of, fit_from_blocks, fit_summaries, session_means
+from edp.monitor.fitting import fit_from_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
-from edp.monitor.residuals.base import FitMaterial, ResidualSource, sisters_of
-from edp.monitor.summaries import BlockSummaries
+from edp.monitor.residuals.base import ResidualSource, SideBySide
+from edp.monitor.residuals.flow_balances import FlowBalances
+from edp.monitor.session_blocks import SessionBlocks, blocks_of
 from edp.recording import Recording
-from edp.sim.plan import ordered
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.workflows.monitor import fit_to_recordings
 from edp.workflows.monitor.dictionary import build_dictionary, machine_of
-from edp.workflows.monitor.fit_monitor import FittedMonitor
 from monitor_sessions import read_session, session_names
 
 Floats = NDArray[np.float64]
@@ -48,8 +46,8 @@ class Plan:
         workers: processes.
         quick: short form.
         settings: of the monitor.
-        networks: folder of an earlier monitor whose networks are taken over; None trains new ones.
         fits: of the promise.
+        until: wall time of the whole run at which nothing further is begun, s.
     """
 
     data: Path
@@ -60,8 +58,24 @@ class Plan:
     workers: int
     quick: bool
     settings: tuple[str, ...]
-    networks: Path | None = None
     fits: int = 20
+    until: float = 1e9
+
+    @property
+    def experiment(self) -> MonitorExperiment:
+        """Settings of the monitor."""
+        options = {"hours_per_false_alarm": self.hours, "minutes": self.minutes}
+        return load_monitor_experiment(None, self.settings, options)
+
+    @property
+    def named(self) -> Path:
+        """Folder of the monitor with its dictionary."""
+        return self.monitor / "named"
+
+    @property
+    def without_flow(self) -> Path:
+        """Folder of the monitor without balances of flow."""
+        return self.monitor / "without_flow"
 
     @property
     def fit_hours(self) -> float:
@@ -109,7 +123,7 @@ class MonitorOfBlocks(Monitor):
         return MonitorOfBlocks(**values | {"chain": own})
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=3)
 def monitor_of(folder: Path) -> Monitor:
     return load_monitor(folder)
 
@@ -137,34 +151,67 @@ def write_blocks(path: Path, part: SessionBlocks, refused: bool) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def blocks(plan: Plan, part: str, names: Sequence[str]) -> list[SessionBlocks]:
-    """Summaries of sessions; those of an earlier run of the same monitor are read."""
-    cache = make_folder(plan.monitor / "blocks" / part)
+def blocks_file(plan: Plan, part: str, name: str) -> Path:
+    """Where the summaries of a session lie."""
+    return plan.monitor / "blocks" / part / f"{name}.npz"
+
+
+def read_blocks(path: Path) -> tuple[SessionBlocks, bool]:
+    """Summaries of a session, and whether the monitor refuses it."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return SessionBlocks(path.stem, arrays["summaries"], arrays["points"]), bool(arrays["refused"])
+
+
+def summarise(plan: Plan, names: Sequence[str], side_by_side: SideBySide) -> None:
+    """Write down the summaries of test sessions; those of an earlier run of the same monitor stay."""
+    cache = make_folder(plan.monitor / "blocks" / "test")
     jobs = [
-        _Job(plan.data / part, name, plan.monitor, cache / f"{name}.npz", name)
+        _Job(plan.data / "test", name, plan.monitor, cache / f"{name}.npz", name)
         for name in names
         if not (cache / f"{name}.npz").exists()
     ]
-    for number, name in enumerate(ordered(_summarise, jobs, plan.workers) if jobs else (), start=1):
-        if number % 20 == 0:
-            print(f"{part}: {number} of {len(jobs)} summarised, {name}", flush=True)
-    result = []
-    for name in names:
-        with np.load(cache / f"{name}.npz", allow_pickle=False) as arrays:
-            result.append(SessionBlocks(name, arrays["summaries"], arrays["points"]))
-    return result
+    for number, name in enumerate(side_by_side(_summarise, jobs), start=1):
+        if number % 50 == 0:
+            print(f"test: {number} of {len(jobs)} summarised, {name}", flush=True)
 
 
-def watched(plan: Plan, names: Sequence[str]) -> dict[str, list[MonitorAlarm]]:
-    """Alarms of test sessions by name; none where the monitor refuses a session as that of another machine."""
-    monitor = MonitorOfBlocks.of(load_monitor(plan.monitor))
-    found = {part.name: monitor.run(part) for part in blocks(plan, "test", names)}  # type: ignore[arg-type]
-    for name in names:
-        with np.load(plan.monitor / "blocks" / "test" / f"{name}.npz", allow_pickle=False) as arrays:
-            if arrays["refused"]:
-                print(f"{name}: refused as a session of another machine")
-                found[name] = []
-    return found
+@dataclass(frozen=True)
+class _WatchJob:
+    monitor: Path
+    blocks: Path
+    columns: tuple[int, ...]
+    label: str
+
+
+def _watch(job: _WatchJob) -> list[MonitorAlarm]:
+    part, refused = read_blocks(job.blocks)
+    if refused:
+        print(f"{job.label}: refused as a session of another machine", flush=True)
+        return []
+    if job.columns:
+        part = replace(part, summaries=part.summaries[:, job.columns])
+    return list(MonitorOfBlocks.of(monitor_of(job.monitor)).run(part))  # type: ignore[arg-type]
+
+
+def watched(
+    plan: Plan,
+    names: Sequence[str],
+    side_by_side: SideBySide = map,
+    monitor: Path | None = None,
+    columns: Sequence[int] = (),
+) -> dict[str, list[MonitorAlarm]]:
+    """Alarms of test sessions by name; none where the monitor refuses a session as that of another machine.
+
+    Args:
+        plan: of the run.
+        names: of sessions whose summaries are written down.
+        side_by_side: calls a function for each of some jobs.
+        monitor: folder of another monitor than that of the plan.
+        columns: of the summaries that it has; all by default.
+    """
+    folder = plan.monitor if monitor is None else monitor
+    jobs = [_WatchJob(folder, blocks_file(plan, "test", name), tuple(columns), name) for name in names]
+    return dict(zip(names, side_by_side(_watch, jobs), strict=True))
 
 
 def same_alarms(plan: Plan, found: dict[str, list[MonitorAlarm]], count: int = 6) -> tuple[int, int]:
@@ -178,28 +225,27 @@ def same_alarms(plan: Plan, found: dict[str, list[MonitorAlarm]], count: int = 6
     return same, len(names)
 
 
-def fitted(plan: Plan) -> dict[str, Any]:
-    """Fit the monitor where it is not there yet; what is kept of it."""
+def fitted(plan: Plan, side_by_side: SideBySide = map) -> dict[str, Any]:
+    """Fit the monitor where it is not there yet, without its dictionary; what is kept of it."""
     facts = plan.monitor / "fit.json"
     if not facts.exists():
         names = session_names(plan.data / "training", "healthy")[: plan.sessions]
-        options = {"hours_per_false_alarm": plan.hours, "minutes": plan.minutes}
-        experiment = load_monitor_experiment(None, plan.settings, options)
-        if plan.networks is None:
-            recordings = [read_session(plan.data / "training", name).recording for name in names]
-            result = fit_to_recordings(recordings, experiment, note=noted)
-        else:
-            result = refitted(plan, load_monitor(plan.networks), experiment)
+        experiment = plan.experiment
+        experiment = replace(experiment, dictionary=replace(experiment.dictionary, machine="none"))
+        recordings = [read_session(plan.data / "training", name).recording for name in names]
+        result = fit_to_recordings(recordings, experiment, note=noted, side_by_side=side_by_side)
         save_monitor(result.monitor, plan.monitor)
+        make_folder(plan.monitor / "blocks" / "training")
+        for part in result.sessions:
+            write_blocks(blocks_file(plan, "training", part.name), part, refused=False)
         monitor = result.monitor
         write_json(
             facts,
             {
-                "seconds": result.seconds,
                 "promise": monitor.limit.sentence(),
                 "limit": asdict(monitor.limit) | {"high_hours": min(monitor.limit.high_hours, NEVER_H)},
                 "residuals": list(monitor.residual_names),
-                "provenance": dict(monitor.provenance),
+                "provenance": {key: value for key, value in monitor.provenance.items() if key != "seconds"},
                 "doubtful": list(result.doubtful),
             },
         )
@@ -212,54 +258,53 @@ def noted(text: str) -> None:
     print(f"fit: {text}", flush=True)
 
 
-def refitted(plan: Plan, old: Monitor, experiment: MonitorExperiment) -> FittedMonitor:
-    """A monitor with the networks of an earlier one; all else is fitted anew, to the same sessions as there.
-
-    Training takes most of a fit, and is the same where settings of residuals and sessions are.
-    """
-    began = time.process_time()
-    parts = [list(old.provenance[key]) for key in ("trained_on", "calibrated_on")]
-    train, rest = ([read_session(plan.data / "training", name).recording for name in names] for names in parts)
-    # The sessions that chose among weights stand last.
-    cut = max(1, len(train) // 6)
-    material = FitMaterial(train[:-cut], train[-cut:], old.channels, old.rate_hz, seed=experiment.seed, note=noted)
-    sources = []
-    for spec in experiment.residuals:
-        source = next((source for source in old.sources if isinstance(source, spec.source)), None)
-        fresh = source if source is not None and source.parts().bundles else spec.fit(material)
-        sources += [] if fresh is None else [fresh]
-    summaries = fit_summaries(experiment.chain, sources, old.channels, rest)
-    held = []
-    for number, recording in enumerate(rest):
-        sisters = sisters_of(sources, experiment.chain.tolerance, number)
-        held.append(_held(plan, summaries, sisters, old, recording))
-    chain = fit_from_blocks(
-        experiment.chain, summaries, held, old.rate_hz, old.chain.settle, experiment.hours_per_false_alarm, noted
-    )
-    means = session_means(old.channels, (*train, *rest))
-    monitor = Monitor(old.channels, old.rate_hz, tuple(sources), chain.chain, chain.limit, means, None, old.provenance)
-    machine = machine_of(experiment.dictionary, rest)
-    if machine:
-        dictionary = build_dictionary(monitor, rest, machine, experiment.dictionary, experiment.seed, _counted)
-        monitor = replace(monitor, diagnosis=dictionary)
-    return FittedMonitor(monitor, chain.doubtful, time.process_time() - began)
+def add_dictionary(plan: Plan, side_by_side: SideBySide = map) -> bool:
+    """The monitor with a dictionary of faults in a folder of its own; false where there is no machine to simulate."""
+    if not (plan.named / "monitor.json").exists():
+        monitor, spec = load_monitor(plan.monitor), plan.experiment.dictionary
+        names = monitor.provenance["calibrated_on"]
+        healthy = [read_session(plan.data / "training", name).recording for name in names]
+        machine = machine_of(spec, healthy)
+        if not machine:
+            return False
+        dictionary = build_dictionary(monitor, healthy, machine, spec, 0, None, side_by_side)
+        save_monitor(replace(monitor, diagnosis=dictionary), plan.named)
+    return True
 
 
-def _counted(what: str, done: int, total: int) -> None:
-    if done % 50 == 0:
-        print(f"fit: {what}: {done} of {total}", flush=True)
+def columns_without_flow(monitor: Monitor) -> tuple[list[ResidualSource], list[int], list[int]]:
+    """Sources that are no balances of flow, places of their residuals, and columns of their summaries."""
+    kept = [source for source in monitor.sources if not isinstance(source, FlowBalances)]
+    own = {name for source in kept for name in source.names}
+    residuals = [place for place, name in enumerate(monitor.residual_names) if name in own]
+    each = monitor.chain.summaries.width // monitor.chain.summaries.residuals
+    return kept, residuals, [place * each + number for place in residuals for number in range(each)]
 
 
-def _held(
-    plan: Plan, summaries: BlockSummaries, sources: Sequence[ResidualSource], old: Monitor, recording: Recording
-) -> SessionBlocks:
-    """Summaries of a training session; those that were written down are read."""
-    cache = make_folder(plan.monitor / "blocks" / "training") / f"{recording.name}.npz"
-    if not cache.exists():
-        part = blocks_of(summaries, sources, old.channels, recording)
-        write_blocks(cache, part, refused=False)
-    with np.load(cache, allow_pickle=False) as arrays:
-        return SessionBlocks(recording.name, arrays["summaries"], arrays["points"])
+def fit_without_flow(plan: Plan, side_by_side: SideBySide = map) -> list[int]:
+    """The monitor less its balances of flow, all behind them fitted anew; columns of the summaries that it has."""
+    monitor = load_monitor(plan.monitor)
+    kept, residuals, columns = columns_without_flow(monitor)
+    if not (plan.without_flow / "monitor.json").exists():
+        old = monitor.chain.summaries
+        summaries = replace(
+            old,
+            scale=old.scale[residuals],
+            channel=old.channel[residuals],
+            change=old.change[residuals],
+            drivers=old.drivers[:, residuals],
+        )
+        held = [read_blocks(blocks_file(plan, "training", name))[0] for name in monitor.provenance["calibrated_on"]]
+        held = [replace(part, summaries=part.summaries[:, columns]) for part in held]
+        result = fit_from_blocks(
+            plan.experiment.chain, summaries, held, monitor.rate_hz, monitor.chain.settle, plan.hours,
+            side_by_side=side_by_side,
+        )  # fmt: skip
+        save_monitor(
+            replace(monitor, sources=tuple(kept), chain=result.chain, limit=result.limit, scatter=None),
+            plan.without_flow,
+        )
+    return columns
 
 
 def parts_of(plan: Plan) -> tuple[list[str], list[str]]:

@@ -46,12 +46,14 @@ def test_a_terminal_is_asked(parity, tmp_path):
     assert "is not a bundle" not in refused
 
 
-def test_run_folders_and_their_bundles_are_ones_own(parity, tmp_path):
+@pytest.mark.parametrize("name", ["run.json", "provenance.json"])
+def test_run_folders_and_their_bundles_are_ones_own(parity, tmp_path, name):
     (tmp_path / "bundle").mkdir()
     (tmp_path / "other").mkdir()
     assert not from_own_run(tmp_path)
-    (tmp_path / "run.json").write_text("{}")
+    (tmp_path / name).write_text("{}")
     assert from_own_run(tmp_path)
     assert from_own_run(tmp_path / "bundle")
     assert not from_own_run(tmp_path / "other")
-    assert "holds a training that is not finished" in parity(tmp_path)[1]
+    unfinished = "holds a training that is not finished" if name == "run.json" else "it has no bundle.json"
+    assert unfinished in parity(tmp_path)[1]

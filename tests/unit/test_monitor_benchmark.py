@@ -48,7 +48,7 @@ def test_sessions_come_back_with_what_is_measured_and_when_it_moved(bench, tmp_p
     sessions = bench[0]
     plans = sessions.session_plans("validation", "healthy", 1, seconds=8.0)
     stuck = sessions.SessionPlan("faulty_0", "faulty", 5, 40.0, 20.0, "clay", 0.0, "stroke_stuck:arm@2s", 8.0)
-    sessions.write_sessions([*plans, stuck], tmp_path, 1)
+    sessions.write_sessions([*plans, stuck], tmp_path)
     assert sessions.session_names(tmp_path, "healthy") == ["healthy_000"]
     (healthy,) = sessions.read_sessions(tmp_path, "healthy")
     again = sessions.simulated(plans[0], tmp_path / "machines")
@@ -60,7 +60,7 @@ def test_sessions_come_back_with_what_is_measured_and_when_it_moved(bench, tmp_p
     stroke = faulty.recording.column("CylStroke_2")
     assert np.ptp(stroke[200:]) == 0.0
     assert np.ptp(stroke[:200]) > 0.0
-    assert sessions.write_sessions(plans, tmp_path, 1) is None, "what is there stays"
+    assert sessions.write_sessions(plans, tmp_path) is None, "what is there stays"
 
 
 def test_a_sister_differs_within_its_tolerance_and_not_in_what_is_machined(bench):

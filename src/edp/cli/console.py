@@ -110,13 +110,19 @@ def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) ->
     Columns that do not fit beside each other stand below each other, each block with the first column.
     """
     texts = [[_cell(cell) for cell in row] for row in rows]
-    for i, block in enumerate(_blocks(headings, texts, out.width)):
+    widths = _widths(headings, texts)
+    for i, block in enumerate(_blocks(widths, out.width)):
         printed_table = _table(title if not i else "")
-        for heading in (headings[column] for column in block):
+        for column in block:
             first = not printed_table.columns
-            # Names are folded, never cut: six rows of a table once all read CylPress...
+            # Names are folded, never cut: six rows of a table once all read CylPress... A text that is wider than what
+            # the names leave stands alone beside them, and would be cut, too, if it could not go on in the next row.
+            wide = len(block) == 2 and sum(widths[other] + _GAP for other in block) > out.width
             printed_table.add_column(
-                _shown(heading), justify="left" if first else "right", overflow="fold", no_wrap=not first
+                _shown(headings[column]),
+                justify="left" if first or wide else "right",
+                overflow="fold",
+                no_wrap=not first and not wide,
             )
         for row in texts:
             printed_table.add_row(*(row[column] for column in block if column < len(row)))
@@ -127,12 +133,16 @@ def _cell(value: Any) -> Text:
     return _shown(f"{value:,}" if isinstance(value, int) else str(value))
 
 
-def _blocks(headings: Sequence[str], rows: Sequence[Sequence[Text]], width: int) -> list[list[int]]:
-    """Columns by blocks that fit into a width, each with the first one."""
-    widths = [
+def _widths(headings: Sequence[str], rows: Sequence[Sequence[Text]]) -> list[int]:
+    """The width that each column would have."""
+    return [
         max([_shown(heading).cell_len, *(row[i].cell_len for row in rows if i < len(row))])
         for i, heading in enumerate(headings)
     ]
+
+
+def _blocks(widths: Sequence[int], width: int) -> list[list[int]]:
+    """Columns by blocks that fit into a width, each with the first one."""
     # A long name takes at most half of a line, and is folded.
     first = min(widths[0], max(width // 2, 1)) if widths else 0
     blocks: list[list[int]] = []

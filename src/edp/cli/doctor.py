@@ -134,9 +134,11 @@ def machine(folder: Path) -> list[InstallationCheck]:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limits = ", ".join(f"{name}={os.environ[name][:8]}" for name in _THREADS if name in os.environ)
-    system = "ok" if sys.platform == "linux" else "broken"
+    system = "ok" if sys.platform == "linux" else "missing"
     checks = [
-        InstallationCheck("system", system, f"{platform.system()} {platform.machine()}", "Linux; on Windows take WSL"),
+        InstallationCheck(
+            "system", system, f"{platform.system()} {platform.machine()}", "only Linux is tested; on Windows take WSL"
+        ),
         InstallationCheck(
             "threads", "ok", f"{cores} cores{'; ' if limits else ''}{limits}", "training.threads, --workers"
         ),

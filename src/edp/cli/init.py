@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,15 +14,18 @@ from edp.cli.quality import LogDisplay
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from edp.logs.proposal.propose import ColumnGuess
     from edp.workflows.proposal import LogsProposal
 
 _SHOWN_ROWS = 60
 """Columns in the table; all of them are in the map and in --json."""
-_SHOWN_NAME = 20
-"""Characters of a name in the table, which fits into 80 columns."""
-_SHOWN_END = 11
-"""Of these, from the end of a longer name."""
+_SHOWN_NAME = 60
+"""Characters of a name in the table; a longer one is cut in its middle, since names mostly differ at an end."""
+_SIBLINGS = 3
+"""So many columns in a row that differ in a number only and are taken for the same stand in one row."""
+_NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
 
 
 def init(
@@ -73,7 +77,7 @@ def show_proposal(proposal: LogsProposal) -> None:
     out.print(f"{count} log(s) with these columns; {look.path.name}: {look.rows:,} rows, {rate}")
     # What never moves last: logs of ROS hold more of it than fits.
     columns = sorted(proposal.proposal.columns, key=lambda guess: guess.role == "constant")
-    rows = [_row(guess) for guess in columns[:_SHOWN_ROWS]]
+    rows = _rows(columns[:_SHOWN_ROWS])
     listing("", ["column", "role", "kind", "unit", "sure", "check"], rows)
     if len(columns) > _SHOWN_ROWS:
         out.print(f"and {len(columns) - _SHOWN_ROWS:,} more columns, which --json lists")
@@ -87,13 +91,41 @@ def show_proposal(proposal: LogsProposal) -> None:
         out.print(f"unsure of {unsure} channel(s): taken as numbers without a unit (generic) until the map says more")
 
 
+def _rows(columns: Sequence[ColumnGuess]) -> list[tuple[str, ...]]:
+    """Rows of the table: name, role, kind, unit, sureness, and what to check or why."""
+    rows: list[tuple[str, ...]] = []
+    siblings: list[str] = []
+    for guess in columns:
+        row = _row(guess)
+        if rows and row[1:] == rows[-1][1:] and _follows(siblings[-1], guess.column):
+            siblings.append(guess.column)
+        else:
+            siblings = [guess.column]
+        if len(siblings) == _SIBLINGS:
+            del rows[2 - _SIBLINGS :]  # all but the first of them
+        if len(siblings) >= _SIBLINGS:
+            rows[-1] = (f"{_cut(siblings[0])} to {_cut(siblings[-1])}", *row[1:])
+        else:
+            rows.append(row)
+    return rows
+
+
+def _follows(name: str, other: str) -> bool:
+    """Whether a name is another one but for its first number, which is one more."""
+    one, two = _NUMBERED.fullmatch(name), _NUMBERED.fullmatch(other)
+    if one is None or two is None:
+        return False
+    return (one[1], one[3], int(one[2]) + 1) == (two[1], two[3], int(two[2]))
+
+
 def _row(guess: ColumnGuess) -> tuple[str, ...]:
-    name = guess.column
-    if len(name) > _SHOWN_NAME:
-        # Names of topics differ at their ends.
-        name = f"{name[: _SHOWN_NAME - 3 - _SHOWN_END]}...{name[-_SHOWN_END:]}"
     kind = (str(guess.kind.kind).replace("_", " "), guess.kind.unit) if guess.channel else ("-", "-")
-    return name, guess.role, *kind, guess.sureness, guess.check or guess.why
+    return _cut(guess.column), guess.role, *kind, guess.sureness, guess.check or guess.why
+
+
+def _cut(name: str) -> str:
+    half = (_SHOWN_NAME - len(" ... ")) // 2
+    return name if len(name) <= _SHOWN_NAME else f"{name[:half]} ... {name[-half:]}"
 
 
 def _facts(proposal: LogsProposal, paths: list[Path], commands: list[str]) -> dict[str, Any]:

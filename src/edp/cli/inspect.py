@@ -25,12 +25,18 @@ SETTINGS = "settings.toml"
 FAULTY = 3
 
 
+MOST_CHANNELS = 12
+"""Of a single log whose channels are all shown without --details."""
+
+
 def inspect(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
     signal_map: MapOption = None,
     details: Annotated[
         bool | None,
-        typer.Option(help="Show each channel and finding of each log, and all coverage; default: of a single log."),
+        typer.Option(
+            help="Show each channel and finding of each log, and all coverage; default: of one log of few channels."
+        ),
     ] = None,
     covered: Annotated[
         bool, typer.Option("--coverage/--no-coverage", help="Show the coverage of the operating range.")
@@ -84,7 +90,8 @@ def inspect(
         build_coverage_page(coverage_facts, page, data.resolve().stem, quality)
 
     def show() -> None:
-        whole = len(quality.reports) == 1 if details is None else details
+        few = len(quality.reports) == 1 and len(quality.reports[0].channels) <= MOST_CHANNELS
+        whole = few if details is None else details
         if whole:
             for report in quality.reports:
                 show_report(report)

@@ -55,6 +55,9 @@ def fit(
     limit. Hours that are too few for the promise are refused, with the rate that they support. Faults are simulated on
     the machine that the logs name or --machine gives, some minutes; without one, alarms have no causes.
 
+    With balances of flow (logs with command, velocity and both pressures of a cylinder) a monitor belongs to the one
+    machine of its logs; for all machines of a series, add `--set chain.tolerance=0.01`.
+
     Example: `edp monitor fit runs/m22 logs/healthy --out monitors/m22`
     """
     from edp.config.monitor import load_monitor_experiment
@@ -79,6 +82,7 @@ def fit(
         "seconds": fitted.seconds,
         "residuals": list(monitor.residual_names),
         "doubtful": list(fitted.doubtful),
+        "one_machine": fitted.one_machine,
         "promise": monitor.limit.sentence(),
     }
 
@@ -87,6 +91,11 @@ def fit(
             out.print(f"'{name}' was left out: it lies far from all other healthy sessions; look into it")
         out.print(f"{len(monitor.residual_names)} residuals of {len(monitor.channels)} channels are watched")
         out.print(monitor.limit.sentence())
+        if fitted.one_machine:
+            out.print(
+                "its balances of flow know this machine's valves to 1 %: it belongs to this one machine and raises "
+                "alarms on others of its series; for those, fit with --set chain.tolerance=0.01, which finds less"
+            )
         out.print(f"fitted in {duration(fitted.seconds)} of processor time; monitor in {folder}")
         out.print(f"next: edp monitor run {folder} LOGS")
 
@@ -109,7 +118,8 @@ def run(
 ) -> None:
     """Watch logs: every alarm with when, since when, and what deviates; exit code 5 where there was one.
 
-    Channels that a log lacks are silent with all that reads them, which is said. A log of another machine is refused.
+    Channels that a log lacks are silent with all that reads them, which is said. A log of another machine is refused,
+    and one that looks like a sister of the monitor's machine is named.
 
     Example: `edp monitor run monitors/m22 logs/today --out watched/today`
     """
@@ -130,6 +140,8 @@ def run(
         for name, reasons in watched.unlearned.items():
             for reason in reasons:
                 out.print(f"'{name}': {reason}")
+        for name, reason in watched.unlike.items():
+            out.print(f"'{name}': {reason}")
         # A fault that stays alarms again and again: one row tells it.
         rows = [
             [

@@ -112,19 +112,25 @@ def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: 
     )
     count = s.shape[1]
     usual, spread, floor = np.zeros((count, design.shape[1])), np.zeros((count, design.shape[1])), np.ones(count)
+    squares = design.T @ design
     for column in range(count):
         values = s[:, column]
         there = np.isfinite(values)
         if there.sum() < 4 * design.shape[1]:
             continue  # never there: stays at zero with width one, and NaN says nothing
-        x, y = design[there], values[there]
-        line = _ridge(x, y)
+        lacking = not there.all()
+        x, y = (design[there], values[there]) if lacking else (design, values)
+        square, product = x.T @ x if lacking else squares, x.T @ y
+        line = _ridge(square, product, len(x))
         off = np.abs(y - x @ line)
         near = off <= TRIMMED * 1.4826 * max(float(np.median(off)), 1e-12)
-        line = _ridge(x[near], y[near])
+        # Few rows are far off: their products are taken from those of all.
+        far, count_near = x[~near], int(near.sum())
+        square = square - far.T @ far
+        line = _ridge(square, product - far.T @ y[~near], count_near)
         off = np.abs(y - x @ line)
         size = max(float(off[near].std()), float(off[near].mean()), 1e-9)
-        wide = _ridge(x[near], off[near])
+        wide = _ridge(square, x.T @ np.where(near, off, 0.0), count_near)
         floor[column] = LEAST_WIDTH * size
         # The mean absolute deviation of a normal variable is 0.798 of its standard deviation.
         usual[column], spread[column] = line, wide / 0.798
@@ -137,9 +143,9 @@ def _single(values: Array) -> Array:
     return values.astype(np.float32).astype(np.float64)
 
 
-def _ridge(x: Array, y: Array) -> Array:
-    """Coefficients of y on x; the constant is not drawn to zero."""
-    penalty = RIDGE * len(x) * np.eye(x.shape[1])
+def _ridge(square: Array, product: Array, rows: int) -> Array:
+    """Coefficients from the products of `rows` rows; the constant is not drawn to zero."""
+    penalty = RIDGE * rows * np.eye(len(square))
     penalty[0, 0] = 0.0
-    line = np.linalg.solve(x.T @ x + penalty + 1e-12 * np.eye(x.shape[1]), x.T @ y)
+    line = np.linalg.solve(square + penalty + 1e-12 * np.eye(len(square)), product)
     return np.asarray(line, dtype=np.float64)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.roles import Axis, roles_of
 from edp.errors import DataError
 from edp.monitor.adaptation import SlowDrift
 from edp.monitor.calibration import AlarmLimit, calibrated
@@ -16,24 +15,19 @@ from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
 from edp.monitor.detectors.separate_cusums import SeparateCusumsSpec
-from edp.monitor.residuals.base import ResidualSource, note_nothing, residuals_of, rows_of, sisters_of
+from edp.monitor.residuals.base import ResidualSource, SideBySide, note_nothing, sisters_of
+from edp.monitor.session_blocks import BlocksJob, SessionBlocks, fit_summaries, summarised
 from edp.monitor.summaries import BlockSummaries
 from edp.monitor.watches import BankSpec, Watch, WatchSpec, fit_watch, scaled_alike
 from edp.recording import Recording
 from edp.settings.bounds import above, below, check_bounds, check_count, integer, span
-from edp.signals import Channel, Kind
+from edp.signals import Channel
 
 Array = NDArray[np.float64]
-SCALED_SESSIONS = 12
-"""Sessions that scales of residuals are taken from: they set units, conditioning does the rest."""
-MOVING = (Kind.VELOCITY, Kind.ANGULAR_VELOCITY, Kind.PILOT_PRESSURE, Kind.FLOW)
-LEVELS = (Kind.PRESSURE, Kind.TEMPERATURE, Kind.POSITION, Kind.ANGLE, Kind.RATIO, Kind.CURRENT, Kind.VOLTAGE)
-MOST_POINT = 24
-"""Channels of an operating point; of more, those that vary most between blocks are taken."""
 LEAST_SESSIONS = 4
 """For conditioning and limits."""
-LEAST_TICKS = 10
-"""Of a block: spreads of fewer say nothing."""
+NO_FOLD = -1
+"""In place of the number of a fold: nothing is left out."""
 
 
 def default_watches() -> tuple[WatchSpec, ...]:
@@ -95,15 +89,6 @@ class ChainSpec:
 
 
 @dataclass(frozen=True, eq=False)
-class SessionBlocks:
-    """Summaries and operating points of a session, shapes (blocks, summaries) and (blocks, points)."""
-
-    name: str
-    summaries: Array
-    points: Array
-
-
-@dataclass(frozen=True, eq=False)
 class FittedChain:
     """What came of it.
 
@@ -127,6 +112,7 @@ def fit_chain(
     sessions: Sequence[Recording],
     promised_hours: float,
     note: Callable[[str], None] = note_nothing,
+    side_by_side: SideBySide = map,
 ) -> FittedChain:
     """Fit all behind the residuals.
 
@@ -137,6 +123,7 @@ def fit_chain(
         sessions: healthy ones.
         promised_hours: operating hours to one false alarm.
         note: called with what begins.
+        side_by_side: calls a function for each of some jobs, such as in processes.
 
     Raises:
         ConfigError: too few hours for the promise; says for which there are enough.
@@ -149,17 +136,18 @@ def fit_chain(
             "bring more sessions, or cut long ones"
         )
     note("summaries of healthy sessions")
-    summaries = fit_summaries(spec, sources, channels, sessions)
-    blocks = [
-        blocks_of(summaries, sisters_of(sources, spec.tolerance, number), channels, session)
+    summaries = fit_summaries(spec.block_s, sources, channels, sessions)
+    jobs = [
+        BlocksJob(summaries, sisters_of(sources, spec.tolerance, number), channels, session)
         for number, session in enumerate(sessions)
     ]
+    blocks = list(side_by_side(summarised, jobs))
     rate_hz = sessions[0].rate_hz
     shortest = min(session.samples for session in sessions)
     # A tenth: one-minute cycles of a rig would otherwise lose most of what they have.
     settle_ticks = min(round(spec.settle_s * rate_hz), shortest // 10)
     settle = -(-settle_ticks // summaries.block)
-    return fit_from_blocks(spec, summaries, blocks, rate_hz, settle, promised_hours, note)
+    return fit_from_blocks(spec, summaries, blocks, rate_hz, settle, promised_hours, note, side_by_side)
 
 
 def fit_from_blocks(
@@ -170,26 +158,21 @@ def fit_from_blocks(
     settle: int,
     promised_hours: float,
     note: Callable[[str], None] = note_nothing,
+    side_by_side: SideBySide = map,
 ) -> FittedChain:
     """`fit_chain` from the blocks of the sessions on."""
     note("conditioning, views and limit")
     remaining, doubtful = _without_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
-    white: list[Array] = [np.zeros(0)] * len(remaining)
     drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)
-    conditioning = _conditioning(spec, remaining, settle)
-    whole = [_conditioned(conditioning, drift, part, settle) for part in remaining]
-    watches = _watches(spec, whole, blocks_per_s, settle)
     folds = min(spec.folds, len(remaining))
-    for fold in range(folds):
-        others = [part for i, part in enumerate(remaining) if i % folds != fold]
-        own_conditioning = _conditioning(spec, others, settle)
-        fitted = [_conditioned(own_conditioning, drift, part, settle) for part in others]
-        own = _watches(spec, fitted, blocks_per_s, settle)
-        own = [_as_wide(watch, whole_one.directions) for watch, whole_one in zip(own, watches, strict=True)]
-        for i in range(fold, len(remaining), folds):
-            # The start of a session is operating time: its rows are missing, and count as healthy.
-            white[i] = BankSpec(tuple(own)).white(*_conditioned(own_conditioning, drift, remaining[i], settle))
+    jobs = [_Part(spec, remaining, drift, blocks_per_s, settle, fold, folds) for fold in (NO_FOLD, *range(folds))]
+    white: list[Array] = [np.zeros(0)] * len(remaining)
+    for job, (own_conditioning, own, rows) in zip(jobs, side_by_side(_fit_part, jobs), strict=True):
+        if job.fold == NO_FOLD:
+            conditioning, watches = own_conditioning, own
+        for index, part in zip(job.left_out, rows, strict=True):
+            white[index] = _as_wide(part, [watch.directions for watch in watches])
     # On sessions that a view was not fitted to: on its own ones one of many directions looks far too calm.
     bank = BankSpec(scaled_alike(spec.watches, watches, white))
     limit = calibrated(bank, white, blocks_per_s, promised_hours)
@@ -206,13 +189,51 @@ def _watches(spec: ChainSpec, sessions: Sequence[tuple[Array, Array]], blocks_pe
     ]
 
 
-def _as_wide(watch: Watch, directions: int) -> Watch:
-    """A view of a fold as wide as that of all sessions: a direction that it lacks counts as healthy."""
-    if watch.directions == directions:
-        return watch
-    matrix = np.zeros((len(watch.matrix), directions))
-    matrix[:, : min(directions, watch.directions)] = watch.matrix[:, :directions]
-    return replace(watch, matrix=matrix)
+def _as_wide(parts: Sequence[Array], directions: Sequence[int]) -> Array:
+    """Rows of the views of a fold as wide as those of all sessions: a direction that it lacks counts as healthy."""
+    wide = []
+    for part, width in zip(parts, directions, strict=True):
+        fitting = part[:, :width]
+        wide.append(np.pad(fitting, ((0, 0), (0, width - fitting.shape[1]))))
+    return np.concatenate(wide, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A fit to all sessions, or to those outside a fold."""
+
+    spec: ChainSpec
+    sessions: Sequence[SessionBlocks]
+    drift: SlowDrift
+    blocks_per_s: float
+    settle: int
+    fold: int
+    folds: int
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return "conditioning and views" if self.fold == NO_FOLD else f"fold {self.fold + 1} of {self.folds}"
+
+    @property
+    def left_out(self) -> range:
+        """Places of the sessions that it is not fitted to."""
+        return range(0) if self.fold == NO_FOLD else range(self.fold, len(self.sessions), self.folds)
+
+
+def _fit_part(job: _Part) -> tuple[Conditioning, list[Watch], list[list[Array]]]:
+    """Conditioning, views, and the rows of each view for each session that they were not fitted to."""
+    out = set(job.left_out)
+    others = [session for index, session in enumerate(job.sessions) if index not in out]
+    conditioning = _conditioning(job.spec, others, job.settle)
+    fitted = [_conditioned(conditioning, job.drift, session, job.settle) for session in others]
+    watches = _watches(job.spec, fitted, job.blocks_per_s, job.settle)
+    rows = []
+    for index in job.left_out:
+        # The start of a session is operating time: its rows are missing, and count as healthy.
+        clipped, gross = _conditioned(conditioning, job.drift, job.sessions[index], job.settle)
+        rows.append([watch(gross if watch.own else clipped) for watch in watches])
+    return conditioning, watches, rows
 
 
 def _quiet(bank: BankSpec, sessions: Sequence[Array]) -> float:
@@ -253,10 +274,13 @@ def doubtful_sessions(
     sources: Sequence[ResidualSource],
     channels: Sequence[Channel],
     sessions: Sequence[Recording],
+    side_by_side: SideBySide = map,
 ) -> tuple[str, ...]:
     """Names of further sessions whose means lie far from those that a chain was fitted to, such as of the training."""
     chain = fitted.chain
-    blocks = [blocks_of(chain.summaries, sources, channels, session) for session in sessions]
+    blocks = list(
+        side_by_side(summarised, [BlocksJob(chain.summaries, sources, channels, session) for session in sessions])
+    )
     bad = _doubtful(spec, blocks, fitted.sessions, chain.settle)
     return tuple(block.name for block, out in zip(blocks, bad, strict=True) if out)
 
@@ -280,117 +304,3 @@ def _doubtful(
     # A fifth at most: where more stand out, they are not exceptions.
     most = max(1, len(sessions) // 5)
     return np.asarray(bad & (worst >= np.sort(worst)[-most]), dtype=bool)
-
-
-def fit_summaries(
-    spec: ChainSpec, sources: Sequence[ResidualSource], channels: Sequence[Channel], sessions: Sequence[Recording]
-) -> BlockSummaries:
-    """Blocks and scales from some healthy sessions."""
-    rate_hz, names = sessions[0].rate_hz, [channel.name for channel in channels]
-    block = max(round(spec.block_s * rate_hz), LEAST_TICKS)
-    block = min(block, max(1, min(session.samples for session in sessions) // 2))
-    places = np.unique(np.linspace(0, len(sessions) - 1, min(len(sessions), SCALED_SESSIONS)).astype(int))
-    chosen = [sessions[i] for i in places]
-    scales = []
-    for source in sources:
-        values = np.concatenate(residuals_of(source, chosen)).astype(np.float64)
-        scales.append(_robust_width(values))
-    rows = np.concatenate([rows_of(session, names) for session in chosen]).astype(np.float64)
-    centre, spread = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
-    centre = np.nan_to_num(centre)
-    spread = np.where(np.nan_to_num(spread) > 0.0, spread, 1.0)
-    judged = [names.index(channel[0]) for source in sources for channel in source.judged]
-    change = np.nanvar(np.diff(rows / spread, axis=0), axis=0)
-    change = np.where(np.nan_to_num(change) > 0.0, change, 1.0)
-    moving, level = _operating_channels(channels, rows, block)
-    return BlockSummaries(
-        block=block,
-        scale=1.0 / np.concatenate(scales),
-        channel=np.array(judged, np.int64),
-        centre=centre,
-        spread=1.0 / spread,
-        change=change[judged],
-        moving=moving,
-        level=level,
-        drivers=drivers_of(channels, sessions[0], [names[i] for i in judged]),
-    )
-
-
-def drivers_of(channels: Sequence[Channel], session: Recording, judged: Sequence[str]) -> NDArray[np.int64]:
-    """What drives each residual: the velocity and the signed command of the axis that its channel belongs to.
-
-    A channel of no axis has those whose sizes go with it most. Shape (drivers, residuals, 2); a driver that no residual
-    has is left out.
-    """
-    names = [channel.name for channel in channels]
-    axes = roles_of(session).axes
-    own = [
-        next((axis for axis in axes if name in (axis.velocity, axis.stroke, *axis.pressures, *axis.command)), None)
-        or _likely_axis(axes, session, name)
-        for name in judged
-    ]
-    rows = []
-    for choose in (lambda axis: (axis.velocity,), lambda axis: axis.command, lambda axis: axis.conflux):
-        pairs = [tuple(n for n in choose(axis) if n in names) if axis is not None else () for axis in own]
-        if any(pairs):
-            # Without a driver the residual is driven by itself against itself, which is nothing: 0 less 0.
-            rows.append([[names.index(p[0]), names.index(p[1]) if len(p) > 1 else -1] if p else [0, 0] for p in pairs])
-    return np.array(rows, np.int64).reshape(len(rows), len(judged), 2)
-
-
-def _likely_axis(axes: Sequence[Axis], session: Recording, name: str) -> Axis | None:
-    """The axis whose velocity has sizes that go with those of a channel most."""
-    if not axes or name not in session.channel_names:
-        return None
-    sizes = np.abs(session.column(name).astype(np.float64) - float(session.column(name).mean()))
-
-    def likeness(axis: Axis) -> float:
-        if axis.velocity not in session.channel_names or axis.velocity == name:
-            return -1.0
-        other = np.abs(session.column(axis.velocity).astype(np.float64))
-        width = float(sizes.std() * other.std())
-        return float(((sizes - sizes.mean()) * (other - other.mean())).mean()) / width if width > 0.0 else -1.0
-
-    return max(axes, key=likeness)
-
-
-def _robust_width(values: Array) -> Array:
-    """Deviation of each column, half of it from the middle of the distribution and half from all."""
-    centred = np.abs(values - np.nanmedian(values, axis=0))
-    width = 0.5 * (1.4826 * np.nanmedian(centred, axis=0) + np.sqrt(np.nanmean(np.square(centred), axis=0)))
-    widest: Array = np.where(np.nan_to_num(width) > 0.0, width, 1.0)
-    return widest
-
-
-def _operating_channels(
-    channels: Sequence[Channel], rows: Array, block: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Places of channels whose size, and of those whose level, tells the operating point."""
-    whole = rows[: len(rows) // block * block].reshape(-1, block, rows.shape[1])
-    varies = np.nan_to_num(np.nanstd(np.nanmean(whole, axis=1), axis=0)) > 0.0
-    moving = [i for i, c in enumerate(channels) if c.kind in MOVING and varies[i]]
-    level = [i for i, c in enumerate(channels) if c.kind in LEVELS and varies[i]]
-    return np.array(moving[:MOST_POINT], np.int64), np.array(level[:MOST_POINT], np.int64)
-
-
-def blocks_of(
-    summaries: BlockSummaries, sources: Sequence[ResidualSource], channels: Sequence[Channel], session: Recording
-) -> SessionBlocks:
-    """Summaries and operating points of a session."""
-    residuals = np.concatenate([residuals_of(source, [session])[0] for source in sources], axis=1)
-    rows = rows_of(session, [channel.name for channel in channels])
-    raw, points, _ = summaries.run(residuals, rows, summaries.initial_state())
-    return SessionBlocks(session.name, raw, points)
-
-
-def session_means(channels: Sequence[Channel], sessions: Sequence[Recording]) -> Array:
-    """Mean over sessions of each channel's mean, and a generous deviation between sessions, shape (2, inputs)."""
-    names = [channel.name for channel in channels]
-    means, within = [], []
-    # One session at a time: hundreds of hours in double precision would not fit into memory.
-    for session in sessions:
-        rows = rows_of(session, names).astype(np.float64)
-        means.append(rows.mean(axis=0))
-        within.append(rows.std(axis=0))
-    width = np.std(means, axis=0) + 0.25 * np.mean(within, axis=0)
-    return np.stack([np.mean(means, axis=0), np.where(width > 0.0, width, 1.0)])

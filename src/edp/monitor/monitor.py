@@ -17,6 +17,7 @@ from edp.monitor.calibration import AlarmLimit
 from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
 from edp.monitor.diagnosis.diagnose import AFTER_S, MOST_ROWS, diagnosed, onset_of
 from edp.monitor.diagnosis.signatures import Dictionary
+from edp.monitor.machine_offsets import other_machine
 from edp.monitor.residuals.base import ResidualSource, Rows, SourceState, rows_of
 from edp.recording import Recording
 from edp.settings.bounds import shown
@@ -98,6 +99,8 @@ class Monitor:
             sessions, shape (2, inputs).
         diagnosis: dictionary of faults that names causes; None where alarms have none.
         provenance: what it was fitted to.
+        scatter: of means over the start of healthy sessions, of each conditioned summary, shape (summaries,); None in
+            monitors of earlier versions.
     """
 
     channels: tuple[Channel, ...]
@@ -108,6 +111,7 @@ class Monitor:
     session_means: Array
     diagnosis: Dictionary | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    scatter: Array | None = None
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -286,6 +290,12 @@ class Monitor:
     def unlearned(self, recording: Recording) -> tuple[str, ...]:
         """Sentences on residuals that are silent in parts of a recording that healthy logs do not cover."""
         return tuple(filter(None, (source.unlearned(recording) for source in self.sources)))
+
+    def unlike(self, watched: Watched) -> str:
+        """Why a recording looks like one of another machine of the same kind; empty where it does not."""
+        if self.scatter is None:
+            return ""
+        return other_machine(self.sources, self.chain, self.scatter, watched.rows.astype(np.float64), self.block_s)
 
     def _check_machine(self, recording: Recording, lacking: Sequence[str]) -> None:
         """Refuse a log whose channels lie far from all healthy sessions."""

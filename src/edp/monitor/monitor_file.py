@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
@@ -23,18 +24,17 @@ from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_json, write_json
+from edp.storage.headers import HASH, header_digest
+from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
-    HASH,
     Bundle,
     as_damage,
     check_hash,
-    header_digest,
     load_bundle,
     read_arrays,
     save_bundle,
     write_arrays,
 )
-from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.twin_bundle import HEADER as TWIN_HEADER
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
@@ -56,6 +56,8 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
     path = make_folder(folder)
     arrays: dict[str, Any] = {f"chain.{name}": values for name, values in monitor.chain.arrays().items()}
     arrays["session_means"] = monitor.session_means
+    if monitor.scatter is not None:
+        arrays["scatter"] = monitor.scatter
     sources, written = [], set()
     for index, source in enumerate(monitor.sources):
         parts = source.parts()
@@ -167,7 +169,18 @@ def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
         raise ValueError("the means of its sessions have another shape, are not finite, or have no width")
     provenance = object_with(header["provenance"], (), "its provenance")
     limit = _limit(object_with(header["limit"], LIMIT, "its limit"))
-    return Monitor(channels, float(rate_hz), sources, chain, limit, means, None, provenance)
+    scatter = _scatter(arrays.get("scatter"), chain)
+    return Monitor(channels, float(rate_hz), sources, chain, limit, means, None, provenance, scatter)
+
+
+def _scatter(values: Any, chain: MonitorChain) -> NDArray[np.float64] | None:
+    """Of means of healthy sessions; earlier versions wrote none."""
+    if values is None:
+        return None
+    scatter = np.asarray(values, np.float64)
+    if scatter.shape != (chain.summaries.width,) or not np.isfinite(scatter).all() or not (scatter >= 0.0).all():
+        raise ValueError("the scatter of its sessions has another shape, is not finite, or below zero")
+    return scatter
 
 
 def _check_fit(sources: tuple[ResidualSource, ...], chain: MonitorChain, names: list[str]) -> None:

@@ -18,6 +18,8 @@ SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
 MOST_DRIVERS = 8
 NEAR_ZERO = 0.05
 """Variance in healthy units that is added below `gain` and `lag`: a channel at rest tells neither."""
+BLOCKS_AT_ONCE = 32
+"""Side by side: their sums stay in the processor's cache."""
 MOST_BLOCK = 1_000_000
 """Ticks of a block."""
 
@@ -103,7 +105,7 @@ class BlockSummaries:
         # Whole blocks from a block's beginning run side by side; the rest goes tick by tick. The bits are the same.
         while at < ticks:
             if state.ticks == 0 and ticks - at >= self.block:
-                blocks = (ticks - at) // self.block
+                blocks = min((ticks - at) // self.block, BLOCKS_AT_ONCE)
                 stop = at + blocks * self.block
             else:
                 blocks, stop = 1, min(ticks, at + self.block - state.ticks)

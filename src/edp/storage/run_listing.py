@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
+from edp.storage.headers import is_whole
 from edp.storage.locks import held_by
-from edp.storage.reading import parse_json, read_text
+from edp.storage.reading import parse_json, read_text, read_toml
 
 MOST_FOLDERS = 20_000
 """Folders that are looked into: more is a whole disk."""
@@ -33,6 +34,10 @@ _MARKS: Mapping[str, str] = {
     "adaptation.json": "adaptation",
 }
 """What only one kind of run has, in the order in which it decides."""
+_HEADERS = ("bundle/bundle.json", "twin/twin.json", "controller/controller.json")
+"""Of what a run made, with its arrays beside it."""
+_NETWORKS = ("network", "auto", "pretraining", "adaptation")
+"""Kinds of runs that are finished by a bundle."""
 _RUN = ("run.json", "status.json", "provenance.json", _STUDY, "auto.json")
 """One of these makes a folder a run."""
 
@@ -44,7 +49,8 @@ class ListedRun:
     Attributes:
         folder: where it is.
         kind: ``network`` or what `_MARKS` says.
-        state: ``finished``, ``running``, ``stopped``, ``diverged``, or ``damaged`` where a file cannot be read.
+        state: ``finished``, ``running``, ``stopped``, ``diverged``, or ``damaged`` where a file cannot be read, its
+            settings are no TOML, or what it made is not there or not as it was written.
         when: of its last state, as its files say; else of its files.
         data: where its recordings were.
         score: its error on test logs in words; empty where it was not judged.
@@ -110,7 +116,26 @@ def _run(path: Path) -> ListedRun:
         score = _score(scores)
     except (KeyError, TypeError, ValueError, AttributeError):
         damaged.append("scores.json")
+    damaged += _damaged_parts(path, kind if state == "finished" else "")
     return ListedRun(path, kind, "damaged" if damaged else state, when[:_LONGEST], source[:_LONGEST], score[:_LONGEST])
+
+
+def _damaged_parts(path: Path, finished: str) -> list[str]:
+    """Settings and results of a run that are damaged; of a finished one of that kind, also a result that is missing."""
+    damaged = []
+    try:
+        if (path / "config.toml").is_file():
+            read_toml(path / "config.toml")
+    except StorageError:
+        damaged.append("config.toml")
+    for name in _HEADERS:
+        file = path / name
+        try:
+            missing = name == _HEADERS[0] and finished in _NETWORKS
+            damaged += [name] if (not is_whole(file) if file.is_file() else missing) else []
+        except (StorageError, ValueError):
+            damaged.append(name)
+    return damaged
 
 
 def _part(file: Path, damaged: list[str]) -> Mapping[str, Any]:

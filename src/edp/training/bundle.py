@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,6 +31,7 @@ from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain
 from edp.networks.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, read_json, write_bytes, write_json
+from edp.storage.headers import ARRAYS_BYTES, HASH, arrays_digest, header_digest
 
 SCHEMA = 8
 INTEGER_SCHEMA = 9
@@ -42,10 +42,6 @@ UNHASHED = {2: SCHEMA, 3: INTEGER_SCHEMA, 4: ADAPTED_SCHEMA}
 """Schemas from before the header had a hash, and what they became."""
 REWORDED = {5: SCHEMA, 6: INTEGER_SCHEMA, 7: ADAPTED_SCHEMA}
 """Schemas with the keys `lesson` for ``strategy`` and `rest` for ``dead_zone``, and what they became."""
-WEIGHTS_BYTES = 2**30
-"""Most that a file of arrays has; the weights of 250 million parameters."""
-HASH = "blake2b"
-"""Key of the hash over the rest of the header."""
 HEADER = "bundle.json"
 ARRAYS = ("weights", "integers", "adaptation")
 """Beginnings of the names of a bundle's files of arrays."""
@@ -117,7 +113,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         )
     path = make_folder(folder)  # an old bundle stays valid until the header is renamed
     data = _weights_bytes(bundle.predictor)
-    digest = hashlib.blake2b(data, digest_size=16).hexdigest()
+    digest = arrays_digest(data)
     # Names by content: a reader of the old header never finds new weights under the old name.
     weights = f"weights-{digest[:12]}.safetensors"
     write_bytes(path / weights, data)
@@ -163,18 +159,10 @@ def _integers_bytes(predictor: IntegerPredictor) -> bytes:
 
 def write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
     """Write arrays beside the weights; returns file and digest."""
-    digest = hashlib.blake2b(data, digest_size=16).hexdigest()
+    digest = arrays_digest(data)
     file = f"{what}-{digest[:12]}.safetensors"
     write_bytes(path / file, data)
     return {"file": file, "blake2b": digest}
-
-
-def header_digest(header: Mapping[str, Any]) -> str:
-    """Hash over all of a header but its hash: what is fed and predicted, and in which order, is under it."""
-    # One round through JSON: the hash is over what a reader will see, tuples as lists.
-    plain = json.loads(json.dumps({key: value for key, value in header.items() if key != HASH}, allow_nan=False))
-    text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def load_bundle(folder: str | Path) -> Bundle:
@@ -381,8 +369,8 @@ def read_arrays(path: Path, entry: Mapping[str, str]) -> bytes:
     file = path / Path(_text(entry["file"])).name  # never a path out of the bundle
     if not os.path.lexists(file):
         raise BundleError(f"bundle '{path}' lacks its weights '{file.name}'; restore the bundle")
-    data = read_bytes(file, WEIGHTS_BYTES, f"weights '{file}'", BundleError)
-    if hashlib.blake2b(data, digest_size=16).hexdigest() != entry["blake2b"]:
+    data = read_bytes(file, ARRAYS_BYTES, f"weights '{file}'", BundleError)
+    if arrays_digest(data) != entry["blake2b"]:
         raise BundleError(f"weights '{file}' do not match their digest: cut off or changed; restore the bundle")
     return data
 

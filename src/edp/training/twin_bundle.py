@@ -21,8 +21,9 @@ from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_json, write_json
+from edp.storage.headers import HASH, header_digest
 from edp.storage.memory import check_setting
-from edp.training.bundle import HASH, Bundle, as_damage, check_hash, header_digest, read_arrays, write_arrays
+from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, write_arrays
 
 SCHEMA = 2
 GROUNDED = 3

@@ -292,8 +292,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     notes = [] if not look.part else [f"{look.path.name}: looked at {look.part}"]
     notes += [f"{count} column(s) {reason}: left out" for reason, count in look.left_out.items()]
     notes += shape_notes(look)
-    if clock.check:
-        notes.append(f"time: {clock.check}")
+    notes += [f"time: {clock.check}"] if clock.check else []
     rows = sum(look.rows for look in group.looks) * len(group.paths) / len(group.looks)
     rate = clock.wanted_hz or clock.rate_hz
     rows *= rate / clock.rate_hz if rate and clock.rate_hz else 1.0
@@ -306,6 +305,8 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     for other in others:
         names = ", ".join(path.name[:40] for path in other.paths[:3])
         notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")
+    roles = {guess.role for guess in proposal.columns}
+    notes += ["labels: those that are known while the machine works may be features"] * ("label" in roles)
     notes += [f"not readable: {reason[:300]}" for reason in list(broken.values())[:3]]
     if len(broken) > 3:
         notes.append(f"{len(broken) - 3} more logs are not readable")

@@ -92,6 +92,21 @@ def test_wide_tables_are_parted_into_blocks(capsys, monkeypatch):
     assert capsys.readouterr().out.replace("\n", "").count("x") == 90
 
 
+@pytest.mark.parametrize("show", [console.table, console.listing])
+@pytest.mark.parametrize("name", [9, 60, 200])
+@pytest.mark.parametrize("cell", [3, 70, 300])
+def test_no_character_of_a_table_is_lost_at_80_columns_however_wide_it_is(capsys, monkeypatch, show, name, cell):
+    monkeypatch.setattr(console.out, "_width", 80)
+    rows = [[f"CylPressures_{n}".ljust(name, "x"), "over: ".ljust(cell - 1, "y") + str(n), "5"] for n in range(3)]
+    show("", ["name", "budget", "k"], rows)
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 80
+    packed = "".join(shown.split())
+    for letter, wanted in (("x", 3 * max(name - 14, 0)), ("y", 3 * max(cell - 7, 0))):
+        assert packed.count(letter) >= wanted
+    assert all(f"CylPressures_{n}" in shown for n in range(3))
+
+
 def test_what_takes_long_says_so_again_until_it_ends(capsys):
     with console.waiting("compiling", every_s=0.01):
         for _ in range(500):

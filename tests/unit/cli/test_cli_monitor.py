@@ -104,6 +104,27 @@ def test_too_few_hours_are_one_message_before_anything_is_written(edp, healthy, 
     assert not (tmp_path / "m").exists() or not any((tmp_path / "m").iterdir())
 
 
+def test_what_is_remarked_of_logs_stands_on_the_page_and_a_damaged_remark_is_refused(edp, fitted, tmp_path):
+    out = tmp_path / "watched"
+    assert edp("monitor", "run", fitted, write(logs(1, first=42), tmp_path / "day"), "--out", out).code in (0, 5)
+    run = json.loads((out / "run.json").read_text())
+    assert run["unlike"] == {}
+    (out / "run.json").write_text(json.dumps(run | {"unlike": {"<b>monday": "all axes are off"}}))
+    assert edp("monitor", "report", out).code == 0
+    assert "Of &lt;b&gt;monday: all axes are off." in (out / "report.html").read_text()
+    for damaged in ([], {"monday": 3}, {"monday": "x" * 5000}, {"monday": ["a", None]}):
+        (out / "run.json").write_text(json.dumps(run | {"unlike": damaged}))
+        ended = edp("monitor", "report", out)
+        assert ended.code == 1
+        assert "run the monitor again" in " ".join(ended.err.split())
+
+
+def test_logs_in_two_folders_are_told_to_be_put_into_one(edp, healthy, tmp_path):
+    ended = edp("monitor", "fit", healthy, healthy, "--out", tmp_path / "m")
+    assert ended.code == 1
+    assert "put them into one folder" in " ".join(ended.err.split())
+
+
 def test_bad_input_is_one_message(edp, fitted, healthy, tmp_path):
     folder = fitted
     for arguments in (

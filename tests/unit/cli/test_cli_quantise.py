@@ -16,6 +16,8 @@ def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, t
     whole = tmp_path / "whole"
     found = edp("quantise", trained, "--out", whole, "--ticks", 1000, "--json").json
     assert 0 < found["integer"] < 1.2 * found["float"]
+    (listed,) = edp("runs", whole, "--json").json["runs"]
+    assert listed["state"] == "finished"
     network = load_bundle(whole).predictor
     assert isinstance(network, IntegerPredictor)
     other = load_bundle(trained).predictor

@@ -5,7 +5,8 @@ import json
 import pytest
 
 from edp.cli import doctor as doctor_command
-from edp.storage import run_listing
+from edp.storage import run_listing, write_bytes, write_json
+from edp.storage.headers import HASH, arrays_digest, header_digest
 from edp.storage.locks import hold
 
 
@@ -15,6 +16,14 @@ def run(folder, **files):
         text = content if isinstance(content, str) else json.dumps(content)
         (folder / f"{name}.json").write_text(text)
     return folder
+
+
+def bundle(folder):
+    """What a finished training leaves, as far as a listing looks."""
+    write_bytes(folder / "bundle" / "weights.safetensors", b"weights")
+    header = {"schema": 8, "weights": {"file": "weights.safetensors", HASH: arrays_digest(b"weights")}}
+    write_json(folder / "bundle" / "bundle.json", header | {HASH: header_digest(header)})
+    (folder / "config.toml").write_text("[task]\n")
 
 
 def scores(*targets, error=1.5):
@@ -31,6 +40,7 @@ def folder(tmp_path):
     later = {"status": "running", "time": "2026-02-02T03:04:05+0000"}
     data = {"data": {"source": "/logs/a"}}
     run(tmp_path / "one", run={}, status=status, provenance=data, scores=scores(("v", "mm/s"), ("w", "mm/s")))
+    bundle(tmp_path / "one")
     run(tmp_path / "one" / "parts" / "0", run={}, status=status)  # of the run, not one of its own
     run(tmp_path / "deep" / "er" / "two", run={}, status=later, scores=scores(("v", "1"), ("x", "1")), auto={})
     run(tmp_path / "study", study={})
@@ -70,6 +80,34 @@ def test_hostile_runs_are_damaged_and_bounded(edp, folder, monkeypatch):
     assert "\x1b" not in edp("runs", folder).out
     monkeypatch.setattr(run_listing, "MOST_FOLDERS", 2)
     assert not edp("runs", folder, "--json").json["complete"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("bundle/bundle.json", b"{"),
+        ("bundle/bundle.json", b'{"schema": 8, "blake2b": "0"}'),
+        ("bundle/bundle.json", None),
+        ("bundle/weights.safetensors", b"weight"),
+        ("bundle/weights.safetensors", None),
+        ("config.toml", b"[task"),
+    ],
+)
+def test_a_finished_run_of_which_a_part_is_damaged_or_gone_is_damaged(edp, folder, name, content):
+    file = folder / "one" / name
+    file.unlink()
+    if content is not None:
+        file.write_bytes(content)
+    rows = {row["folder"]: row["state"] for row in edp("runs", folder, "--json").json["runs"]}
+    assert rows[f"{folder}/one"] == "damaged"
+
+
+def test_a_header_leads_to_no_file_outside_of_its_folder(edp, folder):
+    (folder / "secret").write_bytes(b"weights")
+    header = {"weights": {"file": "../../secret", HASH: arrays_digest(b"weights")}}
+    write_json(folder / "one" / "bundle" / "bundle.json", header | {HASH: header_digest(header)})
+    rows = {row["folder"]: row["state"] for row in edp("runs", folder, "--json").json["runs"]}
+    assert rows[f"{folder}/one"] == "damaged"
 
 
 def test_no_runs_and_no_folder(edp, tmp_path):

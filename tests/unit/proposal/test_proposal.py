@@ -8,11 +8,13 @@ import os
 import shlex
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from edp.cli import app
+from edp.cli import init as init_command
 from edp.cli.console import run_app
 from edp.config.twin import load_twin_experiment
 from edp.data.twin_channels import twin_channels
@@ -385,3 +387,20 @@ def test_command_writes_nothing_on_a_no(edp, cylinder, tmp_path, monkeypatch):
     assert "nothing was written" in message
     assert "to predict: v_Zyl" in shown
     assert os.listdir(tmp_path) == []
+
+
+def test_numbered_columns_that_are_taken_for_the_same_stand_in_one_row_and_no_name_is_hidden():
+    long = [f"front_loader_cylinder_{side}_of_the_second_machine_beside_the_river_bank" for side in ("rod", "head")]
+    names = ["p0", "p1", "p2", "p3", "q1", "q2", "r1", "s7", "s8", "s10", "x_1_a", "x_2_a", "x_3_a", "x_4_b", *long]
+
+    def guessed(name):
+        kind = SimpleNamespace(kind="pressure", unit="bar" if name != "p3" else "Pa")
+        return SimpleNamespace(
+            column=name, channel=name, role="measured", kind=kind, sureness="sure", check="", why="w"
+        )
+
+    shown = [row[0] for row in init_command._rows([guessed(name) for name in names])]
+    assert shown[:5] == ["p0 to p2", "p3", "q1", "q2", "r1"]
+    assert shown[5:10] == ["s7", "s8", "s10", "x_1_a to x_3_a", "x_4_b"]
+    assert len(set(shown)) == len(shown)
+    assert all(len(name) <= 60 for name in shown)

@@ -167,6 +167,13 @@ def test_a_damaged_part_is_named(run_folder, name):
         read_facts(run_folder)
 
 
+@pytest.mark.parametrize("content", [b"[task", b"\xff\xfe", b"a = 1\na = 2\n"])
+def test_damaged_settings_are_named_and_not_shown(run_folder, content):
+    (run_folder / "config.toml").write_bytes(content)
+    with pytest.raises(StorageError, match=r"config\.toml"):
+        read_facts(run_folder)
+
+
 def test_scores_and_predictions_of_different_evaluations_are_refused(run_folder):
     edit_scores(run_folder, lambda scores: scores["task"].update(horizons=[1, 10]))
     with pytest.raises(DataError, match="edp evaluate"):

@@ -232,7 +232,7 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
     brief = word == "command" and rows < _LEAST_SWITCHES * (rate_hz or 1.0) / _SWITCHED_HZ[word]
     if behaviour.switches and seldom and not brief:
         sure = min(0.85 if word == "label" else 0.7, max(kind.confidence, BOUND))
-        check = kind.check if kind.kind is not Kind.GENERIC and kind.check else "known on the machine? then a feature"
+        check = kind.check if kind.kind is not Kind.GENERIC and kind.check else "a feature?"
         return ColumnGuess(name, name, "label", kind, sure, f"{behaviour.levels} values, seldom changed", check)
     return None
 

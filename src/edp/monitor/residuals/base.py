@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -224,6 +224,8 @@ class ResidualSpec(ABC):
         """
 
 
+SideBySide = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
+"""What calls a function for each of some jobs, and gives what comes of them in their order; `map` does."""
 RESIDUALS: Registry[type[ResidualSpec]] = Registry("residual")
 
 

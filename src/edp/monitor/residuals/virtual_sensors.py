@@ -122,20 +122,35 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
+        bundles = {}
+        groups = self.groups(material)
+        for group in groups:
+            material.note(f"virtual sensors of {group.name}")
+            bundle = self.network(group, material, len(groups))
+            if bundle is not None:
+                bundles[group.name] = bundle
+        return self.together(bundles, material)
+
+    def groups(self, material: FitMaterial) -> tuple[Group, ...]:
+        """Channels that a network each judges together."""
         if material.groups:
             groups: tuple[Group, ...] = tuple(Group(" and ".join(names), names) for names in material.groups)
         else:
             groups = groups_of(material.channels)
         constant = constant_channels(material)
-        material = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
+        changing = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
         groups = tuple(replace(g, judged=tuple(n for n in g.judged if n not in constant)) for g in groups)
-        groups = tuple(group for group in groups if group.judged and self._fed(group, material))
-        bundles = {}
-        for group in groups:
-            material.note(f"virtual sensors of {group.name}")
-            bundle = self._fitted(group, material, 0.8 * material.minutes / len(groups))
-            if bundle is not None:
-                bundles[group.name] = bundle
+        return tuple(group for group in groups if group.judged and self._fed(group, changing))
+
+    def network(self, group: Group, material: FitMaterial, networks: int) -> Bundle | None:
+        """The network of a group, in its part of the time of so many; None where it explains none of its channels."""
+        constant = constant_channels(material)
+        changing = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
+        return self._fitted(group, changing, 0.8 * material.minutes / networks)
+
+    @staticmethod
+    def together(bundles: dict[str, Bundle], material: FitMaterial) -> VirtualSensors | None:
+        """The source of these networks; None without any."""
         if not bundles:
             return None
         used = {name for b in bundles.values() for name in (*b.task.inputs, *b.task.targets)}

@@ -168,8 +168,8 @@ class ElementsTwin(Twin):
         for tank in parts.tanks:
             pump = self.inputs.get(tank.source, -1)
             above = -1 if pump >= 0 else names.index(tank.source)
-            place = (self.columns[tank.level], -1) if tank.level else (-1, next(unseen))
-            tanks.append((pump, above, *place, self._first(tank.name)))
+            level = (self.columns[tank.level], -1) if tank.level else (-1, next(unseen))
+            tanks.append((pump, above, *level, self._first(tank.name)))
         rows = (np.array(some, np.int64).reshape(-1, wide) for some, wide in ((lags, 3), (masses, 3), (tanks, 5)))
         low, high, widths = (part.astype(np.float64) for part in (scales.low, scales.high, scales.command_width))
         facts = (self.spec.steps, len(channels.velocities), bool(channels.strokes))
@@ -178,7 +178,7 @@ class ElementsTwin(Twin):
 
     def _first(self, element: str) -> int:
         """Place of the first number of an element."""
-        return min(place for (owner, _), place in self.places.items() if owner == element)
+        return min(index for (owner, _), index in self.places.items() if owner == element)
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         answer, hidden = (np.array(state[name], np.float32, order="C") for name in ("answer", "hidden"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
@@ -20,6 +20,7 @@ MOST_ALARMS = 40
 """With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
 MOST_CAUSES = 5
 MOST_SILENT = 6
+MOST_REMARKS = 6
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class MonitorFacts:
         confusions: faults of the dictionary that cannot be told apart; empty without one.
         classes: how many faults the dictionary has; 0 without one.
         provenance: name and text of where it comes from.
+        remarks: by what is to be said of recordings, beside their alarms, names of these.
     """
 
     title: str
@@ -71,6 +73,7 @@ class MonitorFacts:
     confusions: Sequence[Confusion] = ()
     classes: int = 0
     provenance: Sequence[tuple[str, str]] = ()
+    remarks: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def trace_of(self, alarm: AlarmFacts) -> RecordingTrace | None:
         """The trace of the recording of an alarm."""
@@ -135,6 +138,9 @@ def verdict(facts: MonitorFacts) -> list[str]:
     if silent:
         shown = listed(silent[:MOST_SILENT]) + (f" and {len(silent) - MOST_SILENT} more" * (len(silent) > MOST_SILENT))
         lines.append(f"Silent for want of channels in some recordings: {shown}; faults that only they show go unseen.")
+    for remark, names in list(facts.remarks.items())[:MOST_REMARKS]:
+        others = f" and {len(names) - 1} more" * (len(names) > 1)
+        lines.append(f"Of {short_label(names[0])}{others}: {remark}.")
     if facts.classes == 0 and facts.alarms:
         lines.append("The monitor has no dictionary of faults: alarms say which residuals changed, not why.")
     return [line for line in lines if line]

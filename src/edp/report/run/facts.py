@@ -17,7 +17,7 @@ from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
-from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
+from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
 
 NETWORK = "network"
 TRUTH = "truth"
@@ -144,7 +144,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
     provenance = json_part("provenance.json")
     facts = Facts(
         folder=folder,
-        config=None if "config.toml" in absent else read_text(folder / "config.toml", SETTINGS_BYTES),
+        config=None if "config.toml" in absent else read_settings(folder / "config.toml"),
         provenance=provenance,
         history=() if "history.jsonl" in absent else read_history(folder / "history.jsonl"),
         scores=None if "scores.json" in absent else read_scores(folder / "scores.json"),
@@ -156,6 +156,20 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
     )
     _check_predictions(facts)
     return facts
+
+
+def read_settings(path: Path) -> str:
+    """The text of a run's settings, which is TOML.
+
+    Raises:
+        StorageError: it cannot be read, or is none.
+    """
+    text = read_text(path, SETTINGS_BYTES)
+    try:
+        parse_toml(text, f"'{path}'")
+    except StorageError as error:
+        raise StorageError(f"{error}; it was cut off or changed by hand: restore it, or train the run anew") from error
+    return text
 
 
 def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:

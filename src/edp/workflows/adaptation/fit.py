@@ -61,6 +61,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json(Budget()))
         facts = replay(bundle.predictor, adaptation, data.test).to_json(data.task, data.target_kinds)
         write_json(target.file("adaptation.json"), facts)
+        target.write_status("finished")
     return adaptation, facts
 
 

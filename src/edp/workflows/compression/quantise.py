@@ -52,4 +52,5 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         write_json(target.file("provenance.json"), provenance | {"number_format": integer_network.number_format})
         # Scores are those of the float network; they would be wrong for the integer one.
         save_bundle(replace(bundle, predictor=integer_network, scores={}), target.file("bundle"))
+        target.write_status("finished")
     return errors | {"bytes": float(constant_bytes(integer_network.integers, bundle.adaptation))}

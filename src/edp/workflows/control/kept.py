@@ -32,7 +32,8 @@ from edp.sim.environment import NominalMachine
 from edp.sim.machine.machine_checks import MACHINE_FILE
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, object_with, read_json, write_bytes, write_json
-from edp.training.bundle import HASH, as_damage, check_hash, header_digest, read_arrays, write_arrays
+from edp.storage.headers import HASH, header_digest
+from edp.training.bundle import as_damage, check_hash, read_arrays, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 KEPT, HEADER, MACHINE, TWIN = "controller", "controller.json", "machine.toml", "twin"

@@ -364,10 +364,17 @@ def _interrupts(stop: asyncio.Event) -> Iterator[None]:
     """Ctrl-C and the system's request end the session, and files are finished; only the main thread hears them."""
     loop = asyncio.get_running_loop()
     signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    handlers_before = {number: signal.getsignal(number) for number in signals}
     for number in signals:
-        loop.add_signal_handler(number, stop.set)
+        try:
+            loop.add_signal_handler(number, stop.set)
+        except NotImplementedError:  # the loops of Windows, which a plain handler has to wake
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
     try:
         yield
     finally:
         for number in signals:
-            loop.remove_signal_handler(number)
+            with contextlib.suppress(NotImplementedError):
+                loop.remove_signal_handler(number)
+            # None: a handler that is not Python's cannot be set again.
+            signal.signal(number, handlers_before[number] or signal.SIG_DFL)

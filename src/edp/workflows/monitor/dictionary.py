@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from edp.monitor.diagnosis.evidence import ONSET, mean_features, parts_of
 from edp.monitor.diagnosis.learning import SimulatedFault, fit_dictionary
 from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.monitor import Monitor
+from edp.monitor.residuals.base import SideBySide
 from edp.recording import MACHINE, Recording
 from edp.sim.machine.machine_files import machine_names
 from edp.workflows.monitor.fault_sessions import (
@@ -63,6 +64,7 @@ def build_dictionary(
     spec: DictionarySpec,
     seed: int = 0,
     note: Note | None = None,
+    side_by_side: SideBySide | None = None,
 ) -> Dictionary:
     """Simulate every fault at every site and size on a machine and learn what the monitor sees of it.
 
@@ -75,6 +77,8 @@ def build_dictionary(
         spec: how.
         seed: root of every random choice.
         note: called with what is done, how much of it is, and how much there is.
+        side_by_side: calls a function for each of some jobs, such as in processes; then all draws are made, whatever
+            the time, and nothing is noted of single sessions.
 
     Raises:
         ConfigError: a machine that lacks the monitor's channels.
@@ -87,13 +91,11 @@ def build_dictionary(
         raise DataError("a dictionary needs healthy sessions that no network was fitted to; bring more")
     classes = fault_classes(spec.kinds or None)
     plan = _Plan(machine, (spec.before_s, spec.after_s), seed, _missing_noise(monitor, healthy, machine, seed))
+    jobs = [_DrawJob(monitor, classes, plan, draw) for draw in range(spec.draws)]
     faults: list[SimulatedFault] = []
     draws = 0
-    for draw in range(spec.draws):
-        spent = time.process_time() - began
-        if draw >= 2 and spent * (draw + 1) / draw > 60.0 * spec.minutes:
-            break
-        faults += _draw(monitor, classes, plan, draw, note)
+    for part in side_by_side(_drawn, jobs) if side_by_side is not None else _in_time(jobs, spec, began, note):
+        faults += part
         draws += 1
     provenance: dict[str, Any] = {
         "machine": machine, "seed": seed, "draws": draws, "sessions": len(faults),
@@ -110,6 +112,34 @@ class _Plan:
     seconds: tuple[float, float]
     seed: int
     added: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _DrawJob:
+    monitor: Monitor
+    classes: Sequence[FaultClass]
+    plan: _Plan
+    number: int
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return f"draw {self.number + 1} of the dictionary"
+
+
+def _drawn(job: _DrawJob, note: Note | None = None) -> list[SimulatedFault]:
+    return _draw(job.monitor, job.classes, job.plan, job.number, note)
+
+
+def _in_time(
+    jobs: Sequence[_DrawJob], spec: DictionarySpec, began: float, note: Note | None
+) -> Iterator[list[SimulatedFault]]:
+    """One draw after the other, two at least, until the next would pass the time."""
+    for draw, job in enumerate(jobs):
+        spent = time.process_time() - began
+        if draw >= 2 and spent * (draw + 1) / draw > 60.0 * spec.minutes:
+            return
+        yield _drawn(job, note)
 
 
 def _draw(

@@ -12,13 +12,17 @@ from typing import Any
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import ConfigError, DataError, closest
+from edp.errors import BundleError, ConfigError, DataError, closest
 from edp.logs.source import DataSource
-from edp.monitor.fitting import doubtful_sessions, fit_chain, session_means
+from edp.monitor.fitting import doubtful_sessions, fit_chain
+from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import save_monitor
-from edp.monitor.residuals.base import FitMaterial, ResidualSource, note_nothing
-from edp.monitor.residuals.groups import sensed_channels
+from edp.monitor.residuals.base import FitMaterial, ResidualSource, ResidualSpec, SideBySide, note_nothing
+from edp.monitor.residuals.flow_balances import FlowBalances
+from edp.monitor.residuals.groups import Group, sensed_channels
+from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
+from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.recording import Recording
 from edp.signals import Channel
 from edp.storage import check_writable, write_bytes
@@ -46,12 +50,16 @@ class FittedMonitor:
         doubtful: names of healthy sessions that were left out.
         seconds: processor time.
         folder: where it lies; None where it was not saved.
+        sessions: blocks of those that set the limit.
+        one_machine: it knows the machine of the logs so well that others of its series raise alarms.
     """
 
     monitor: Monitor
     doubtful: tuple[str, ...]
     seconds: float
     folder: Path | None = None
+    sessions: tuple[SessionBlocks, ...] = ()
+    one_machine: bool = False
 
 
 def fit_monitor(
@@ -74,12 +82,26 @@ def fit_monitor(
         EdpError: runs or logs that cannot be used, or too few hours for the promise.
     """
     check_writable(out)
-    bundles = [load_twin(run) if holds_twin(run) else load_bundle(run) for run in runs]
+    bundles = [_network_of(run) for run in runs]
     recordings = source.read()
     fitted = fit_to_recordings(recordings, experiment, bundles, note)
     folder = save_monitor(fitted.monitor, out)
     write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
-    return FittedMonitor(fitted.monitor, fitted.doubtful, fitted.seconds, folder)
+    return replace(fitted, folder=folder)
+
+
+def _network_of(run: str | Path) -> Bundle | TwinBundle:
+    """The network or twin of a run.
+
+    Raises:
+        BundleError: it holds none, or is damaged.
+    """
+    try:
+        return load_twin(run) if holds_twin(run) else load_bundle(run)
+    except BundleError as error:
+        if any((Path(run) / name).exists() for name in ("bundle", "bundle.json", "run.json", "twin")):
+            raise
+        raise BundleError(f"{error}; healthy logs are the last argument alone: put them into one folder") from error
 
 
 @one_blas_thread()
@@ -89,8 +111,17 @@ def fit_to_recordings(
     bundles: Sequence[Bundle | TwinBundle] = (),
     note: Callable[[str], None] = note_nothing,
     again: bool = False,
+    side_by_side: SideBySide = map,
 ) -> FittedMonitor:
-    """`fit_monitor` without files; `again` says that doubtful sessions were left out of the training before.
+    """`fit_monitor` without files.
+
+    Args:
+        recordings: healthy logs.
+        experiment: settings.
+        bundles: networks and twins of this machine.
+        note: called with what begins.
+        again: doubtful sessions were left out of the training before.
+        side_by_side: calls a function for each of some jobs, such as in processes.
 
     Raises:
         EdpError: recordings that cannot be used, or too few hours for the promise.
@@ -113,17 +144,19 @@ def fit_to_recordings(
         minutes=experiment.minutes,
         note=note,
     )
-    sources = _sources(experiment, material)
-    fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note)
+    sources = _sources(experiment, material, side_by_side)
+    fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note, side_by_side)
     if not again:
         note("sessions that trained, compared with the others")
-        trained = doubtful_sessions(fitted, experiment.chain, sources, channels, (*train, *validation))
+        trained = doubtful_sessions(
+            fitted, experiment.chain, sources, channels, (*train, *validation), side_by_side
+        )  # fmt: skip
         if trained:
             note(f"once more without {', '.join(trained)}")
             left = [session for session in sessions if session.name not in trained]
-            better = fit_to_recordings(left, experiment, bundles, note, again=True)
+            better = fit_to_recordings(left, experiment, bundles, note, True, side_by_side)
             seconds = time.process_time() - began
-            return FittedMonitor(better.monitor, (*trained, *better.doubtful), seconds)
+            return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
     provenance: dict[str, Any] = {
         "sessions": len(sessions),
         "hours": sum(session.duration_s for session in sessions) / 3600.0,
@@ -141,10 +174,13 @@ def fit_to_recordings(
         fitted.limit,
         session_means(channels, sessions),
         provenance=provenance,
+        scatter=scatter_of(fitted.chain, fitted.sessions, fitted.chain.summaries.block / recordings[0].rate_hz),
     )
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     monitor = _with_dictionary(monitor, healthy, experiment, note)
-    return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began)
+    one_machine = not experiment.chain.tolerance and any(isinstance(source, FlowBalances) for source in sources)
+    seconds = time.process_time() - began
+    return FittedMonitor(monitor, fitted.doubtful, seconds, None, fitted.sessions, one_machine)
 
 
 def _with_dictionary(
@@ -216,14 +252,49 @@ def _enough_sessions(recordings: Sequence[Recording]) -> list[Recording]:
     return pieces
 
 
-def _sources(experiment: MonitorExperiment, material: FitMaterial) -> tuple[ResidualSource, ...]:
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A source to fit, or the network of one group of virtual sensors."""
+
+    spec: ResidualSpec
+    material: FitMaterial
+    group: Group | None = None
+    groups: int = 1
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return type(self.spec).__name__ if self.group is None else f"virtual sensors of {self.group.name}"
+
+
+def _fit_source(job: _Fit) -> ResidualSource | Bundle | None:
+    if isinstance(job.spec, VirtualSensorsSpec) and job.group is not None:
+        job.material.note(job.label)
+        return job.spec.network(job.group, job.material, job.groups)
+    return job.spec.fit(job.material)
+
+
+def _sources(
+    experiment: MonitorExperiment, material: FitMaterial, side_by_side: SideBySide = map
+) -> tuple[ResidualSource, ...]:
     """The settings' residuals that find something to judge.
 
     Raises:
         DataError: none does.
     """
-    fits = [spec.fit(material) for spec in experiment.residuals]
-    sources = tuple(source for source in fits if source is not None)
+    jobs = []
+    for spec in experiment.residuals:
+        groups = spec.groups(material) if isinstance(spec, VirtualSensorsSpec) else (None,)
+        jobs += [_Fit(spec, material, group, len(groups)) for group in groups]
+    fits: dict[ResidualSpec, ResidualSource | None] = {}
+    networks: dict[ResidualSpec, dict[str, Bundle]] = {}
+    for job, result in zip(jobs, side_by_side(_fit_source, jobs), strict=True):
+        if job.group is None:
+            fits[job.spec] = result
+        elif result is not None:
+            networks.setdefault(job.spec, {})[job.group.name] = result
+            fits[job.spec] = VirtualSensorsSpec.together(networks[job.spec], material)
+    sources = tuple(source for spec in experiment.residuals if (source := fits.get(spec)) is not None)
     if not sources:
         raise DataError(
             "none of the settings' residuals finds something to judge in these channels; name further channels or "

@@ -20,7 +20,7 @@ from edp.workflows.monitor.run_monitor import ALARM_LOG, RUN
 
 PAGE = "report.html"
 LONGEST = 4096
-MOST_ALARMS, MOST_EVIDENCE, MOST_CAUSES = 100_000, 64, 64
+MOST_ALARMS, MOST_EVIDENCE, MOST_CAUSES, MOST_REMARKED = 100_000, 64, 64, 100_000
 
 
 def report_monitor(
@@ -71,7 +71,25 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
         confusions,
         classes,
         provenance_rows({key: value for key, value in content.items() if isinstance(value, str)}),
+        _remarks(content, where),
     )
+
+
+def _remarks(content: Mapping[str, Any], where: str) -> dict[str, list[str]]:
+    """What is to be said of recordings, with their names; runs of earlier versions have less of it.
+
+    Raises:
+        StorageError: it is damaged.
+    """
+    remarks: dict[str, list[str]] = {}
+    for key in ("unlike", "unlearned"):
+        entries = content.get(key, {})
+        if not isinstance(entries, dict) or len(entries) > MOST_REMARKED:
+            raise StorageError(f"{where}: {key} must be an object of at most {MOST_REMARKED}; run the monitor again")
+        for name, texts in entries.items():
+            for remark in texts if isinstance(texts, list) else [texts]:
+                remarks.setdefault(_text(remark, where), []).append(_text(name, where))
+    return remarks
 
 
 def read_alarms(file: Path) -> list[AlarmFacts]:

@@ -46,6 +46,7 @@ class MonitorRun:
         silent: by recording, channels that it lacks.
         traces: statistics and levels of residual groups, block by block.
         unlearned: by recording, sentences on residuals that are silent where healthy logs were never.
+        unlike: by recording, why it looks like one of another machine of the same kind.
     """
 
     monitor: Monitor
@@ -55,6 +56,7 @@ class MonitorRun:
     silent: dict[str, tuple[str, ...]]
     traces: RunTraces
     unlearned: dict[str, tuple[str, ...]]
+    unlike: dict[str, str]
 
     @property
     def changes(self) -> list[list[MonitorAlarm]]:
@@ -68,6 +70,7 @@ class MonitorRun:
             "recordings": list(self.recordings),
             "silent": {name: list(channels) for name, channels in self.silent.items()},
             "unlearned": {name: list(reasons) for name, reasons in self.unlearned.items()},
+            "unlike": dict(self.unlike),
             "promise": self.monitor.limit.sentence(),
             "alarms": [alarm.to_json() for alarm in self.alarms],
         }
@@ -94,6 +97,7 @@ def run_monitor(
     alarms: list[MonitorAlarm] = []
     silent: dict[str, tuple[str, ...]] = {}
     unlearned: dict[str, tuple[str, ...]] = {}
+    unlike: dict[str, str] = {}
     traces: list[RecordingTrace] = []
     if out is not None:
         check_writable(out)
@@ -110,6 +114,9 @@ def run_monitor(
             unlearned[recording.name] = reasons
         start = str(recording.meta.get(START, ""))
         watched = monitor.watch(recording, start_time(start))
+        reason = monitor.unlike(watched)
+        if reason:
+            unlike[recording.name] = reason
         alarms += watched.alarms
         traces.append(trace_of(monitor, recording, watched, groups, start))
         hours += recording.duration_s / 3600.0
@@ -117,7 +124,7 @@ def run_monitor(
     names = tuple(recording.name for recording in recordings)
     run = MonitorRun(
         monitor, tuple(alarms), hours, names, silent,
-        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)), unlearned,
+        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)), unlearned, unlike,
     )  # fmt: skip
     if out is not None:
         _write(run, Path(out), str(folder))
@@ -170,6 +177,7 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
         "recordings": len(run.recordings),
         "silent": {name: list(channels) for name, channels in run.silent.items()},
         "unlearned": {name: list(reasons) for name, reasons in run.unlearned.items()},
+        "unlike": dict(run.unlike),
         "classes": 0 if dictionary is None else len(dictionary.classes),
         "confusions": [] if dictionary is None else [asdict(pair) for pair in dictionary.confusions],
     }

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-RUN = "run.json"
-"""Training, distillation, quantisation and adaptation write it beside a bundle; a bundle that is passed on has none."""
+RUN = ("run.json", "provenance.json")
+"""Training and distillation write both beside a bundle, quantisation and adaptation the second; a bundle that is passed
+on has neither."""
 WHAT = (
     "edp parity writes C, Python and MATLAB code of this network, compiles it and runs it on this computer with your "
     "rights. The code holds numbers and sizes of the bundle, and its text in comments and strings only"
@@ -20,6 +21,7 @@ def from_own_run(path: str | Path) -> bool:
     folder = Path(path)
     return any(
         # The bundle of a run lies one folder below it.
-        (candidate / RUN).is_file()
+        (candidate / name).is_file()
         for candidate in (folder, *([folder.parent] if folder.name == "bundle" else []))
+        for name in RUN
     )
