@@ -51,7 +51,7 @@ class Trainer:
 
 
 @dataclass(frozen=True, eq=False)
-class Portfolio:
+class TrainedPortfolio:
     """Every candidate, trained.
 
     Attributes:
@@ -67,7 +67,7 @@ class Portfolio:
 
 def train_portfolio(
     settings: AutoSettings, data: Prepared, amount: Amount, folder: Path, trainer: Trainer
-) -> Portfolio:
+) -> TrainedPortfolio:
     """Train every candidate that suits the data.
 
     Where a recurrent network is among them it first trains for a share of its time. Unless it comes near the linear
@@ -86,7 +86,7 @@ def train_portfolio(
     """
     experiments = _experiments(settings, amount)
     if amount.foundation is not None or not {LINEAR, COMMITTEE, RECURRENT} <= experiments.keys():
-        return Portfolio(trainer.train(_jobs(experiments, data, amount, folder)), amount)
+        return TrainedPortfolio(trainer.train(_jobs(experiments, data, amount, folder)), amount)
     amount = replace(amount, trial=RecurrentTrial.RUNNING)
     experiments = _experiments(settings, amount)
     linear, trial = _jobs({name: experiments[name] for name in (LINEAR, RECURRENT)}, data, amount, folder)
@@ -99,7 +99,7 @@ def train_portfolio(
     rest = {name: one for name, one in experiments.items() if name != LINEAR and (passed or name != RECURRENT)}
     second = trainer.train(_jobs(rest, data, amount, folder), done=len(first), total=len(first) + len(rest))
     outcomes = first | second
-    return Portfolio({name: outcomes[name] for name in experiments}, amount, [] if passed else [_note(ratio)])
+    return TrainedPortfolio({name: outcomes[name] for name in experiments}, amount, [] if passed else [_note(ratio)])
 
 
 def _over_linear(outcomes: Mapping[str, TrainedCandidate | str]) -> float | None:

@@ -1,7 +1,7 @@
 """Methods of transfer: one file and one registration each."""
 
 from edp.workflows.transfer.methods.base import METHODS, Made, Method
-from edp.workflows.transfer.methods.code import Code
+from edp.workflows.transfer.methods.code import MachineCodeAlone
 from edp.workflows.transfer.methods.direct import Direct
 from edp.workflows.transfer.methods.few_steps import FewSteps
 from edp.workflows.transfer.methods.full import Full
@@ -16,12 +16,12 @@ __all__ = [
     "METHODS",
     "Adapters",
     "Adversarial",
-    "Code",
     "Direct",
     "DistilledRehearsal",
     "FewSteps",
     "Full",
     "LinearProbe",
+    "MachineCodeAlone",
     "Made",
     "Method",
     "Rehearsal",

@@ -16,7 +16,7 @@ RATE = 0.05
 
 
 @METHODS.register("code")
-class Code:
+class MachineCodeAlone:
     """Find the code of the target's machine; all weights stay those of the fleet."""
 
     label: ClassVar[str] = "Code alone"
