@@ -1,0 +1,193 @@
+"""Every command line of the docs runs, on small things: what a page shows works, not only exists.
+
+Lines of the same form, which differ in names only, run once. What cannot run is listed with its reason.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import chdir
+from pathlib import Path
+
+import pytest
+from line_grounds import SHORTER, WRITTEN, Ground, Line, edp, kind_of, lines_of, more_of
+from rich.table import Table
+
+from edp.cli import console
+from edp_site import markdown
+
+ROOT = Path(__file__).parents[2]
+HISTORY = ("CHANGELOG.md", "findings.md")
+FOLDERS = (ROOT, ROOT / "docs", ROOT / "website" / "pages")
+PAGES = [page for folder in FOLDERS for page in sorted(folder.glob("*.md")) if page.name not in HISTORY]
+LEFT_OUT = {
+    "edp live runs/m22 --ros2": "needs ROS 2; tests/unit/live/test_live_sources.py has a stand-in",
+    "edp store build s3://fleet/logs --map mine.toml --out store": "needs a bucket; tests/unit/test_store_buckets.py",
+    "edp train s3://fleet/stores/first --out runs/first": "needs a bucket; tests/unit/test_store_buckets.py",
+    "edp search /shared/logs --study studies/first --preset standard --cluster HOST:6379": (
+        "needs a cluster; tests/unit/search/test_cluster.py"
+    ),
+    "edp identify LOGS --out MACHINE.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp identify LOGS --out machine.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp identify logs --out mine.toml --machine measured.toml": "fits a machine; tests/unit/cli/test_cli_identify.py",
+    "edp twin logs --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/grey": (
+        "fits a grey box; tests/unit/twin/test_grey_linkage.py"
+    ),
+    "edp twin data/m22 --set twin.kind=greybox --set twin.linkage=mine.toml --out runs/twin": (
+        "fits a grey box; tests/unit/twin/test_grey_linkage.py"
+    ),
+    "edp twin logs/loam --start runs/grey --set ground=drag --out runs/grey_loam": (
+        "learns the resistance of the ground; tests/unit/twin/test_ground_run.py"
+    ),
+}
+"""Lines that need what no test has, or fits that take minutes and that other tests run shortened, and why."""
+SHELL_LEFT_OUT = {
+    "make": "installs packages, or is the run of these tests",
+    "source": "is of an environment that this process has",
+    "pip": "asks a package registry",
+    "python": "examples/mpc.py runs in tests/examples, the parts of a ROS package in tests/export",
+    "ray": "needs a cluster",
+    "export": "names its keys",
+    "colcon": "needs ROS 2",
+    "ros2": "needs ROS 2",
+    "for": "loads this machine for minutes",
+}
+"""First words of lines of other programs that are not run, and why; targets of make: tests/unit/test_code_blocks.py."""
+MOST_LEFT_OUT = 10
+QUICK = re.compile(
+    r"(init|inspect|evaluate|report|compare|adapt|replay|footprint|runs|registry|rollout|forecast|store|monitor r)"
+)
+"""Commands that take fractions of a second."""
+ALLOWED = {"inspect": (0, 3), "evaluate": (0, 6), "twin": (0, 6), "monitor run": (0, 5)}
+"""Exit codes that say something of the data or the model."""
+
+
+def form_of(line: Line) -> tuple[object, ...]:
+    """What two lines have in common that differ in names only."""
+    words: list[str] = []
+    for role, word in zip(line.roles, line.words):
+        if role == "--name" or word == "--name":
+            continue
+        free = role in WRITTEN and role not in ("--to", "--set")
+        words.append(kind_of(line, role, word) or SHORTER.get((line.command, role)) or ("OUT" if free else word))
+    return (line.command, *words, *more_of(line))
+
+
+ALL = [line for page in PAGES for line in lines_of(page)]
+FORMS: dict[tuple[object, ...], Line] = {}
+for line in ALL:
+    if line.text not in LEFT_OUT:
+        FORMS.setdefault(form_of(line), line)
+CASES = [
+    pytest.param(
+        line,
+        id=f"{line.page}-{line.number}",
+        marks=() if QUICK.match(line.command) else (pytest.mark.slow, pytest.mark.timeout(1200)),
+    )
+    for line in FORMS.values()
+]
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory) -> Ground:
+    return Ground(tmp_path_factory.mktemp("ground"))
+
+
+@pytest.fixture
+def tables(monkeypatch) -> list[list[str]]:
+    """Tables that commands print at 80 columns, as their lines."""
+    printed: list[list[str]] = []
+    plain = console.Terminal.print
+
+    def keeping(self, *objects, **options):
+        for part in objects:
+            if isinstance(part, Table):
+                rendered = self.render_lines(part, self.options.update(width=80))
+                printed.append(["".join(segment.text for segment in row).rstrip() for row in rendered])
+        plain(self, *objects, **options)
+
+    monkeypatch.setattr(console.Terminal, "print", keeping)
+    monkeypatch.setattr(console.out, "_width", 80)
+    return printed
+
+
+@pytest.mark.training
+@pytest.mark.parametrize("line", CASES)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_command_line_of_the_docs_runs(line, ground, tables, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "dumb")
+    words = [*line.command.split(), *ground.lay(line, tmp_path)]
+    capsys.readouterr()
+    if line.command == "live" and "--log" not in line.words:
+        code, said = live(words, tmp_path)
+    else:
+        with chdir(tmp_path):
+            code = edp(*words)
+        said = "".join(capsys.readouterr())
+    assert code in ALLOWED.get(line.command, (0,)), f"{line.text}: {said[-2000:]}"
+    for table in tables:
+        # Rows that are cut read alike: six of a table were once all 'CylPress...'.
+        assert all(len(row) <= 80 for row in table), table
+        assert not any("…" in row for row in table), table
+
+
+def live(words: list[str], folder: Path) -> tuple[int, str]:
+    """A session without an end, in a process: stopped by Ctrl-C once its page has an address."""
+    call = [sys.executable, "-m", "edp", *words]
+    places = os.pathsep.join(place for place in sys.path if place)
+    process = subprocess.Popen(
+        call, cwd=folder, env={**os.environ, "PYTHONPATH": places}, stderr=subprocess.PIPE, text=True
+    )
+    said = ""
+    until = time.monotonic() + 120
+    while "http://" not in said and process.poll() is None and time.monotonic() < until:
+        said += process.stderr.readline() if process.stderr is not None else ""
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=120)[1]
+    return process.returncode, said + rest
+
+
+def test_what_is_left_out_is_on_a_page_and_has_a_reason_that_is_there_and_does_not_grow():
+    for reason in LEFT_OUT.values():
+        assert all((ROOT / name).is_file() for name in re.findall(r"tests/\S+\.py", reason)), reason
+    assert set(LEFT_OUT) <= {line.text for line in ALL}
+    assert len(LEFT_OUT) <= MOST_LEFT_OUT, "run the line, or raise the number in a review"
+
+
+def other_lines() -> dict[str, list[str]]:
+    """Lines of other programs in blocks of a shell, by their first word."""
+    found: dict[str, list[str]] = {}
+    for page in PAGES:
+        for fence in markdown.fences(page.read_text(encoding="utf-8")):
+            for text in fence.code.splitlines() if fence.language in ("", "sh") else ():
+                words = text.split("#")[0].split()
+                known = words and (fence.language == "sh" or words[0] in {*SHELL_LEFT_OUT, "cmake"})
+                if known and re.fullmatch(r"[a-z0-9]+", words[0]) and words[0] != "edp":
+                    found.setdefault(words[0], []).append(" ".join(words))
+    return found
+
+
+def test_lines_of_other_programs_are_run_or_left_out_by_name():
+    assert set(other_lines()) == {*SHELL_LEFT_OUT, "cmake"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("text", sorted(set(other_lines()["cmake"])))
+def test_exported_code_is_built_and_tested_by_the_lines_of_the_docs(text, ground, tmp_path):
+    if not (shutil.which("cmake") and shutil.which("cc")):
+        pytest.skip("no cmake, or no C compiler")
+    (folder,) = set(re.findall(r"-S (\S+)", text))
+    kind = {"firmware/control": "loop", "firmware/monitor": "monitor"}.get(folder, "run")
+    form = "controller" if kind == "loop" else "c"
+    assert edp("export", ground.of(kind), "--to", form, "--out", tmp_path / folder) == 0
+    done = subprocess.run(text, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert "100% tests passed" in done.stdout
