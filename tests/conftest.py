@@ -138,7 +138,7 @@ def _physical() -> dict[str, Structure]:
 
 
 STRUCTURES = _structures() | _physical()
-ALONE = ("tcn+squeeze_excitation", "hybrid+multi_scale_tcn", "gru+linear")
+ALONE = ("tcn+squeeze_excitation", "hybrid+multi_scale_tcn", "hybrid+machine_code", "gru+linear")
 """The only ones in which some layer reads the output of some other."""
 
 

@@ -154,7 +154,8 @@ def test_a_twin_with_a_linkage_is_another_one_once_its_machine_file_changes(edp,
     kind = ("--set", "twin.kind=greybox", "--set", f"twin.linkage={file}")
     words = ("twin", logs, "--out", run, *kind, *LINKED)
     ended = edp(*words)
-    assert ended.code == 0, ended.err
+    # 6: on logs as short as these a floor may win.
+    assert ended.code in (0, 6), ended.err
     assert "boom_body.mass" in (run / "datasheet.txt").read_text()
     longer = text.replace("rod_radius = 2.484", "rod_radius = 2.494")
     assert longer != text

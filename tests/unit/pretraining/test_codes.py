@@ -53,7 +53,7 @@ def test_a_bundle_holds_the_network_without_the_codes_of_the_machines_that_train
 
 def test_a_source_without_a_code_is_refused(machines, experiment, tmp_path):
     pretrain(machines, experiment, Pretrain(), tmp_path / "joint")
-    with pytest.raises(ConfigError, match="reads no code of a machine"):
+    with pytest.raises(ConfigError, match="reads the code of a machine"):
         finetune(tmp_path / "joint", machines, FinetuneRequest(method="code"), tmp_path / "own")
 
 

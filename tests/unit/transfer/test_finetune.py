@@ -48,7 +48,9 @@ class Pulled(Exception):
 
 def test_every_method_is_judged_on_the_same_ticks_in_both_domains(tuned):
     _, found = tuned
-    assert set(found["methods"]) == set(METHODS)
+    # The source's network reads no code of a machine.
+    assert set(found["methods"]) == set(METHODS) - {"code"}
+    assert any("reads the code of a machine" in note for note in found["notes"])
     for domain in ("target", "source"):
         counts = {row["domains"][domain][k]["rise"]["count"] for row in found["methods"].values() for k in ("2", "5")}
         assert len(counts) == 1, domain

@@ -24,7 +24,7 @@ from edp.training import Diverged, TrainingProgress
 from edp.training.bundle import weights_digest
 from edp.workflows.transfer.case import TransferCase, tuned
 from edp.workflows.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
-from edp.workflows.transfer.methods import METHODS, Made, Method
+from edp.workflows.transfer.methods import METHODS, Made, Method, code_names
 from edp.workflows.transfer.scores import distributions, errors_of, excerpts, measure
 from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
 from edp.workflows.transfer.spec import FinetuneSpec
@@ -186,14 +186,18 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
     Raises:
         ConfigError: the method that is to be kept is one of the others.
     """
-    lacking = [name for name in order.names if METHODS[name].needs_source and source.data is None]
+    lacking = {}
+    for name in order.names:
+        if METHODS[name].needs_source and source.data is None:
+            lacking[name] = f"needs the recordings of the source, which are not there: {source.absent}"
+        elif METHODS[name].needs_code and not code_names(source.predictor):
+            lacking[name] = (
+                "needs a network that reads the code of a machine, which that of the source does not; give one of "
+                "edp pretrain --method codes"
+            )
     if order.method in lacking:
-        raise ConfigError(
-            f"method '{order.method}' needs the recordings of the source, which are not there: {source.absent}"
-        )
-    notes = [
-        f"{METHODS[name].label} is left out: it needs the recordings of the source. {source.absent}" for name in lacking
-    ]
+        raise ConfigError(f"method '{order.method}' {lacking[order.method]}")
+    notes = [f"{METHODS[name].label} is left out: it {why}" for name, why in lacking.items()]
     return [name for name in order.names if name not in lacking], notes
 
 

@@ -1,7 +1,7 @@
 """Methods of transfer: one file and one registration each."""
 
 from edp.workflows.transfer.methods.base import METHODS, Made, Method
-from edp.workflows.transfer.methods.code import MachineCodeAlone
+from edp.workflows.transfer.methods.code import MachineCodeAlone, code_names
 from edp.workflows.transfer.methods.direct import Direct
 from edp.workflows.transfer.methods.few_steps import FewSteps
 from edp.workflows.transfer.methods.full import Full
@@ -28,4 +28,5 @@ __all__ = [
     "Ridge",
     "Scratch",
     "TwoPhase",
+    "code_names",
 ]

@@ -53,6 +53,8 @@ class Method(Protocol):
     """Whether it leaves a run, which can be judged, reported and exported."""
     needs_source: ClassVar[bool]
     """Whether it needs the recordings of the source."""
+    needs_code: ClassVar[bool]
+    """Whether the source's network must read the code of a machine."""
 
     def make(self, case: TransferCase) -> Made:
         """Carry it out, or go on where it was stopped."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from edp.errors import ConfigError
 from edp.networks.blocks.machine_code import CODE
+from edp.networks.predictor import Predictor
 from edp.training.optimizers import AdamW
 from edp.training.warm_start import WarmStart
 from edp.workflows.transfer.case import TransferCase
@@ -15,6 +15,11 @@ RATE = 0.05
 """Of the code, whose numbers are of the order of one: a hundred times that of weights."""
 
 
+def code_names(network: Predictor) -> list[str]:
+    """Names of the parameters that are a machine's code; none where the network reads no code."""
+    return [name for name, _ in network.named_parameters() if name.rpartition(".")[2] == CODE]
+
+
 @METHODS.register("code")
 class MachineCodeAlone:
     """Find the code of the target's machine; all weights stay those of the fleet."""
@@ -22,20 +27,12 @@ class MachineCodeAlone:
     label: ClassVar[str] = "Code alone"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = True
 
     def make(self, case: TransferCase) -> Made:
-        """Train the code.
-
-        Raises:
-            ConfigError: the source's network reads no code.
-        """
+        """Train the code."""
         source = case.source.predictor
-        names = [name for name, _ in source.named_parameters() if name.rpartition(".")[2] == CODE]
-        if not names:
-            raise ConfigError(
-                "method 'code': the network of the source reads no code of a machine; give one of edp pretrain "
-                "--method codes, or take --method full"
-            )
+        names = code_names(source)
         frozen = [name for name, _ in source.named_parameters() if name not in names]
         training = case.tuning(AdamW(learning_rate=RATE, weight_decay=0.0))
         network = case.train("code", training, lambda: WarmStart(source, frozen), centred=False)

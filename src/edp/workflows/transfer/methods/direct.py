@@ -15,6 +15,7 @@ class Direct:
     label: ClassVar[str] = "Direct transfer"
     trains: ClassVar[bool] = False
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Nothing is learned."""

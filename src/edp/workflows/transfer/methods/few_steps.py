@@ -25,6 +25,7 @@ class FewSteps:
     label: ClassVar[str] = "A few steps"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Take the steps; what did not adapt in the meta-learning does not here."""

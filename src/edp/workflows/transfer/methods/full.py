@@ -16,6 +16,7 @@ class Full:
     label: ClassVar[str] = "Fine-tuned, one rate"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train everything."""

@@ -17,6 +17,7 @@ class LinearProbe:
     label: ClassVar[str] = "Linear probe"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train the last layer."""

@@ -17,6 +17,7 @@ class Adapters:
     label: ClassVar[str] = "Low-rank adapters"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train the changes."""

@@ -20,6 +20,7 @@ class Rehearsal:
     label: ClassVar[str] = "Rehearsal"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = True
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train on both domains."""
@@ -33,6 +34,7 @@ class DistilledRehearsal:
     label: ClassVar[str] = "Rehearsal, distilled"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = True
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train on both domains."""
@@ -47,6 +49,7 @@ class Adversarial:
     label: ClassVar[str] = "Rehearsal, adversarial"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = True
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train on both domains."""

@@ -17,6 +17,7 @@ class Ridge:
     label: ClassVar[str] = "Ridge ARX on the target"
     trains: ClassVar[bool] = False
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Fit it; penalty and history are chosen on the validation part."""

@@ -19,6 +19,7 @@ class Scratch:
     label: ClassVar[str] = "From scratch"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train as ``edp train`` would, with the early stopping of the fine-tuning."""

@@ -19,6 +19,7 @@ class TwoPhase:
     label: ClassVar[str] = "Fine-tuned, two phases"
     trains: ClassVar[bool] = True
     needs_source: ClassVar[bool] = False
+    needs_code: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Both phases; the first is a run of its own within the run of the second."""
