@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,8 @@ def finish(script: str, verdicts: Sequence[Verdict], seed: int, details: object 
     print()
     rows = [[v.name, v.ours, v.rival, v.ratio, v.goal, "met" if v.met else "NOT MET", v.unit] for v in verdicts]
     table(["question", "ours", "rival", "ratio", "goal", "verdict", "unit"], rows)
-    plain = [asdict(v) for v in verdicts]
+    # No measurement is no number: JSON has none for it.
+    plain = [finite(asdict(v)) for v in verdicts]
     if keep and not any(v.quick for v in verdicts):
         kept = {
             "command": command_line(),
@@ -92,6 +94,15 @@ def finish(script: str, verdicts: Sequence[Verdict], seed: int, details: object 
         }
         write_json(RESULTS / f"{script}.json", kept)
     print(json.dumps(plain if len(plain) != 1 else plain[0]), flush=True)
+
+
+def finite(value: Any) -> Any:
+    """Plain values as JSON can keep them: what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _cell(value: object) -> str:

@@ -53,6 +53,7 @@ STARTS = {
     "m22": "M22 in free air",
     "family": "foundation",
     "meta": "meta-learned",
+    "codes": "with codes",
 }
 
 
@@ -129,10 +130,9 @@ def trained(bench: Bench, name: str) -> Predictor:
             if event.row is not None and event.epoch % 4 == 0:
                 print(f"{name}: epoch {event.epoch}, validation MAE {event.row['validation_mae']:.3f}", flush=True)
 
-        if name == "family":
-            pretrain(
-                bench.source(name), bench.experiment(epochs, updates, *HELD_OUT), Pretrain(), bench.run(name), tell
-            )
+        if name in ("family", "codes"):
+            order = Pretrain(method="codes" if name == "codes" else "joint")
+            pretrain(bench.source("family"), bench.experiment(epochs, updates, *HELD_OUT), order, bench.run(name), tell)
         elif name == "meta":
             # A twelfth of the updates: each of them goes through twice the ticks, and three times more to adapt.
             rate = 'training.optimizer={kind="soap",learning_rate=1e-3}'

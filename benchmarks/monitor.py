@@ -17,93 +17,42 @@ begin later are left out.
 
 from __future__ import annotations
 
-import json
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from common import Verdict, finish, in_folder, kept, parser, table, verdict
+from common import finish, finite, in_folder, parser
 from edp.monitor.alarms import MonitorAlarm
-from edp.monitor.fitting import fit_from_blocks
 from edp.monitor.monitor_file import load_monitor
 from edp.monitor.residuals.base import SideBySide
-from edp.monitor.session_blocks import SessionBlocks
 from edp.sandbox.helpers import Helpers
-from edp.sim.faults import FAULTS, parse_fault
-from monitor_metrics import (
-    Case,
-    curves,
-    false_alarm_rate,
-    finite,
-    judged,
-    median_delay,
-    share_found,
-)
-from monitor_rivals import CHARTS, PYOD, Rival, has_pyod, limit_of, raised, rivals_of
-from monitor_sessions import (
-    COUNTS,
-    DURATION_S,
-    NUISANCES,
-    died,
-    plans_of,
-    read_session,
-    session_facts,
-    session_names,
-    session_plans,
-    write_sessions,
-)
+from monitor_metrics import Case, curves, false_alarm_rate, judged, summary
+from monitor_naming import naming
+from monitor_progress import BEGAN, Beside, say
+from monitor_promise import FITS, promise
+from monitor_rival_runs import choose, rival_results
+from monitor_sessions import DURATION_S, NUISANCES, died, session_facts
+from monitor_test_set import QUICK_HOURS, QUICK_SECONDS, test_names, write_test, write_training
+from monitor_verdicts import show
 from monitor_watching import (
-    NEVER_H,
-    Floats,
-    MonitorOfBlocks,
     Plan,
     add_dictionary,
-    blocks_file,
     columns_without_flow,
     fit_without_flow,
     fitted,
-    monitor_of,
-    parts_of,
-    read_blocks,
     same_alarms,
     summarise,
     watched,
 )
 
-BEST_PYOD = ("CBLOF", "GMM")
-"""Of ten on the validation part."""
-GOALS = {
-    "found": 0.8,
-    "found_large": 0.95,
-    "delay_s": 60.0,
-    "delay_largest_s": 10.0,
-    "over_rival": 5.0,
-    "component": 0.85,
-    "top_three": 0.95,
-    "place": 0.95,
-    "fits": 18,
-}
-LARGE = (0, 1)
-"""Ranks of the two largest sizes."""
-FITS, FIT_SESSIONS, MEASURED_SESSIONS = 20, 66, 120
-"""Of the promise: fits, and sessions that each is fitted to and measured on."""
-QUICK_COUNTS = {"training": (16, 0), "test": (6, 1)}
-"""Healthy sessions, and those of each nuisance set."""
-QUICK_SECONDS, QUICK_HOURS = 60.0, 0.1
-QUICK_FAULTS = 12
 QUICK_SETTINGS = (
     'chain.watches=[{detector={kind="cusum"}, memory_s=4.0}]',
     'dictionary.machine="none"',
     'residuals=[{kind="virtual_sensors", units=16, lags_s=[0.04, 0.16]}, {kind="balances"}]',
 )
 """Averages over a minute need more than minutes, and faults that are simulated half an hour."""
-BEGAN = time.monotonic()
 
 
 def our_cases(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> list[Case]:
@@ -115,191 +64,6 @@ def our_cases(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> list[Case]:
     return cases
 
 
-def naming(plan: Plan, found: dict[str, list[MonitorAlarm]]) -> dict[str, float]:
-    """Shares of the found faults whose first alarm names the component, kind and site, among three, and the place.
-
-    Empty without a diagnosis.
-    """
-    hits: dict[str, list[bool]] = {key: [] for key in ("component", "top_three", "kind_and_site", "place")}
-    for name, alarms in found.items():
-        fault = parse_fault(session_facts(plan.data / "test", name)[0].fault)
-        after = [alarm for alarm in alarms if alarm.raised_s > fault.onset_s]
-        if not after:
-            continue
-        causes = after[0].causes
-        parts = [component(cause.kind, cause.site) for cause in causes]
-        right = component(fault.kind, fault.site)
-        hits["component"].append(parts[:1] == [right])
-        hits["top_three"].append(right in parts[:3])
-        hits["kind_and_site"].append([(c.kind, c.site) for c in causes[:1]] == [(fault.kind, fault.site)])
-        hits["place"].append([cause.at_fault for cause in causes[:1]] == [place_of(fault.kind)])
-    diagnosed = any(alarm.causes for alarms in found.values() for alarm in alarms)
-    return {key: float(np.mean(values)) for key, values in hits.items()} if diagnosed else {}
-
-
-def component(kind: str, site: str) -> str:
-    """The part that a mechanic would look at."""
-    if kind not in FAULTS:
-        return kind
-    of = getattr(FAULTS[kind], "component", None)
-    return str(of(site)) if of is not None else f"{kind} {site}"
-
-
-def place_of(kind: str) -> str:
-    """Whether a fault is one of the machine or of a sensor."""
-    return "sensor" if hasattr(FAULTS[kind], "operation") else "machine"
-
-
-def rival_rows(plan: Plan, rivals: Mapping[str, Rival], folder: str, names: Sequence[str]) -> dict[str, list[Floats]]:
-    """White rows of sessions of every rival; each session is read once."""
-    rows: dict[str, list[Floats]] = {name: [] for name in rivals}
-    for number, session in enumerate(names, start=1):
-        values = read_session(plan.data / folder, session).recording.values
-        for name, rival in rivals.items():
-            rows[name].append(rival.rows(values))
-        if number % 50 == 0:
-            print(f"rivals: {number} of {len(names)} of {folder}", flush=True)
-    return rows
-
-
-@dataclass(frozen=True)
-class _RivalJob:
-    plan: Plan
-    rival: str
-    healthy: tuple[str, ...]
-    faulty: tuple[str, ...]
-
-    @property
-    def label(self) -> str:
-        """For messages."""
-        return self.rival
-
-
-def rival_result(job: _RivalJob) -> dict[str, dict[str, Any]]:
-    """A rival on the same sessions, with each of its charts."""
-    plan = job.plan
-    learning, limiting = parts_of(plan)
-    # Forty sessions are 5 h: what is linear or of neighbours has seen all there is to see by then.
-    material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
-    rate = 1.0
-    rivals = {job.rival: rivals_of(BEST_PYOD if job.rival.startswith("PyOD") else ())[job.rival]}
-    rivals[job.rival].fit(material, ticks=100)
-    held = rival_rows(plan, rivals, "training", limiting)[job.rival]
-    calm, wrong = (rival_rows(plan, rivals, "test", names)[job.rival] for names in (job.healthy, job.faulty))
-    facts = [session_facts(plan.data / "test", name) for name in job.faulty]
-    results: dict[str, dict[str, Any]] = {}
-    for chart, spec in CHARTS.items():
-        limit = limit_of(spec, held, rate, plan.hours).limit
-        false = sum(len(raised(spec, limit, rows, rate)) for rows in calm)
-        cases = [
-            judged(session.fault, moving, raised(spec, limit, rows, rate))
-            for (session, moving), rows in zip(facts, wrong, strict=True)
-        ]
-        hours = sum(len(rows) for rows in calm) / rate / 3600.0
-        results[f"{job.rival}, {chart}"] = summary(cases) | {"false": false_alarm_rate(false, hours)}
-    return results
-
-
-def summary(cases: Sequence[Case]) -> dict[str, Any]:
-    """Figures of one detector on the faulty sessions."""
-    return {
-        "found": share_found(cases),
-        "found_large": share_found(cases, LARGE),
-        "delay_s": median_delay(cases),
-        "delay_largest_s": median_delay(cases, (0,)),
-        "before_onset": sum(case.false_alarms for case in cases),
-        "before_onset_hours": sum(case.healthy_s for case in cases) / 3600.0,
-    }
-
-
-@dataclass(frozen=True)
-class _FitJob:
-    plan: Plan
-    seed: int
-    number: int
-    label: str
-
-
-@lru_cache(maxsize=1)
-def pool(plan: Plan) -> tuple[SessionBlocks, ...]:
-    """Healthy sessions that no residual was fitted to."""
-    held = [blocks_file(plan, "training", name) for name in parts_of(plan)[1]]
-    test = [blocks_file(plan, "test", name) for name in test_names(plan)["healthy"]]
-    return tuple(read_blocks(path)[0] for path in (*held, *test))
-
-
-def promise_of(rows: Sequence[dict[str, Any]], plan: Plan) -> dict[str, Any]:
-    """Fits of all behind the residuals to other healthy sessions each, and what they raise on others."""
-    within = sum(row["low_hours"] <= row["measured_hours"] <= row["high_hours"] for row in rows)
-    as_promised = sum(row["measured_hours"] >= plan.fit_hours for row in rows)
-    return {
-        "fits": list(rows), "within": within, "of": len(rows), "as_promised": as_promised,
-        "promised_hours": plan.fit_hours,
-    }  # fmt: skip
-
-
-def _one_fit(job: _FitJob) -> dict[str, Any]:
-    # Of processes that were begun later this is an earlier time than the run's, by the seconds of their start.
-    if time.monotonic() - BEGAN > job.plan.until:
-        return {}
-    plan, parts, monitor = job.plan, pool(job.plan), monitor_of(job.plan.monitor)
-    order = np.random.default_rng([job.seed, job.number]).permutation(len(parts))
-    count = min(FIT_SESSIONS, len(parts) // 2)
-    chosen, others = ([parts[i] for i in some] for some in (order[:count], order[count:][:MEASURED_SESSIONS]))
-    spec, old = plan.experiment.chain, monitor.chain
-    result = fit_from_blocks(spec, old.summaries, chosen, monitor.rate_hz, old.settle, plan.fit_hours)
-    own = MonitorOfBlocks.of(monitor, result.chain)
-    count = sum(len(own.run(part)) for part in others)  # type: ignore[arg-type]
-    measured = sum(len(part.summaries) for part in others) * monitor.block_s / 3600.0
-    return {
-        "low_hours": result.limit.low_hours,
-        "high_hours": min(result.limit.high_hours, NEVER_H),
-        # No alarm in H hours: the mean is H at least.
-        "measured_hours": measured / max(count, 1),
-        "alarms": count,
-        "hours": measured,
-    }
-
-
-def write_training(plan: Plan, side_by_side: SideBySide) -> None:
-    """Simulate the sessions that are fitted to, where they are missing."""
-    if plan.quick:
-        healthy, _ = QUICK_COUNTS["training"]
-        plans = plans_of("training", {"healthy": healthy, "faulty": 0, "nuisance": 0}, QUICK_SECONDS)
-    else:
-        plans = session_plans("training", "healthy", min(plan.sessions, COUNTS["training"]["healthy"]))
-    write_sessions(plans, plan.data / "training", side_by_side)
-
-
-def write_test(plan: Plan, side_by_side: SideBySide) -> None:
-    """Simulate the sessions that are judged, where they are missing."""
-    if not plan.quick:
-        write_sessions(plans_of("test", COUNTS["test"]), plan.data / "test", side_by_side)
-        return
-    # With the seeds of the validation part: those of the test are for the full form alone.
-    healthy, nuisance = QUICK_COUNTS["test"]
-    plans = plans_of("validation", {"healthy": healthy, "faulty": 0, "nuisance": nuisance}, QUICK_SECONDS)
-    faults = plans_of("validation", {"healthy": 0, "faulty": 1, "nuisance": 0}, QUICK_SECONDS)
-    step = len(faults) // QUICK_FAULTS
-    write_sessions([*plans, *faults[step - 1 :: step]], plan.data / "test", side_by_side)
-
-
-def test_names(plan: Plan) -> dict[str, list[str]]:
-    """Names of the test sessions by group; groups without any are left out."""
-    groups = ("healthy", "faulty", *NUISANCES)
-    if plan.quick:
-        names = {group: session_names(plan.data / "test", group) for group in groups}
-    else:
-        counts = {group: COUNTS["test"].get(group, COUNTS["test"]["nuisance"]) for group in groups}
-        names = {group: [one.name for one in session_plans("test", group, counts[group])] for group in groups}
-    return {group: some for group, some in names.items() if some}
-
-
-def say(what: str, value: Any) -> None:
-    """A line with what was found, for runs that are cut off."""
-    print(json.dumps({"found": what, "after_s": round(time.monotonic() - BEGAN), "value": finite(value)}), flush=True)
-
-
 @dataclass(frozen=True)
 class _Start:
     label: str
@@ -307,37 +71,6 @@ class _Start:
 
 def _started(job: _Start) -> str:
     return job.label
-
-
-class Beside:
-    """Work in a thread beside the rest, whose result is asked for later; ends with the program."""
-
-    def __init__(self, work: Callable[[], Any]) -> None:
-        self._work, self._result = work, None
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._result = self._work()
-        except Exception as error:
-            self._error = error
-
-    def done(self) -> bool:
-        """Whether it has come to its end."""
-        return not self._thread.is_alive()
-
-    def result(self) -> Any:
-        """What came of it; waits for it.
-
-        Raises:
-            Exception: that of the work.
-        """
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return self._result
 
 
 def measure(plan: Plan, seed: int, side_by_side: SideBySide) -> dict[str, Any]:
@@ -423,128 +156,6 @@ def named(plan: Plan, wrong: dict[str, list[MonitorAlarm]]) -> dict[str, float]:
     found = naming(plan, watched(plan, [name for name, alarms in wrong.items() if alarms], map, plan.named))
     say("causes", found)
     return found
-
-
-def promise(plan: Plan, seed: int, side_by_side: SideBySide) -> dict[str, Any]:
-    """Fits to other healthy sessions, as many as the time allows."""
-    rows: list[dict[str, Any]] = []
-    fits = 2 if plan.quick else plan.fits
-    jobs = [_FitJob(plan, seed, number, f"fit {number}") for number in range(fits)]
-    for row in side_by_side(_one_fit, jobs):
-        if row:
-            rows.append(row)
-            say(f"promise {len(rows)}", row)
-    return promise_of(rows, plan)
-
-
-def rival_results(
-    plan: Plan, names: Mapping[str, Sequence[str]], side_by_side: SideBySide
-) -> dict[str, dict[str, Any]]:
-    """Every rival on the same sessions; of an earlier run of the same sessions where there was one."""
-
-    def measured() -> dict[str, Any]:
-        rivals = rivals_of(BEST_PYOD if has_pyod() else ())
-        jobs = [_RivalJob(plan, rival, tuple(names["healthy"]), tuple(names["faulty"])) for rival in rivals]
-        results: dict[str, dict[str, Any]] = {}
-        for result in side_by_side(rival_result, jobs):
-            results |= result
-            say("rival", result)
-        return finite(results)  # type: ignore[no-any-return]
-
-    if time.monotonic() - BEGAN > plan.until:
-        print("rivals: left out, the time is over")
-        return {}
-    return kept(plan.monitor / "rivals.json", measured)
-
-
-def show(found: dict[str, Any], plan: Plan) -> list[Verdict]:
-    """Tables and verdicts."""
-    quick, ours = plan.quick, found["ours"]
-    rows = [_row("edp.monitor", ours, found["healthy"])]
-    rows += [_row(name, rival, rival["false"]) for name, rival in found["rivals"].items()]
-    print(
-        "\nall kinds and sizes; false alarms on healthy test sessions" + (" (quick: hardly trained)" if quick else "")
-    )
-    table(["detector", "found", "two largest", "delay, s", "largest, s", "false alarms", "hours", "in 8 h"], rows)
-    print("\nshare found by size; size found in half of the cases")
-    table(
-        ["kind", "found", "half", "unit", "delay, s"],
-        [
-            [kind, ", ".join(f"{s}: {v:.2f}" for s, v in c["found"].items()), c["half"], c["unit"], c["delay_s"]]
-            for kind, c in found["curves"].items()
-        ],
-    )
-    print("\nhealthy sessions that must stay silent")
-    sets, others = found["nuisance"].items(), found["without_flow"]
-    table(
-        ["set", "false alarms", "hours", "in 8 h", "alarms without balances of flow"],
-        [[n, r["alarms"], r["hours"], r["in_8_h"], others[n]["alarms"] if others else "-"] for n, r in sets],
-    )
-    return verdicts(found, plan)
-
-
-def _row(name: str, figures: dict[str, Any], false: dict[str, Any]) -> list[object]:
-    keys = ("found", "found_large", "delay_s", "delay_largest_s")
-    return [name, *(figures[key] for key in keys), false["alarms"], false["hours"], false["in_8_h"]]
-
-
-def verdicts(found: dict[str, Any], plan: Plan) -> list[Verdict]:
-    """The goals, one by one."""
-    quick, ours, goals = plan.quick, found["ours"], GOALS
-    # A rival that raises more false alarms than promised is no rival at this rate: it is shown, not taken.
-    best = max((r["found"] for r in found["rivals"].values()), default=None)
-    rate = found["healthy"]["in_8_h"]
-    result = [
-        verdict("false alarms in 8 h, healthy sessions", rate, 8.0 / plan.hours, "<= 1", "alarms", quick),
-        verdict("faults found, all kinds and sizes", ours["found"], goals["found"], ">= 1", "share", quick),
-        verdict("of the two largest sizes", ours["found_large"], goals["found_large"], ">= 1", "share", quick),
-        verdict("median delay", ours["delay_s"], goals["delay_s"], "<= 1", "s of motion", quick),
-        verdict("of the largest size", ours["delay_largest_s"], goals["delay_largest_s"], "<= 1", "s of motion", quick),
-    ]
-    if best is not None:
-        over = f">= {goals['over_rival']:g}"
-        result.append(verdict("found, over the best rival", ours["found"], best, over, "share", quick))
-    for group, row in found["nuisance"].items():
-        result.append(
-            verdict(f"{group}: false alarms in 8 h", row["in_8_h"], 8.0 / plan.hours, "<= 2", "alarms", quick)
-        )
-    named = found["naming"]
-    if not named:
-        print("no alarm names a cause: this monitor has no diagnosis")
-    for key in ("component", "top_three", "place") if named else ():
-        result.append(verdict(f"named right: {key}", named[key], goals[key], ">= 1", "share", quick))
-    fits = found["promise"]
-    if not fits["of"]:
-        return result
-    wanted = goals["fits"] * fits["of"] / FITS
-    result.append(verdict("fits whose interval holds the rate", float(fits["within"]), wanted, ">= 1", "fits", quick))
-    return result
-
-
-def choose(plan: Plan, side_by_side: SideBySide) -> None:
-    """PyOD's detectors on the validation part: the two best are `BEST_PYOD`."""
-    write_training(plan, side_by_side)
-    write_sessions(plans_of("validation", COUNTS["validation"]), plan.data / "validation", side_by_side)
-    fitted(plan, side_by_side)
-    learning, limiting = parts_of(plan)
-    material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
-    names, rows = session_names(plan.data / "validation", "faulty"), []
-    facts = [session_facts(plan.data / "validation", name) for name in names]
-    for name in PYOD:
-        rival = {name: rivals_of((name,))[f"PyOD {name}"]}
-        rival[name].fit(material, ticks=100)
-        held, wrong = (
-            rival_rows(plan, rival, part, some)[name] for part, some in (("training", limiting), ("validation", names))
-        )
-        for chart, spec in CHARTS.items():
-            limit = limit_of(spec, held, 1.0, plan.hours).limit
-            cases = [
-                judged(session.fault, moving, raised(spec, limit, part, 1.0))
-                for (session, moving), part in zip(facts, wrong, strict=True)
-            ]
-            rows.append([name, chart, share_found(cases), share_found(cases, LARGE), median_delay(cases)])
-        print(rows[-2:], flush=True)
-    table(["PyOD", "chart", "found", "two largest", "delay, s"], sorted(rows, key=lambda row: -row[2]))
 
 
 def main() -> None:

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from edp.monitor.calibration import hours_between
 from edp.sim.faults import FAULTS, parse_fault
 
+LARGE = (0, 1)
+"""Ranks of the two largest sizes."""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -123,10 +126,13 @@ def area_under_curve(healthy: NDArray[np.float64], faulty: NDArray[np.float64]) 
     return float(above + 0.5 * (faulty[:, None] == healthy[None, :]).mean())
 
 
-def finite(value: Any) -> Any:
-    """Plain values as JSON can keep them: what is not finite becomes None."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def summary(cases: Sequence[Case]) -> dict[str, Any]:
+    """Figures of one detector on the faulty sessions."""
+    return {
+        "found": share_found(cases),
+        "found_large": share_found(cases, LARGE),
+        "delay_s": median_delay(cases),
+        "delay_largest_s": median_delay(cases, (0,)),
+        "before_onset": sum(case.false_alarms for case in cases),
+        "before_onset_hours": sum(case.healthy_s for case in cases) / 3600.0,
+    }

@@ -25,14 +25,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common import Verdict, finish, parser, table, verdict
+from common import Verdict, finish, finite, parser, table, verdict
 from edp.config.monitor import MonitorExperiment, load_monitor_experiment
 from edp.errors import DataError
 from edp.logs.source import DataSource
 from edp.monitor.monitor import Monitor
 from edp.recording import Recording
 from edp.workflows.monitor import fit_to_recordings
-from monitor_metrics import finite
 from monitor_rig import BEST_PYOD, GOALS, MINUTES, lowest, read_rig, rig_results
 from monitor_rivals import CHARTS, has_pyod, limit_of, raised, rivals_of
 from real_recordings import EXAMPLES, VARIABLE, shared_folder

@@ -88,7 +88,9 @@ class WithCodes(EpisodicStrategy):
         if self.start is not None:
             continue_from(net, self.start)
         block, self.training = coded_block(net), spec
-        draws = torch.randn(len(self.machines) * len(block.machine_code), generator=torch.Generator().manual_seed(0))
+        draws = torch.randn(
+            len(self.machines) * len(block.machine_code), generator=torch.Generator().manual_seed(spec.seed)
+        )
         # A vector: optimisers that precondition matrices would need the square of the number of machines.
         block.table = nn.Parameter(SPREAD * draws)
         return self.start is not None

@@ -1,0 +1,116 @@
+"""The monitor's rivals on the sessions that it is judged on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from common import finite, kept, table
+from edp.monitor.residuals.base import SideBySide
+from monitor_metrics import LARGE, false_alarm_rate, judged, median_delay, share_found, summary
+from monitor_progress import BEGAN, say
+from monitor_rivals import CHARTS, PYOD, Floats, Rival, has_pyod, limit_of, raised, rivals_of
+from monitor_sessions import COUNTS, plans_of, read_session, session_facts, session_names, write_sessions
+from monitor_test_set import write_training
+from monitor_watching import Plan, fitted, parts_of
+
+BEST_PYOD = ("CBLOF", "GMM")
+"""Of ten on the validation part."""
+
+
+def rival_rows(plan: Plan, rivals: Mapping[str, Rival], folder: str, names: Sequence[str]) -> dict[str, list[Floats]]:
+    """White rows of sessions of every rival; each session is read once."""
+    rows: dict[str, list[Floats]] = {name: [] for name in rivals}
+    for number, session in enumerate(names, start=1):
+        values = read_session(plan.data / folder, session).recording.values
+        for name, rival in rivals.items():
+            rows[name].append(rival.rows(values))
+        if number % 50 == 0:
+            print(f"rivals: {number} of {len(names)} of {folder}", flush=True)
+    return rows
+
+
+@dataclass(frozen=True)
+class _RivalJob:
+    plan: Plan
+    rival: str
+    healthy: tuple[str, ...]
+    faulty: tuple[str, ...]
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return self.rival
+
+
+def rival_result(job: _RivalJob) -> dict[str, dict[str, Any]]:
+    """A rival on the same sessions, with each of its charts."""
+    plan = job.plan
+    learning, limiting = parts_of(plan)
+    # Forty sessions are 5 h: what is linear or of neighbours has seen all there is to see by then.
+    material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
+    rate = 1.0
+    rivals = {job.rival: rivals_of(BEST_PYOD if job.rival.startswith("PyOD") else ())[job.rival]}
+    rivals[job.rival].fit(material, ticks=100)
+    held = rival_rows(plan, rivals, "training", limiting)[job.rival]
+    calm, wrong = (rival_rows(plan, rivals, "test", names)[job.rival] for names in (job.healthy, job.faulty))
+    facts = [session_facts(plan.data / "test", name) for name in job.faulty]
+    results: dict[str, dict[str, Any]] = {}
+    for chart, spec in CHARTS.items():
+        limit = limit_of(spec, held, rate, plan.hours).limit
+        false = sum(len(raised(spec, limit, rows, rate)) for rows in calm)
+        cases = [
+            judged(session.fault, moving, raised(spec, limit, rows, rate))
+            for (session, moving), rows in zip(facts, wrong, strict=True)
+        ]
+        hours = sum(len(rows) for rows in calm) / rate / 3600.0
+        results[f"{job.rival}, {chart}"] = summary(cases) | {"false": false_alarm_rate(false, hours)}
+    return results
+
+
+def rival_results(
+    plan: Plan, names: Mapping[str, Sequence[str]], side_by_side: SideBySide
+) -> dict[str, dict[str, Any]]:
+    """Every rival on the same sessions; of an earlier run of the same sessions where there was one."""
+
+    def measured() -> dict[str, Any]:
+        rivals = rivals_of(BEST_PYOD if has_pyod() else ())
+        jobs = [_RivalJob(plan, rival, tuple(names["healthy"]), tuple(names["faulty"])) for rival in rivals]
+        results: dict[str, dict[str, Any]] = {}
+        for result in side_by_side(rival_result, jobs):
+            results |= result
+            say("rival", result)
+        return finite(results)  # type: ignore[no-any-return]
+
+    if time.monotonic() - BEGAN > plan.until:
+        print("rivals: left out, the time is over")
+        return {}
+    return kept(plan.monitor / "rivals.json", measured)
+
+
+def choose(plan: Plan, side_by_side: SideBySide) -> None:
+    """PyOD's detectors on the validation part: the two best are `BEST_PYOD`."""
+    write_training(plan, side_by_side)
+    write_sessions(plans_of("validation", COUNTS["validation"]), plan.data / "validation", side_by_side)
+    fitted(plan, side_by_side)
+    learning, limiting = parts_of(plan)
+    material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
+    names, rows = session_names(plan.data / "validation", "faulty"), []
+    facts = [session_facts(plan.data / "validation", name) for name in names]
+    for name in PYOD:
+        rival = {name: rivals_of((name,))[f"PyOD {name}"]}
+        rival[name].fit(material, ticks=100)
+        held, wrong = (
+            rival_rows(plan, rival, part, some)[name] for part, some in (("training", limiting), ("validation", names))
+        )
+        for chart, spec in CHARTS.items():
+            limit = limit_of(spec, held, 1.0, plan.hours).limit
+            cases = [
+                judged(session.fault, moving, raised(spec, limit, part, 1.0))
+                for (session, moving), part in zip(facts, wrong, strict=True)
+            ]
+            rows.append([name, chart, share_found(cases), share_found(cases, LARGE), median_delay(cases)])
+        print(rows[-2:], flush=True)
+    table(["PyOD", "chart", "found", "two largest", "delay, s"], sorted(rows, key=lambda row: -row[2]))
