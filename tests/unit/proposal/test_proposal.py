@@ -364,6 +364,20 @@ def test_where_no_plant_model_is_named_a_sentence_says_what_to_record(tmp_path, 
     assert why in proposal.no_plant().replace(f"{name}_{unit}", name)
 
 
+def test_stamps_within_messages_are_no_inputs(tmp_path):
+    draw = np.random.default_rng(2)
+    columns = {
+        "time": np.arange(600) / 10.0,
+        "arm.velocity": np.cumsum(draw.normal(0.0, 0.1, 600)),
+        "transforms_1.header.stamp.sec": np.floor(np.arange(600) / 10.0 + draw.uniform(0.0, 0.3, 600)) + 1.5e9,
+        "transforms_1.header.stamp.nanosec": draw.uniform(0.0, 1e9, 600),
+        "stamped_force": draw.normal(size=600),
+    }
+    columns = propose(write(tmp_path / "x.csv", columns)).proposal.columns
+    assert [guess.channel for guess in columns if guess.channel] == ["arm.velocity", "stamped_force"]
+    assert [guess.why for guess in columns if guess.check == "not taken"] == ["the stamp of a message"] * 2
+
+
 def test_a_data_set_file_is_no_log(tmp_path):
     (tmp_path / "d.toml").write_text("recordings = []\n")
     with pytest.raises(ConfigError, match="is a data-set file"):
