@@ -6,7 +6,7 @@ import pytest
 from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError
 from edp.networks.twin import TWINS, fit_scales
-from edp.networks.twin.tuned import BOUND, NUMBER_GROUPS, TunedTwin, TunedSpec, group_matrix
+from edp.networks.twin.tuned import BOUND, NUMBER_GROUPS, TunedSpec, TunedTwin, group_matrix
 from edp.networks.twin.tuned_correction import TunedCorrection
 from edp.testing.twins import sample_actuators
 

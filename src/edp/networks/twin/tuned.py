@@ -3,7 +3,8 @@
 An observer follows the machine as in `edp.networks.twin.forecast`. Every `learn_ticks` ticks the stretch that has just
 been measured is run again, freely, from the observer's state at its beginning with the commands that came: once with
 the present numbers, and once for each *group* of numbers a little grown. With e the errors of the velocities in units
-of what they are on known machines, S their slopes by the logarithms x of the groups, and P the covariance of x::
+of what they lately were (root mean square), S the slopes of the runs by the logarithms x of the groups, and P their
+covariance::
 
     P = (P^-1 + S' S / n)^-1,  x = x + P S' clip(e) / n,   n ticks of the stretch, whose errors count as one tick's
     x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)
@@ -123,14 +124,14 @@ def group_matrix(twin: GreyTwin, groups: Sequence[str]) -> tuple[tuple[str, ...]
     columns, deviations, warmth = [], [], []
     for kind in groups:
         group = NUMBER_GROUPS[kind]
-        found: dict[str, list[int]] = {}
+        by_element: dict[str, list[int]] = {}
         for index, number in enumerate(twin.table.numbers):
             if number.name.startswith(group.names) and number.positive:
                 element = "" if group.shared else owner.get(number.element, number.element)
-                found.setdefault(element, []).append(index)
-        if not found:
+                by_element.setdefault(element, []).append(index)
+        if not by_element:
             raise ConfigError(f"tuning: the grey box has no number of the group '{kind}'; leave it out of groups")
-        for element, places in found.items():
+        for element, places in by_element.items():
             labels.append(f"{element}.{kind}".lstrip("."))
             columns.append(np.isin(np.arange(len(twin.table.numbers)), places).astype(np.float64))
             deviations.append(group.deviation)
@@ -147,8 +148,8 @@ class TunedTwin:
 
     Attributes:
         labels: of the groups.
-        logs: logarithms of the groups' factors, less `known` ``(group,)``; 0 where nothing has changed.
-        known: what the oil's temperature makes of them ``(group,)``.
+        logs: logarithms of the groups' factors, less `by_oil` ``(group,)``; 0 where nothing has changed.
+        by_oil: what the oil's temperature makes of them ``(group,)``.
         learn: False freezes them.
         learned: stretches that have taught.
 
@@ -172,7 +173,7 @@ class TunedTwin:
     def reset(self) -> None:
         """Forget the machine and all that was learned."""
         self.logs, self._prior = np.zeros(len(self.labels)), np.diag(self._deviation**2)
-        self.known = np.zeros(len(self.labels))
+        self.by_oil = np.zeros(len(self.labels))
         self._covariance, self.learned = self._prior.copy(), 0
         self._square, self._judged = np.zeros(len(self._speeds)), 0
         self._plain_runner = self.twin.runner()
@@ -195,12 +196,12 @@ class TunedTwin:
         self._runner.resistance = forces.copy()
 
     def _with(self, logs: Doubles) -> GreyTwin:
-        return self.twin.with_numbers(self.twin.numbers * np.exp(self._moves @ (self.known + logs)))
+        return self.twin.with_numbers(self.twin.numbers * np.exp(self._moves @ (self.by_oil + logs)))
 
     @property
     def factors(self) -> dict[str, float]:
         """Of each group, against the machine as it was."""
-        return dict(zip(self.labels, np.exp(self.known + self.logs).tolist(), strict=True))
+        return dict(zip(self.labels, np.exp(self.by_oil + self.logs).tolist(), strict=True))
 
     def step(self, command: Array, measured: Array, oil_c: float = math.nan) -> None:
         """Take one tick in.
@@ -239,21 +240,21 @@ class TunedTwin:
         if self._now is None or self._ticks <= self.twin.prefix_ticks:
             return None
         command, plain, tuned = self._now
-        held, first = np.repeat(command[None, None], ticks, axis=1), np.zeros(1, np.int64)
-        one, other = (
-            runner.branches(held, state, row, first)[0, -1, self._speeds]
+        commands, first = np.repeat(command[None, None], ticks, axis=1), np.zeros(1, np.int64)
+        as_it_was, as_it_is = (
+            runner.branches(commands, state, row, first)[0, -1, self._speeds]
             for runner, (state, row) in ((self._plain_runner, plain), (self._runner, tuned))
         )
-        return one, other
+        return as_it_was, as_it_is
 
     def _warm(self, oil_c: float) -> None:
         """Move the numbers by what the temperature of the oil makes of them."""
         apart = oil_c - self.spec.oil_c
         if not (abs(apart) <= 2.0 * HOTTEST_C and abs(oil_c) <= HOTTEST_C):
             return
-        known = self._warmth * apart
-        if (np.abs(known - self.known) > WARMER).any():
-            self.known = known
+        logs = self._warmth * apart
+        if (np.abs(logs - self.by_oil) > WARMER).any():
+            self.by_oil = logs
             self._renew(np.array(self._runner.resistance))
 
     def _port(self, state: TwinState, measured: Array) -> Array:
@@ -293,12 +294,12 @@ class TunedTwin:
         unit = self._unit(error)
         count, clipped = len(truth), np.clip(error / unit, -CLIP, CLIP).ravel()
         slopes = (slopes / unit[:, None]).reshape(len(clipped), -1)
-        known = np.linalg.inv(np.linalg.inv(self._covariance) + slopes.T @ slopes / count)
+        posterior = np.linalg.inv(np.linalg.inv(self._covariance) + slopes.T @ slopes / count)
         keep = math.exp(-self.spec.learn_ticks / (self.spec.forgetting_s * self.twin.channels.rate_hz))
         most = BOUND * self._deviation
-        self.logs = np.clip(keep * (self.logs + known @ (slopes.T @ clipped) / count), -most, most)
+        self.logs = np.clip(keep * (self.logs + posterior @ (slopes.T @ clipped) / count), -most, most)
         # Its symmetric part, so that rounding of thousands of inversions does not add up.
-        self._covariance = keep**2 * 0.5 * (known + known.T) + (1.0 - keep**2) * self._prior
+        self._covariance = keep**2 * 0.5 * (posterior + posterior.T) + (1.0 - keep**2) * self._prior
         self.learned += 1
         self._renew(np.array(self._runner.resistance))
 

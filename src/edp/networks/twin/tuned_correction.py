@@ -84,9 +84,9 @@ class TunedCorrection:
         self._judge(np.asarray(measured, np.float64)[self._columns])
         added = np.zeros_like(base)
         for h, k in enumerate(self._horizons):
-            said = self.tuned.forecast(k)
-            if said is not None:
-                added[h] = (said[1] - said[0])[self._columns]
+            forecasts = self.tuned.forecast(k)
+            if forecasts is not None:
+                added[h] = (forecasts[1] - forecasts[0])[self._columns]
         added = np.where(np.isfinite(added), np.clip(added, -self._limit, self._limit), 0.0)
         for h, rows in enumerate(self._rows):
             rows.append((base[h], base[h] + added[h]))
@@ -97,10 +97,10 @@ class TunedCorrection:
         for h, k in enumerate(self._horizons):
             if len(self._rows[h]) < k:
                 continue
-            plain, corrected = (np.abs(present - said) for said in self._rows[h].pop(0))
-            known = np.isfinite(plain) & np.isfinite(corrected)
-            self._plain[h][known] += self._rate * (plain - self._plain[h])[known]
-            self._corrected[h][known] += self._rate * (corrected - self._corrected[h])[known]
+            plain, corrected = (np.abs(present - expected) for expected in self._rows[h].pop(0))
+            usable = np.isfinite(plain) & np.isfinite(corrected)
+            self._plain[h][usable] += self._rate * (plain - self._plain[h])[usable]
+            self._corrected[h][usable] += self._rate * (corrected - self._corrected[h])[usable]
         worse = self._corrected > WORSE * self._plain
         better = self._corrected < BETTER * self._plain
         self.fallback = (self.fallback | worse) & ~better

@@ -143,7 +143,7 @@ def replay(
     adapter, replayed = RlsCorrector(adaptation), []
     plain = stream_predictions(predictor, series)
     moved = plain if moves is None else moves(plain)
-    for done, (part, base, given) in enumerate(zip(series, plain, moved, strict=True)):
+    for done, (part, base, start) in enumerate(zip(series, plain, moved, strict=True)):
         if on_recording is not None:
             on_recording(part.name, done, len(series))
         # The gap between recordings is no motion: predictions from before it must not be judged after it.
@@ -151,7 +151,7 @@ def replay(
         if not carry:
             adapter.reset()
         adapted, status = np.empty_like(base), np.zeros(len(base), dtype=np.int64)
-        for tick, (x, y) in enumerate(zip(part.inputs, given, strict=True)):
+        for tick, (x, y) in enumerate(zip(part.inputs, start, strict=True)):
             # Before a whole window the network itself is not warm; its errors would teach the wrong thing.
             adapted[tick], status[tick] = adapter.step(x, y, fresh=tick + 1 >= skip, learn=learn)
         replayed.append(Replayed(part.name, base, adapted, motion_s(adaptation, part.targets), status, part.targets))

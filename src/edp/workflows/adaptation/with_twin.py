@@ -12,7 +12,7 @@ from edp.data.task import Task
 from edp.errors import ConfigError, DataError
 from edp.ir.rls import Adaptation
 from edp.networks.twin import Twin
-from edp.networks.twin.tuned import TunedTwin, TunedSpec
+from edp.networks.twin.tuned import TunedSpec, TunedTwin
 from edp.networks.twin.tuned_correction import TunedCorrection
 from edp.recording import Recording
 
@@ -57,8 +57,8 @@ class TwinMoves:
             DataError: a channel of the twin is missing.
         """
         self.correction.tuned.learn = learn
-        task, made = self._twin.channels.task(), []
-        for recording, said in zip(recordings, predictions, strict=True):
+        task, moved = self._twin.channels.task(), []
+        for recording, predicted in zip(recordings, predictions, strict=True):
             try:
                 part = task.series(matched(self._twin.channels, recording))
             except DataError as error:
@@ -67,6 +67,6 @@ class TwinMoves:
                 self.correction.interrupt()
             else:
                 self.correction.reset()
-            rows = zip(part.inputs, part.targets, said, strict=True)
-            made.append(np.stack([self.correction.step(*row) for row in rows]))
-        return made
+            rows = zip(part.inputs, part.targets, predicted, strict=True)
+            moved.append(np.stack([self.correction.step(*row) for row in rows]))
+        return moved
