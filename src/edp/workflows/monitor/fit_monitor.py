@@ -291,9 +291,9 @@ def _sources(
     for job, result in zip(jobs, side_by_side(_fit_source, jobs), strict=True):
         if job.group is None:
             fits[job.spec] = result
-        elif result is not None:
+        elif result is not None and isinstance(job.spec, VirtualSensorsSpec):
             networks.setdefault(job.spec, {})[job.group.name] = result
-            fits[job.spec] = VirtualSensorsSpec.together(networks[job.spec], material)
+            fits[job.spec] = job.spec.together(networks[job.spec], material)
     sources = tuple(source for spec in experiment.residuals if (source := fits.get(spec)) is not None)
     if not sources:
         raise DataError(
