@@ -31,7 +31,7 @@ static void {own}_residuals({name}_state *s) {{
 }}
 """
 TURNS = """
-/* Runs every {every} ticks, by turns with others; residuals hold in between. What stood in for a missing value does not. */
+/* Runs every {every} ticks, by turns with others; residuals hold in between, but not what came of a missing value. */
 static void {own}_residuals({name}_state *s) {{
 {hold}    if (s->{own}_due == 0u) {{
         const bool known = {model}_step(&s->{own}, s->{own}_in, &s->{own}_out) <= EDP_WARMING;
@@ -174,7 +174,10 @@ class NetworkCode:
             rings = ("past", "width") if self.part.scaled else ("past",)
             lines += [f"float {self.own}_{ring}[{max(self.part.delays) + 1}][{self.residuals}];" for ring in rings]
         if self.turns:
-            lines += [f"uint32_t {self.own}_due; /* ticks until it runs */", f"float {self.own}_kept[{self.residuals}];"]
+            lines += [
+                f"uint32_t {self.own}_due; /* ticks until it runs */",
+                f"float {self.own}_kept[{self.residuals}];",
+            ]
         return lines
 
     def constants(self, tables: MonitorTables) -> None:
