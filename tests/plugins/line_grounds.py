@@ -22,6 +22,7 @@ from unittest import mock
 import numpy as np
 from page_grounds import lever_logs
 from small_monitors import fitted_monitor
+from small_studies import CHANGES
 
 from edp.cli import app
 from edp.cli.console import run_app
@@ -53,14 +54,6 @@ MACHINES = (
     *TRAINING,
 )
 FEW = ('task.targets=["CylVels_1"]', 'task.features={name="few",channels=["CylVels_1","BmUp"]}')
-SEARCH = (
-    'task={targets=["CylVels_1"], horizons=[1]}',
-    'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',
-    "training.chunks={length=32, batch=4, burn_in=5}",
-    'search={horizon=1, backbones=["lstm"], features=["FG1", "FG2"], updates=2, folds=2, variance_runs=4}',
-    "search={variance_seeds=1, trials=2, compression={on=false}}",
-    "search.space={units=[2, 4], kernel=false}",
-)
 LIMIT = ("limit.moments=4", "limit.branches=4", "limit.horizons=[1,10]")
 LOOP = ("task.length_m=[0.4,0.5]", "task.hold_s=0.2", "task.lead_s=0.2")
 JUDGED = ("judge.seconds=4", "judge.starts=2", "judge.at_s=[1,4]")
@@ -359,7 +352,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     "actuators_csv": lambda ground, path: _table(ground.of("actuators"), path),
     "actuators_map": lambda ground, path: _map_of(ground.of("actuators"), path),
     "study": _made_by(
-        "search", "{logs}", "--study", "{out}", "--workers", "1", "--phase", "isolation", *settings(SEARCH)
+        "search", "{logs}", "--study", "{out}", "--workers", "1", "--phase", "isolation", *settings(CHANGES)
     ),
     "mapped": lambda ground, path: _table(ground.of("logs"), path),
     "map": lambda ground, path: _map_of(ground.of("logs"), path),
@@ -515,7 +508,7 @@ MORE: Mapping[str, tuple[str, ...]] = {
     r"^train .*--minutes": tuple(settings(FEW)),
     r"^train .*--config examples": (),
     r"^train": ("--minutes", "0.01", *settings(FEW)),
-    r"^search run": ("--phase", "isolation", "--workers", "1", *settings(SEARCH)),
+    r"^search run": ("--phase", "isolation", "--workers", "1", *settings(CHANGES)),
     r"^pretrain .*test_masses": ("--preset", "quick", *settings(MACHINES[1:])),
     r"^pretrain (?!.*--preset)": ("--preset", "quick", *settings(MACHINES)),
     r"^pretrain": tuple(settings(MACHINES)),
