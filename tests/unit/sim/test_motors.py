@@ -16,6 +16,7 @@ from edp.sim.physics import dynamics, friction, motors
 from edp.sim.physics.motor_circuit import MotorCircuit
 from edp.sim.physics.plant import Plant
 from edp.sim.sensors.sensors import truth_columns
+from edp.workflows.live.sources.sim import SimSource
 
 STEP_S = 1e-3
 TEXT = resources.files("edp.sim").joinpath("machines", "m22.toml").read_text(encoding="utf-8")
@@ -229,7 +230,9 @@ def test_a_dig_with_swing_dumps_beside_where_it_dug(machine):
     assert np.median(np.abs(swing[dug])) < 0.25
 
 
-def test_an_environment_moves_the_front_alone():
+def test_environments_and_the_live_simulator_move_the_front_alone():
+    with pytest.raises(ConfigError, match="six_levers swings and travels, which nothing here does"):
+        SimSource("M22", 100.0, settings={"excitation": "six_levers"})
     assert EnvironmentSpec().scenario(0).excitation == "combined"
     with pytest.raises(ConfigError, match="observed channel 'SwingVel' is unknown"):
         EnvironmentSpec(observed=("SwingVel",))
