@@ -25,8 +25,8 @@ class SwingDig(Dig):
     LEVEL = (0.55, 1.0)
     BRAKES_AT = 0.4
     """rad/s^2 that the operator takes for the deceleration of a closed valve."""
-    CLOSE_RAD = 0.06
-    """Angle left at which the swing is not moved any more."""
+    CLOSE_RAD, NEAR_RAD = 0.06, 0.25
+    """Angle left at which the swing is not moved any more, and at which the bucket is lowered or emptied."""
     TRAVELS = 0.3
     """Share of cycles with travel."""
     TRAVEL_S, TRAVEL_LEVEL = (0.6, 2.5), (0.4, 1.0)
@@ -38,7 +38,9 @@ class SwingDig(Dig):
         self._tracks = np.zeros(2)
 
     def next_leg(self, view: View) -> Array:
-        """The leg of the next phase; swing and travel follow the phase."""
+        """The leg of the next phase, or a stay where the swing is not yet there; swing and travel follow the phase."""
+        if self._phase in (APPROACH, CURL) and abs(self._swing_goal - view.swing) > self.NEAR_RAD:
+            return self.stroke_leg(self._queue[-1], 1.0)
         leg = super().next_leg(view)
         rng = self._rng
         if self._phase == CURL:
@@ -61,9 +63,14 @@ class SwingDig(Dig):
             self._travel_left_s -= self.step_s
         return targets
 
+    @property
+    def _swing_goal(self) -> float:
+        """The side while lifting and dumping, the dig otherwise."""
+        return self._side if self._phase in (CURL, DUMP) else 0.0
+
     def _swing_lever(self, view: View) -> float:
-        """Towards the side while lifting and dumping, back to the dig otherwise; centred where braking suffices."""
-        left = (self._side if self._phase in (CURL, DUMP) else 0.0) - view.swing
+        """Towards the goal; centred where braking suffices."""
+        left = self._swing_goal - view.swing
         braking = view.swing_rate * abs(view.swing_rate) / (2.0 * self.BRAKES_AT)
         # What is left once the motion has died out by itself.
         left -= braking

@@ -170,6 +170,7 @@ def _motor(motor: Any, s: float, sweep: float, weight: float) -> Any:
     changed = {key: getattr(motor, key) * s**sweep for key in forces}
     flows = {key: (getattr(motor, key)[0] * s**2, getattr(motor, key)[1]) for key in ("meter_in", "meter_out")}
     leaks = {key: getattr(motor, key) * s for key in ("leakage", "drain_leakage")}
+    leaks["relief_slope"] = motor.relief_slope * s**2
     slower = {key: float(getattr(motor, key) / np.sqrt(s)) for key in ("pilot_frequency", "spool_frequency")}
     return replace(
         motor,

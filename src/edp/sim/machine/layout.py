@@ -60,9 +60,9 @@ OPENINGS = 8
 MOTORS = 3
 (
     MOTOR_PUMP, SWEPT, MOTOR_INERTIA, MOTOR_VOLUME, MOTOR_LEAK, MOTOR_DRAIN, MOTOR_COULOMB, MOTOR_VISCOUS, BRAKE,
-    BRAKE_DELAY, MOTOR_RELIEF, MOTOR_DEAD_BAND, MOTOR_DEMAND, MOTOR_IN, MOTOR_OUT, FOOT_AHEAD,
-) = range(16)  # fmt: skip
-MOTOR_VALUES = 16
+    BRAKE_DELAY, MOTOR_RELIEF, MOTOR_SLOPE, MOTOR_DEAD_BAND, MOTOR_DEMAND, MOTOR_IN, MOTOR_OUT, FOOT_AHEAD,
+) = range(17)  # fmt: skip
+MOTOR_VALUES = 17
 # state[motor, ...]: speed (rad/s, of tracks m/s), pressures of its ports, way (rad, m), time since its spool closed (s)
 SPEED, PORT_A, PORT_B, WAY, IDLE = range(5)
 MOTOR_STATES = 5

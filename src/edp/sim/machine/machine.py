@@ -235,7 +235,8 @@ class Motor:
         viscous: N m s (N s/m).
         brake: of the parking brake, N m (N).
         brake_delay: s after which it falls in, once its spool has closed.
-        relief: of the valve at each port, Pa.
+        relief: pressure at which the valve of each port opens, Pa.
+        relief_slope: flow through it for each Pa above, m^3/s/Pa.
         pilot_frequency: Hz, as in `Valves`.
         spool_frequency: Hz.
         dead_time: of its command, s.
@@ -256,6 +257,7 @@ class Motor:
     brake: float
     brake_delay: float
     relief: float
+    relief_slope: float
     pilot_frequency: float
     spool_frequency: float
     dead_time: float

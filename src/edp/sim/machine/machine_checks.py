@@ -66,6 +66,7 @@ _MOTOR: Mapping[str, ParameterBound] = {
     "brake": NOT_NEGATIVE,
     "brake_delay": ParameterBound(0.0, 60.0),
     "relief": POSITIVE,
+    "relief_slope": POSITIVE,
     "pilot_frequency": FREQUENCY,
     "spool_frequency": FREQUENCY,
     "dead_time": ParameterBound(0.0, 2.0),

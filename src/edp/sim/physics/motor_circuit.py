@@ -36,7 +36,7 @@ def pack_motors(machine: Machine) -> Array:
     for row, motor in zip(numbers, motors, strict=True):
         row[: at.FOOT_AHEAD] = (
             *(motor.pump - 1, motor.displacement, motor.inertia, motor.volume, motor.leakage, motor.drain_leakage),
-            *(motor.coulomb, motor.viscous, motor.brake, motor.brake_delay, motor.relief),
+            *(motor.coulomb, motor.viscous, motor.brake, motor.brake_delay, motor.relief, motor.relief_slope),
             *(motor.dead_band, motor.pump_demand, conductance(motor.meter_in), conductance(motor.meter_out)),
         )
     numbers[2, at.MOTOR_PUMP] = 1.0 - numbers[1, at.MOTOR_PUMP]

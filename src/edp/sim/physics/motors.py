@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 Motors = tuple[Array, ...]
 STILL = 5e-3
 """Speed (rad/s, m/s) below which dry friction fades, so that it needs no state of its own."""
+NEVER = 1e12
+"""Pa, at which no relief opens."""
 
 # Motors[...]
 (
@@ -138,6 +140,18 @@ def drag(i: int, speed: float, motors: Motors) -> tuple[float, float]:
 
 
 @inlined
+def port_flows(pressure: float, i: int, motors: Motors, plant: Array) -> tuple[float, float]:
+    """Inflow (m^3/s) of a port of motor `i` through relief, make-up check and drain, and its slope (<= 0)."""
+    numbers = motors[NUMBERS]
+    flow, slope = hydraulics.port_flows(pressure, NEVER, numbers[i, at.MOTOR_DRAIN] * plant[at.THINNING], plant)
+    above, relief_slope = pressure - numbers[i, at.MOTOR_RELIEF], numbers[i, at.MOTOR_SLOPE]
+    # Softer than those of the cylinders: oil of a port is little, and a step would chatter about a steep one.
+    if above > 0.0:
+        return flow - relief_slope * above, slope - relief_slope
+    return flow, slope
+
+
+@inlined
 def port_rates(
     i: int, state: Array, supply: tuple[float, float], motors: Motors, plant: Array, jacobian: bool
 ) -> tuple[float, float, float]:
@@ -147,15 +161,14 @@ def port_rates(
     """
     numbers, opened, e = motors[NUMBERS], motors[OPENED], motors[SLOPE]
     a, b, tank = state[i, at.PORT_A], state[i, at.PORT_B], plant[at.TANK]
-    relief, thin = numbers[i, at.MOTOR_RELIEF], plant[at.THINNING]
     check, most = plant[at.REGEN_CHECK], plant[at.SECTION_DROP]
-    q_a, a_a = hydraulics.port_flows(a, relief, numbers[i, at.MOTOR_DRAIN] * thin, plant)
-    q_b, b_b = hydraulics.port_flows(b, relief, numbers[i, at.MOTOR_DRAIN] * thin, plant)
+    q_a, a_a = port_flows(a, i, motors, plant)
+    q_b, b_b = port_flows(b, i, motors, plant)
     in_a, a_p, a_load = hydraulics.section(opened[i, IN_A], supply[0], a, supply[1], check, most)
     in_b, b_p, b_load = hydraulics.section(opened[i, IN_B], supply[0], b, supply[1], check, most)
     out_a, a_out = hydraulics.drain(opened[i, OUT_A], a - tank, 1.0)
     out_b, b_out = hydraulics.drain(opened[i, OUT_B], b - tank, 1.0)
-    across = numbers[i, at.MOTOR_LEAK] * thin
+    across = numbers[i, at.MOTOR_LEAK] * plant[at.THINNING]
     through = across * (a - b) + numbers[i, at.SWEPT] * state[i, at.SPEED]
     c_a = hydraulics.stiffness(a, plant) / numbers[i, at.MOTOR_VOLUME]
     c_b = hydraulics.stiffness(b, plant) / numbers[i, at.MOTOR_VOLUME]
