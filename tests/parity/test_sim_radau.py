@@ -259,9 +259,8 @@ class Moving(Reference):
             through = motor.leakage * self.thin * (a[i] - b[i]) + motor.displacement * speed[i]
             flows += np.array([-through, through])
             for n, p in enumerate((a[i], b[i])):
-                flows[n] -= motor.drain_leakage * self.thin * (p - tank) + v.port_relief_slope * max(
-                    p - motor.relief, 0
-                )
+                flows[n] -= motor.drain_leakage * self.thin * (p - tank)
+                flows[n] -= motor.relief_slope * max(p - motor.relief, 0)
                 flows[n] += self.k(v.anti_cavitation) * self.orifice(max(tank - p, 0))
             self.flows_in[:, i] = flows
         return super().pumps(y, np.concatenate((pilots, pilot)), np.concatenate((spools, spool)), drawn)
