@@ -172,9 +172,9 @@ def test_the_integrator_keeps_its_order():
 
 
 def test_pumps_that_sense_loads_sense_the_swing():
-    log = run([0, 0, 0, 1, 0, 0], 1.5, machine_with(SENSING))[1]
+    log = run([0, 0, 0, 0.5, 0, 0], 1.5, machine_with(SENSING))[1]
     margin = log[-50:, at.PUMP + 1] - column(log, "SwingPressure_1")[-50:]
-    assert 0.5 * 30e5 < margin.mean() < 1.1 * 30e5
+    assert 0.65 * 30e5 < margin.mean() < 1.05 * 30e5
     assert log[-1, at.PUMP] < 40e5
     shared = machine_with(SENSING, valves={"flow_sharing": "compensated"})
     alone, both = (
