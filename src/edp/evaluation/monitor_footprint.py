@@ -296,5 +296,5 @@ def _source_bytes(part: SourcePart) -> int:
     coverages = len(part.bundle.predictor.output.coverages)
     out = len(task.targets) * len(task.horizons) * (1 + 2 * coverages)
     rings = 0 if max(part.delays) == 0 else (max(part.delays) + 1) * len(part.judged) * (2 if part.scaled else 1)
-    kept = 0 if part.every == 1 else 1 + len(part.judged)
-    return buffers + network + 4 * (out + rings + kept)
+    last = 0 if part.every == 1 else 1 + len(part.judged)
+    return buffers + network + 4 * (out + rings + last)

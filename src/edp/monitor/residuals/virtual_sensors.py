@@ -49,7 +49,7 @@ class _Turn:
     """Of one network: ticks until it runs next, its last residuals (streams, judged), its memory."""
 
     due: int
-    held: Rows
+    residuals: Rows
     network: Any
 
 
@@ -96,14 +96,14 @@ class VirtualSensors(ResidualSource):
         with torch.inference_mode():
             for bundle, (fed, judged), turn in zip(self.bundles.values(), self._columns, own, strict=True):
                 at = slice(turn.due, None, self.every)
-                residuals, network = turn.held[:, None], turn.network
+                residuals, network = turn.residuals[:, None], turn.network
                 if turn.due < rows.shape[1]:
                     fed_rows = torch.from_numpy(np.ascontiguousarray(rows[:, at, fed]))
                     expected, network = bundle.predictor.predict(fed_rows, turn.network)
-                    found = rows[:, at, judged] - expected[..., 0, :].numpy()
+                    differences = rows[:, at, judged] - expected[..., 0, :].numpy()
                     # What stood in for a missing value must not outlast the tick.
-                    found[~(there[:, at, fed].all(axis=-1, keepdims=True) & there[:, at, judged])] = np.nan
-                    residuals = np.concatenate([residuals, found], axis=1)
+                    differences[~(there[:, at, fed].all(axis=-1, keepdims=True) & there[:, at, judged])] = np.nan
+                    residuals = np.concatenate([residuals, differences], axis=1)
                 newest = (np.arange(rows.shape[1]) - turn.due) // self.every + 1
                 parts.append(residuals[:, newest])
                 turns.append(_Turn((turn.due - rows.shape[1]) % self.every, residuals[:, -1], network))
