@@ -176,11 +176,14 @@ def saved_twin(kind, sessions, folder, rate_hz=100.0):
     return str(folder)
 
 
-def test_a_grey_box_that_follows_the_machine_moves_what_is_replayed(adapted, lever_sessions, tmp_path):
+def test_a_grey_box_that_follows_the_machine_moves_what_is_replayed(adapted, lever_sessions, tmp_path, monkeypatch):
     folder, command = str(adapted[0]), CliRunner()
+    monkeypatch.setattr("edp.networks.twin.tuned_correction.JUDGED_S", 0.5)  # the logs take three seconds
     twin = saved_twin(GreyBox(), lever_sessions, tmp_path / "grey")
     plain, moved = (
-        json.loads(command.invoke(app, ["replay", folder, str(lever_sessions.path), *more, "--json"]).stdout)["mae"]
+        json.loads(
+            command.invoke(app, ["replay", folder, str(lever_sessions.path), "--carry", *more, "--json"]).stdout
+        )["mae"]
         for more in ((), ("--twin", twin))
     )
     assert [row["base"] for row in moved] == [row["base"] for row in plain]

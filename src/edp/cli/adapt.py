@@ -58,7 +58,7 @@ def replay(
     frozen: Annotated[bool, typer.Option("--frozen", help="Apply the correction without learning.")] = False,
     twin: Annotated[
         Path | None,
-        typer.Option("--twin", help="Grey box of the machine as it was, whose numbers follow it and move predictions."),
+        typer.Option("--twin", help="Grey box of the machine as it was: its numbers follow, and it is mixed in."),
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006

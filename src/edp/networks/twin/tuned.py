@@ -10,8 +10,7 @@ covariance::
     x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)
 
 which is a Kalman filter on numbers that fade to what they were. Forces that no number stands for, as those of soil, are
-estimated tick by tick (`LoadEstimate`). What the machine's change is worth to any predictor is the difference of two
-forecasts: of the tuned numbers with these forces, and of the numbers as they were without.
+estimated tick by tick (`LoadEstimate`). A forecast runs from the observer's state with the numbers and forces of now.
 """
 
 from __future__ import annotations
@@ -176,18 +175,16 @@ class TunedTwin:
         self.by_oil = np.zeros(len(self.labels))
         self._covariance, self.learned = self._prior.copy(), 0
         self._square, self._judged = np.zeros(len(self._speeds)), 0
-        self._plain_runner = self.twin.runner()
         self.interrupt()
 
     def interrupt(self) -> None:
         """Tell that ticks are missing: the observer begins anew at the next one; what was learned stays."""
         self._renew(np.zeros(len(self._speeds)))
-        self._plain: TwinState | None = None
-        self._tuned: TwinState | None = None
+        self._state: TwinState | None = None
         self._commands: list[Array] = []
         self._measured: list[Array] = []
         self._begin: tuple[TwinState, Array, Doubles] | None = None
-        self._now: tuple[Array, tuple[TwinState, Array], tuple[TwinState, Array]] | None = None
+        self._now: tuple[Array, TwinState, Array] | None = None
         self._ticks = 0
 
     def _renew(self, forces: Doubles) -> None:
@@ -215,37 +212,31 @@ class TunedTwin:
         if not np.isfinite(command).all():
             self.interrupt()
             return
-        if self._plain is None or self._tuned is None:
+        if self._state is None:
             if not (np.isfinite(measured).all() and self.twin.within_stops(measured[None])[0]):
                 return
-            rest = self.twin.initial_state(command[None], measured[None])
-            self._plain, self._tuned = dict(rest), dict(rest)
+            self._state = dict(self.twin.initial_state(command[None], measured[None]))
         self._take(measured)
         self._load.update(measured[self._speeds].astype(np.float64))
-        plain, tuned = (self._port(state, measured) for state in (self._plain, self._tuned))
-        self._now = (command, (self._plain, plain), (self._tuned, tuned))
+        row = self._port(self._state, measured)
+        self._now = (command, self._state, row)
         self._ticks += 1
         if self._begin is None and self._ticks > self.twin.prefix_ticks:
-            self._begin = (self._tuned, tuned, np.array(self._runner.resistance))
+            self._begin = (self._state, row, np.array(self._runner.resistance))
             self._commands, self._measured = [], []
         if self._begin is not None:
             self._commands.append(command)
-        self._plain = self._plain_runner.step(command, self._plain, plain)
-        after = self._runner.step(command, self._tuned, tuned)
-        self._load.expect(command, tuned, self._tuned, after)
-        self._tuned = after
+        after = self._runner.step(command, self._state, row)
+        self._load.expect(command, row, self._state, after)
+        self._state = after
 
-    def forecast(self, ticks: int) -> tuple[Doubles, Doubles] | None:
-        """Velocities so many ticks ahead with the command held: as the machine was, and as it is; None at the start."""
+    def forecast(self, ticks: int) -> Doubles | None:
+        """Velocities so many ticks ahead with the command held ``(velocity,)``; None at the start."""
         if self._now is None or self._ticks <= self.twin.prefix_ticks:
             return None
-        command, plain, tuned = self._now
+        command, state, row = self._now
         commands, first = np.repeat(command[None, None], ticks, axis=1), np.zeros(1, np.int64)
-        as_it_was, as_it_is = (
-            runner.branches(commands, state, row, first)[0, -1, self._speeds]
-            for runner, (state, row) in ((self._plain_runner, plain), (self._runner, tuned))
-        )
-        return as_it_was, as_it_is
+        return np.asarray(self._runner.branches(commands, state, row, first)[0, -1, self._speeds])
 
     def _warm(self, oil_c: float) -> None:
         """Move the numbers by what the temperature of the oil makes of them."""

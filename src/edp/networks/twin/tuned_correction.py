@@ -1,4 +1,4 @@
-"""What a grey box that follows the machine adds to a network's predictions, judged tick by tick."""
+"""A network's predictions and the forecasts of a grey box that follows the machine, mixed by what they were worth."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
-from edp.networks.twin.tuned import TunedTwin
+from edp.networks.twin.tuned import REST, TunedTwin
 
 Array = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 JUDGED_S = 10.0
-"""Over which errors without and with the correction are compared."""
-WORSE, BETTER = 1.05, 0.99
-"""Shares of the error without it at which a correction is taken back, and let out again."""
+"""Seconds of motion over which errors of both are averaged, and before which nothing is moved."""
 
 
 class TunedCorrection:
-    """Moves predictions by what the change of the machine is worth to a grey box: tuned less plain forecast.
+    """Moves predictions towards the forecasts of a grey box that follows the machine.
 
-    The network knows the machine as it was, and so does the grey box with its first numbers; what the tuned numbers say
-    otherwise of the next ticks is added, at most `limit`. A correction that does worse than none over the last
-    `JUDGED_S` is taken back, number by number, until it would do better.
+    With y what the network predicted, f what the grey box forecast, and e their errors, known when a prediction comes
+    due and averaged over the last `JUDGED_S` of motion, the prediction becomes ``y + w (f - y)`` with the weight of the
+    least squared error of such a mixture::
+
+        w = (mean e_y^2 - mean e_y e_f) / (mean e_y^2 + mean e_f^2 - 2 mean e_y e_f), within 0 and 1
+
+    for each horizon and target; by at most `limit`. A grey box that is worse, and whose errors say nothing of the
+    network's, has the weight 0: then predictions go out as they came.
 
     Args:
         tuned: the grey box; the correction feeds it.
@@ -33,7 +36,7 @@ class TunedCorrection:
         limit: largest correction ``(horizon, target)``, SI units.
 
     Attributes:
-        fallback: which numbers go out as they came ``(horizon, target)``.
+        weight: w ``(horizon, target)``.
 
     Raises:
         ConfigError: a target that is no velocity of the twin, a horizon below 1, or a limit that is not positive.
@@ -54,15 +57,15 @@ class TunedCorrection:
             raise ConfigError(f"limit of shape {np.shape(limit)}; positive numbers of shape {shape} must hold")
         self.tuned, self._horizons, self._limit = tuned, tuple(horizons), np.asarray(limit, np.float64)
         self._columns = [names.index(name) for name in targets]
-        self._rate = 1.0 - math.exp(-1.0 / (JUDGED_S * tuned.twin.channels.rate_hz))
+        self._rate = 1.0 / (JUDGED_S * tuned.twin.channels.rate_hz)
         self.reset()
 
     def reset(self) -> None:
         """Forget the machine and all that was learned."""
         self.tuned.reset()
-        shape = self._limit.shape
-        self.fallback = np.zeros(shape, dtype=bool)
-        self._plain, self._corrected = np.zeros(shape), np.zeros(shape)
+        self.weight = np.zeros(self._limit.shape)
+        self._products = np.zeros((3, *self._limit.shape))
+        self._judged = np.zeros(len(self._horizons), np.int64)
         self.interrupt()
 
     def interrupt(self) -> None:
@@ -74,33 +77,40 @@ class TunedCorrection:
         """Take a tick in and correct what was predicted from it.
 
         Args:
-            command: of the twin ``(command,)``, finite.
+            command: of the twin ``(command,)``; one that is missing interrupts.
             measured: what the twin answers ``(answer,)``, NaN where a sensor is missing.
             prediction: the network's ``(horizon, target)``, SI units; as it is where it is not finite.
             oil_c: temperature of the oil (degC); NaN: not measured.
         """
+        if not np.isfinite(command).all():
+            self.interrupt()
         self.tuned.step(command, measured, oil_c)
-        base = np.asarray(prediction, np.float64)
         self._judge(np.asarray(measured, np.float64)[self._columns])
-        added = np.zeros_like(base)
+        base = np.asarray(prediction, np.float64)
+        moved = base.copy()
         for h, k in enumerate(self._horizons):
-            forecasts = self.tuned.forecast(k)
-            if forecasts is not None:
-                added[h] = (forecasts[1] - forecasts[0])[self._columns]
-        added = np.where(np.isfinite(added), np.clip(added, -self._limit, self._limit), 0.0)
-        for h, rows in enumerate(self._rows):
-            rows.append((base[h], base[h] + added[h]))
-        return np.where(self.fallback, base, base + added).astype(np.float32)
+            forecast = self.tuned.forecast(k)
+            ahead = np.full(base.shape[1], np.nan) if forecast is None else forecast[self._columns]
+            self._rows[h].append((base[h], ahead))
+            step = np.clip(self.weight[h] * (ahead - base[h]), -self._limit[h], self._limit[h])
+            moved[h] += np.where(np.isfinite(step), step, 0.0)
+        return moved.astype(np.float32)
 
     def _judge(self, present: Doubles) -> None:
-        """Compare what was said of this tick, without and with the correction."""
+        """Learn from what was predicted and forecast of this tick what each is worth."""
         for h, k in enumerate(self._horizons):
             if len(self._rows[h]) < k:
                 continue
-            plain, corrected = (np.abs(present - expected) for expected in self._rows[h].pop(0))
-            usable = np.isfinite(plain) & np.isfinite(corrected)
-            self._plain[h][usable] += self._rate * (plain - self._plain[h])[usable]
-            self._corrected[h][usable] += self._rate * (corrected - self._corrected[h])[usable]
-        worse = self._corrected > WORSE * self._plain
-        better = self._corrected < BETTER * self._plain
-        self.fallback = (self.fallback | worse) & ~better
+            # Shares of the limit, so that one spike of a sensor weighs no more than the largest correction.
+            ours, theirs = (np.clip((present - row) / self._limit[h], -1.0, 1.0) for row in self._rows[h].pop(0))
+            products = np.stack([ours * ours, theirs * theirs, ours * theirs])
+            if not np.isfinite(products).all() or (np.abs(present) <= REST).all():
+                continue
+            self._judged[h] += 1
+            self._products[:, h] += (products - self._products[:, h]) * max(self._rate, 1.0 / self._judged[h])
+            if self._judged[h] * self._rate >= 1.0:
+                own, other, both = self._products[:, h]
+                apart = own + other - 2.0 * both
+                self.weight[h] = np.where(
+                    apart > 0.0, np.clip((own - both) / np.where(apart > 0.0, apart, 1.0), 0, 1), 0.0
+                )

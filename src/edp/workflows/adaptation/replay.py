@@ -174,8 +174,8 @@ def replay_run(
         carry: keep what was learned from one recording to the next.
         learn: False freezes what was learned.
         on_recording: called with name, how many are done and of how many.
-        twin: run folder of a grey box of the machine as it was, whose numbers follow the machine and move the
-            network's predictions before they are corrected (`edp.networks.twin.tuned_correction`); None: none does.
+        twin: run folder of a grey box of the machine as it was, whose numbers follow the machine and towards which the
+            network's predictions move before they are corrected (`edp.networks.twin.tuned_correction`); None: none.
 
     Raises:
         EdpError: a run without adaptation, logs that do not go with its network, or a twin that does not.
