@@ -127,6 +127,11 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
         raise ConfigError(f"--from {start_s:g}: {span(0.0, MOST_SECONDS).rule('from')} must hold")
     start = prefix if start_s is None else round(start_s * rate)
     ticks = max(1, round(seconds * rate))
+    if recording.samples < prefix + 2:
+        raise DataError(
+            f"'{recording.name}' has {recording.samples} ticks ({recording.duration_s:g} s); the twin needs a prefix "
+            f"of {prefix} measured ones ({prefix / rate:g} s) and two more: give a longer log"
+        )
     if start < prefix:
         raise DataError(
             f"a free run from {start / rate:g} s has {start} measured ticks before it; the twin needs a prefix of "
