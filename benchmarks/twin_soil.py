@@ -53,7 +53,7 @@ MODELS = ("static", "default", "grey box", "grey box on a ground", "network on t
 GROUNDS = ("dry_sand", "sandy_loam", "gravel")
 """Endings of the names of recordings in soil."""
 VALIDATION_S = 10.0
-FIT, STRETCHES = GreyFitSpec(ticks=4000, starts=1, final_rounds=0), 5
+FIT, STRETCHES = GreyFitSpec(ticks=2500, starts=1, final_rounds=0), 5
 """Of grey boxes: short ones, since it is soil that leaves errors, and not their numbers."""
 
 

@@ -30,8 +30,8 @@ def command_ranges(channels: TwinChannels, series: Sequence[Series], before: Any
     high = np.max([part.inputs.max(axis=0) for part in series], axis=0)
     ranges = {c.name: [float(a), float(b)] for c, a, b in zip(channels.commands, low, high, strict=True)}
     for name, taught in before.items() if isinstance(before, Mapping) else ():
-        if name in ranges and _is_range(taught):
-            ranges[name] = [min(ranges[name][0], taught[0]), max(ranges[name][1], taught[1])]
+        if name in ranges and (ends := _ends(taught)):
+            ranges[name] = [min(ranges[name][0], ends[0]), max(ranges[name][1], ends[1])]
     return ranges
 
 
@@ -48,10 +48,10 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
         return found
     values = np.concatenate([np.asarray(rows, dtype=np.float64) for rows in inputs])
     for column, channel in enumerate(channels.commands):
-        taught = ranges.get(channel.name)
-        if not _is_range(taught):
+        ends = _ends(ranges.get(channel.name))
+        if ends is None:
             continue
-        low, high = taught
+        low, high = ends
         margin, own = MARGIN * (high - low), values[:, column]
         share = float(((own < low - margin) | (own > high + margin)).mean())
         if share > 0.0:
@@ -61,10 +61,13 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
     return found
 
 
-def _is_range(value: Any) -> bool:
+def _ends(value: Any) -> tuple[float, float] | None:
+    """Two finite numbers that do not fall; None: something else."""
     if not isinstance(value, list) or len(value) != 2:
-        return False
-    return all(isinstance(end, int | float) and math.isfinite(end) for end in value) and value[0] <= value[1]
+        return None
+    if not all(isinstance(end, int | float) and math.isfinite(end) for end in value) or value[0] > value[1]:
+        return None
+    return float(value[0]), float(value[1])
 
 
 def beyond_sentence(found: Mapping[str, Mapping[str, float]]) -> str:
