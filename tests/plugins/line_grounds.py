@@ -22,15 +22,18 @@ from unittest import mock
 import numpy as np
 from page_grounds import lever_logs
 from small_monitors import fitted_monitor
+from small_studies import CHANGES
 
 from edp.cli import app
 from edp.cli.console import run_app
 from edp.logs import write_recording
 from edp.monitor.monitor_file import save_monitor
 from edp.networks.twin import TWINS
+from edp.networks.twin.grey.ground_contact import NUMBERS
+from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY, Channel, Kind
-from edp.testing.control import sample_excavator_twin
+from edp.testing.control import sample_excavator_twin, sample_grey_box
 from edp.testing.monitor import rig_sessions
 from edp.testing.twins import sample_actuators
 from edp.training.twin_bundle import TwinBundle, save_twin
@@ -53,14 +56,6 @@ MACHINES = (
     *TRAINING,
 )
 FEW = ('task.targets=["CylVels_1"]', 'task.features={name="few",channels=["CylVels_1","BmUp"]}')
-SEARCH = (
-    'task={targets=["CylVels_1"], horizons=[1]}',
-    'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',
-    "training.chunks={length=32, batch=4, burn_in=5}",
-    'search={horizon=1, backbones=["lstm"], features=["FG1", "FG2"], updates=2, folds=2, variance_runs=4}',
-    "search={variance_seeds=1, trials=2, compression={on=false}}",
-    "search.space={units=[2, 4], kernel=false}",
-)
 LIMIT = ("limit.moments=4", "limit.branches=4", "limit.horizons=[1,10]")
 LOOP = ("task.length_m=[0.4,0.5]", "task.hold_s=0.2", "task.lead_s=0.2")
 JUDGED = ("judge.seconds=4", "judge.starts=2", "judge.at_s=[1,4]")
@@ -98,6 +93,12 @@ class Line(NamedTuple):
     text: str
     command: str
     words: tuple[str, ...]
+
+    @property
+    def ends_within_an_option(self) -> bool:
+        """Whether the value of the last option is missing: a sentence names the option."""
+        last = commands.commands()[tuple(self.command.split())].options.get(self.words[-1])
+        return last is not None and not getattr(last, "is_flag", False)
 
     @property
     def roles(self) -> tuple[str, ...]:
@@ -138,7 +139,8 @@ def lines_of(page: Path) -> Iterator[Line]:
         needed = sum(option.required for option in places)
         must = [option for option in known[named].parsed.params if option.required and option not in places]
         given = sum(role.isdigit() for role in line.roles)
-        if given >= needed and all(set(option.opts) & set(line.words) for option in must):
+        whole = given >= needed and all(set(option.opts) & set(line.words) for option in must)
+        if whole and not line.ends_within_an_option:
             yield line
 
 
@@ -299,6 +301,12 @@ def _named(ground: Ground, path: Path) -> None:
     _write(recordings, path)
 
 
+def _grounded(ground: Ground, path: Path) -> None:
+    """A grey box on a ground without resistance, neither of them fitted."""
+    law = DragLaw(np.zeros(NUMBERS), np.zeros(NUMBERS), bucket_m=1.3, surface_m=-1.5)
+    save_twin(replace(sample_grey_box("C14"), ground=law), path / "twin")
+
+
 def _monitor(ground: Ground, path: Path) -> None:
     from edp.logs import read_data_set
 
@@ -359,7 +367,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     "actuators_csv": lambda ground, path: _table(ground.of("actuators"), path),
     "actuators_map": lambda ground, path: _map_of(ground.of("actuators"), path),
     "study": _made_by(
-        "search", "{logs}", "--study", "{out}", "--workers", "1", "--phase", "isolation", *settings(SEARCH)
+        "search", "{logs}", "--study", "{out}", "--workers", "1", "--phase", "calibration", *settings(CHANGES)
     ),
     "mapped": lambda ground, path: _table(ground.of("logs"), path),
     "map": lambda ground, path: _map_of(ground.of("logs"), path),
@@ -375,6 +383,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
     "front": _made_by("simulate", "{out}", "--minutes", "0.4", "--recordings", "4", "--workers", "1"),
     "front_log": lambda ground, path: shutil.copytree(ground.of("front"), path, ignore=_all_but_one),
     "one_log": lambda ground, path: shutil.copytree(ground.of("logs"), path, ignore=_all_but_one),
+    "rig_log": lambda ground, path: shutil.copytree(ground.of("rig"), path, ignore=_all_but_one),
     "actuator_log": lambda ground, path: shutil.copytree(ground.of("actuators"), path, ignore=_all_but_one),
     "actuator_run": _made_by(
         *("train", "{actuators}", "--out", "{out}", "--preset", "quick"),
@@ -393,6 +402,7 @@ MAKERS: Mapping[str, Callable[[Ground, Path], None]] = {
         *settings(('task={features="all",targets=["CylVels_1"],horizons=[10]}', "model.blocks=[]", *TRAINING)),
     ),
     "front_twin": lambda ground, path: save_twin(TwinBundle(TWINS["static"](), sample_excavator_twin()), path / "twin"),
+    "grounded": _grounded,
     "fmi2": lambda ground, path: _fmu(ground, path, "2"),
     "fmi3": lambda ground, path: _fmu(ground, path, "3"),
     "loop": _made_by("control", "{out}", "--plant", "{front_twin}", "--seeds", "1", *settings(LOOP)),
@@ -486,6 +496,11 @@ SPECIAL: tuple[tuple[str, str, str], ...] = (
     (r"logs/healthy --map", "logs/healthy", "rig_csv"),
     (r"logs/healthy --map", "map.toml", "rig_map"),
     (r"registry add .* fleet/base", "fleet/base", "base"),
+    (r"runs/grey_loam --set task", "runs/grey_loam", "grounded"),
+    (r"twin .*--start runs/twin", "runs/twin", "recurrent"),
+    (r"auto.foundation", "logs/c14", "drives"),
+    (r"live .*--monitor", "runs/m22", "rig_run"),
+    (r"live .*--monitor", "data/m22/m22_000_combined.parquet", "rig_log"),
 )
 """Line, word and kind: what neither place nor name tells."""
 BESIDE = (
@@ -515,7 +530,11 @@ MORE: Mapping[str, tuple[str, ...]] = {
     r"^train .*--minutes": tuple(settings(FEW)),
     r"^train .*--config examples": (),
     r"^train": ("--minutes", "0.01", *settings(FEW)),
-    r"^search run": ("--phase", "isolation", "--workers", "1", *settings(SEARCH)),
+    r"^search run .*--preset thesis": (
+        *("--phase", "isolation", "--workers", "1"),
+        *settings((*CHANGES, "search.epochs=2")),
+    ),
+    r"^search run": ("--phase", "isolation", "--workers", "1", *settings(CHANGES)),
     r"^pretrain .*test_masses": ("--preset", "quick", *settings(MACHINES[1:])),
     r"^pretrain (?!.*--preset)": ("--preset", "quick", *settings(MACHINES)),
     r"^pretrain": tuple(settings(MACHINES)),

@@ -11,7 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
+import threading
 from contextlib import chdir
 from pathlib import Path
 
@@ -59,6 +59,8 @@ SHELL_LEFT_OUT = {
     "for": "loads this machine for minutes",
 }
 """First words of lines of other programs that are not run, and why; targets of make: tests/unit/test_code_blocks.py."""
+LIVE_S = 240.0
+"""After which a session that says no address, or does not end, is killed: its code is then no success."""
 MOST_LEFT_OUT = 10
 QUICK = re.compile(
     r"(init|inspect|evaluate|report|compare|adapt|replay|footprint|runs|registry|rollout|forecast|store|monitor r)"
@@ -140,18 +142,30 @@ def test_a_command_line_of_the_docs_runs(line, ground, tables, tmp_path, monkeyp
 
 def live(words: list[str], folder: Path) -> tuple[int, str]:
     """A session without an end, in a process: stopped by Ctrl-C once its page has an address."""
-    call = [sys.executable, "-m", "edp", *words]
     places = os.pathsep.join(place for place in sys.path if place)
-    process = subprocess.Popen(
-        call, cwd=folder, env={**os.environ, "PYTHONPATH": places}, stderr=subprocess.PIPE, text=True
+    session = subprocess.Popen(
+        [sys.executable, "-u", "-m", "edp", *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": places},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        # A shell that starts tests in the background has them ignore Ctrl-C, and so would the session.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    said = ""
-    until = time.monotonic() + 120
-    while "http://" not in said and process.poll() is None and time.monotonic() < until:
-        said += process.stderr.readline() if process.stderr is not None else ""
-    process.send_signal(signal.SIGINT)
-    rest = process.communicate(timeout=120)[1]
-    return process.returncode, said + rest
+    too_late = threading.Timer(LIVE_S, session.kill)
+    too_late.start()
+    with session as process:
+        try:
+            said = ""
+            for text in process.stdout or ():
+                said += text
+                if "Ctrl-C ends" in text:
+                    process.send_signal(signal.SIGINT)
+            return process.wait(), said
+        finally:
+            too_late.cancel()
+            process.kill()
 
 
 def test_what_is_left_out_is_on_a_page_and_has_a_reason_that_is_there_and_does_not_grow():

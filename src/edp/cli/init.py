@@ -65,8 +65,11 @@ def init(
         if plant:
             out.print("or a plant model, which runs on commands alone:")
             out.print("      " + plant)
+        else:
+            out.print("no plant model is proposed: " + proposal.no_plant())
 
-    emit(as_json, _facts(proposal, paths, commands) | {"plant_command": plant or None}, show)
+    plants = {"plant_command": plant or None, "no_plant": proposal.no_plant() or None}
+    emit(as_json, _facts(proposal, paths, commands) | plants, show)
 
 
 def show_proposal(proposal: LogsProposal) -> None:

@@ -16,7 +16,6 @@ import numpy as np
 
 from edp.data.even_split import blocks_where_time_is_uneven, rests_where_it_tests
 from edp.data.splits import ByTime
-from edp.data.twin_channels import INTEGRAL
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.proposal.columns import LogLook, refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
@@ -43,6 +42,7 @@ from edp.workflows.proposal_files import (
     settings_text,
     toml_text,
 )
+from edp.workflows.proposal_plant import propose_plant
 
 MOST_TARGETS = 4
 """Outputs at most: each is a model of its own in the time that a first run takes."""
@@ -104,21 +104,21 @@ class LogsProposal:
         ]
 
     def plant_command(self, folder: Path) -> str:
-        """The command that trains a plant model, which runs on commands alone; empty where it needs more names."""
-        guesses = {guess.channel: guess.kind.kind for guess in self.proposal.columns if guess.channel}
-        kinds = {guesses.get(name, Kind.GENERIC) for name in self.targets}
-        if not self.proposal.of_role("command") or not kinds <= {*INTEGRAL, Kind.GENERIC}:
+        """The command that trains a plant model, which runs on commands alone; empty where `no_plant` says why."""
+        plant = propose_plant(self.proposal, self.targets, self.inputs)
+        if plant.why_not:
             return ""
-        if {*self.inputs} & {*self.targets}:  # a log whose only moving column is both has nothing that answers
-            return ""
-        parts = {"commands": self.inputs, "velocities": self.targets if Kind.GENERIC in kinds else ()}
         named = "".join(
             f" --set {shlex.quote(f'channels.{part}={json.dumps(names, ensure_ascii=False)}')}"
-            for part, names in parts.items()
+            for part, names in plant.parts.items()
             if names
         )
         data, mapped, repair = self._logs(folder)
         return f"edp twin {data}{mapped} --out {_quoted(folder / 'runs' / 'twin')}{repair}{named}"
+
+    def no_plant(self) -> str:
+        """Why no plant model is proposed, and what to record or to name, in a sentence; empty where one is."""
+        return propose_plant(self.proposal, self.targets, self.inputs).why_not
 
     def _logs(self, folder: Path) -> tuple[str, str, str]:
         """Logs, map and repairs as arguments of a command."""

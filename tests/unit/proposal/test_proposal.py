@@ -17,6 +17,7 @@ from edp.cli import app
 from edp.cli import init as init_command
 from edp.cli.console import run_app
 from edp.config.twin import load_twin_experiment
+from edp.data.derived_velocities import complete_velocities
 from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.proposal import columns as columns_module
@@ -325,6 +326,56 @@ def test_a_plant_model_is_not_named_where_one_channel_would_command_and_answer(t
     proposal = propose(tmp_path / "x.csv")
     assert (proposal.inputs, proposal.targets) == (("a",), ("a",))
     assert proposal.plant_command(tmp_path) == ""
+    assert proposal.no_plant() == "no column but the command moves: record what answers it, a position or a speed"
+
+
+def test_a_plant_model_of_angles_and_commands_alone_is_named_and_takes_their_changes(tmp_path):
+    draw = np.random.default_rng(5)
+    lever = np.repeat(draw.uniform(-1.0, 1.0, 40), 25)
+    angle = np.cumsum(np.convolve(lever, np.full(30, 1 / 30))[: len(lever)]) * 0.01 + draw.normal(0.0, 1e-4, len(lever))
+    columns = {"time_s": np.arange(1000) / 10.0, "joystick_boom": lever, "boom_angle_rad": angle}
+    proposal = propose(write(tmp_path / "x.csv", columns))
+    assert proposal.targets == ("boom_angle_rad",)
+    assert proposal.no_plant() == ""
+    plant = shlex.split(proposal.plant_command(tmp_path / "out"))
+    assert plant[-2:] == ["--set", 'channels.commands=["joystick_boom"]']
+    write_proposal(proposal, tmp_path / "out")
+    recordings = DataSource.of(tmp_path / "x.csv", tmp_path / "out" / MAP).read()
+    completed, settings = complete_velocities(recordings, load_twin_experiment(None, plant[-1:]).channels)
+    channels = twin_channels(completed[0], settings)
+    assert [channel.name for channel in channels.answers] == ["boom_angle_rad_velocity", "boom_angle_rad"]
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "why"),
+    [
+        ("oil_temperature", "degC", "it answers with positions or speeds, and oil_temperature are none: record one"),
+        ("boom_angle", "rad", "no column looks like a command: record what moves the machine"),
+    ],
+)
+def test_where_no_plant_model_is_named_a_sentence_says_what_to_record(tmp_path, name, unit, why):
+    draw = np.random.default_rng(5)
+    answer = np.cumsum(draw.normal(0.0, 0.1, 1000))
+    columns = {"time_s": np.arange(1000) / 10.0, f"{name}_{unit}": answer}
+    if unit == "degC":
+        columns["joystick_boom"] = np.repeat(draw.uniform(-1.0, 1.0, 40), 25)
+    proposal = propose(write(tmp_path / "x.csv", columns))
+    assert proposal.plant_command(tmp_path) == ""
+    assert why in proposal.no_plant().replace(f"{name}_{unit}", name)
+
+
+def test_stamps_within_messages_are_no_inputs(tmp_path):
+    draw = np.random.default_rng(2)
+    columns = {
+        "time": np.arange(600) / 10.0,
+        "arm.velocity": np.cumsum(draw.normal(0.0, 0.1, 600)),
+        "transforms_1.header.stamp.sec": np.floor(np.arange(600) / 10.0 + draw.uniform(0.0, 0.3, 600)) + 1.5e9,
+        "transforms_1.header.stamp.nanosec": draw.uniform(0.0, 1e9, 600),
+        "stamped_force": draw.normal(size=600),
+    }
+    columns = propose(write(tmp_path / "x.csv", columns)).proposal.columns
+    assert [guess.channel for guess in columns if guess.channel] == ["arm.velocity", "stamped_force"]
+    assert [guess.why for guess in columns if guess.check == "not taken"] == ["the stamp of a message"] * 2
 
 
 def test_a_data_set_file_is_no_log(tmp_path):

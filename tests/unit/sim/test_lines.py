@@ -6,6 +6,7 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from snapshots import check_snapshot
 
 from edp.errors import ConfigError
 from edp.sim import Scenario, Simulation, load_machine
@@ -173,14 +174,7 @@ def test_transmitters_at_the_valve_show_its_pressure(tmp_path):
 
 
 def test_a_snapshot_holds_the_lines(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(text_with(f"line_bore = {list(BORES)}\nline_modulus = {list(SOFT)}"))
-    simulation = Simulation(Scenario(machine=str(path), excitation="combined", seed=2))
-    simulation.run(150)
-    moment = simulation.snapshot()
-    first = simulation.run(60).copy()
-    simulation.restore(moment)
-    assert np.array_equal(simulation.run(60), first)
+    simulation = check_snapshot(tmp_path, text_with(f"line_bore = {list(BORES)}\nline_modulus = {list(SOFT)}"))
     assert np.abs(simulation.plant.state[at.FLOW_HEAD :]).max() > 1e-6
 
 

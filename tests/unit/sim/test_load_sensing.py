@@ -5,9 +5,10 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from snapshots import check_snapshot
 
 from edp.errors import ConfigError
-from edp.sim import Scenario, Simulation, load_machine
+from edp.sim import load_machine
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine_checks import check_machine
 from edp.sim.machine.machine_files import parse_machine
@@ -134,14 +135,7 @@ def test_an_unloading_valve_opens_above_the_margin_and_never_above_the_relief():
 
 
 def test_a_snapshot_holds_what_pumps_do(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(text_with())
-    simulation = Simulation(Scenario(machine=str(path), excitation="combined", seed=2))
-    simulation.run(150)
-    moment = simulation.snapshot()
-    first = simulation.run(60).copy()
-    simulation.restore(moment)
-    assert np.array_equal(simulation.run(60), first)
+    check_snapshot(tmp_path, text_with())
 
 
 def text_with(

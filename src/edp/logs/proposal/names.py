@@ -168,6 +168,9 @@ def role_by_word(name: str) -> str:
     return next((role for role in ("reference", "measured", "label", "command") if role in roles), "")
 
 
+_STAMP = re.compile(r"(?:^|[./])header[./]stamp(?:[./](?:n?secs?|nanosec))?$")
+
+
 def is_counter_name(name: str) -> bool:
     """Whether a word of a name counts something."""
     return any(word in _COUNTERS for word in words_of(name))
@@ -181,3 +184,8 @@ def is_time_name(name: str) -> bool:
 def is_sample_time_name(name: str) -> bool:
     """Whether a name is that of the time between two rows."""
     return "".join(name.split()).lower() in _SAMPLE_TIMES
+
+
+def is_stamp_name(name: str) -> bool:
+    """Whether a field of a message is the time at which it was sent: a stamp of ROS, whole or in its two parts."""
+    return _STAMP.search(name) is not None

@@ -13,7 +13,15 @@ from edp.logs.proposal.behaviour import Behaviour, Relation, behaviour_of, is_st
 from edp.logs.proposal.clocks import ClockGuess, clock_of
 from edp.logs.proposal.columns import LogColumn, LogLook
 from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change, with_article
-from edp.logs.proposal.names import is_counter_name, is_error_name, kind_by_word, role_by_word, tag_family, words_of
+from edp.logs.proposal.names import (
+    is_counter_name,
+    is_error_name,
+    is_stamp_name,
+    kind_by_word,
+    role_by_word,
+    tag_family,
+    words_of,
+)
 from edp.signals import TABLE_A1, VOCABULARY, ChannelMap, Kind, SignalMap
 
 SURE = 0.85
@@ -221,6 +229,8 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
     if behaviour.constant:
         value = _EMPTY if not behaviour.filled else f"always {behaviour.high:g}"
         return ColumnGuess(name, "", "constant", _NO_KIND, 0.95, value, "" if is_known(name) else "not taken")
+    if is_stamp_name(name):
+        return ColumnGuess(name, "", "time", _NO_KIND, 0.9, "the stamp of a message", "not taken")
     if behaviour.counts and behaviour.levels > 2:
         sure = 0.9 if is_counter_name(name) else 0.65
         return ColumnGuess(name, "", "counter", _NO_KIND, sure, "rises by one", "" if sure >= SURE else "a counter?")

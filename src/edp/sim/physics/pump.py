@@ -28,17 +28,22 @@ DROOP = 0.3
 
 
 @inlined
+def pump_of(spool: int, axes: Array) -> float:
+    """Number of the pump that feeds a spool: the first ones are those of the axes, then come those of conflux."""
+    return axes[spool, at.PRIMARY_PUMP] if spool < at.AXES else axes[spool - at.AXES, at.CONFLUX_PUMP]
+
+
+@inlined
 def demand(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
     """Displacement asked for by the pilots, as a share of full, for both pumps."""
     first = second = plant[at.MIN_DISPLACEMENT]
     for j in range(at.SPOOLS):
-        i = j if j < 3 else j - 3
+        i = j % at.AXES
         pilot = valves[j, at.PILOT]
         gain = axes[i, at.DEMAND_EXTEND] if pilot >= 0.0 else axes[i, at.DEMAND_RETRACT]
         # Demand begins at 10 % of the pilot, below usual dead bands of the spools (12 to 14 %), and is full at 85 %.
         asked = min(gain * max(abs(pilot) - 0.1, 0.0) * (1.0 / 0.75), 1.0)
-        pump = axes[i, at.PRIMARY_PUMP] if j < 3 else axes[i, at.CONFLUX_PUMP]
-        if pump == 0.0:
+        if pump_of(j, axes) == 0.0:
             first = max(first, asked)
         else:
             second = max(second, asked)
@@ -54,16 +59,14 @@ def sensed_loads(state: Array, valves: Array, axes: Array, plant: Array) -> tupl
         i, spool = j % at.AXES, valves[j, at.SPOOL]
         if j < at.AXES:
             extend, retract = axes[i, at.DEAD_BAND_EXTEND], axes[i, at.DEAD_BAND_RETRACT]
-            pump = axes[i, at.PRIMARY_PUMP]
         else:
             extend, retract = axes[i, at.CONFLUX_DEAD_BAND_EXTEND], axes[i, at.CONFLUX_DEAD_BAND_RETRACT]
-            pump = axes[i, at.CONFLUX_PUMP]
         load = plant[at.TANK]
         if spool > extend:
             load = state[port + i]
         elif -spool > retract:
             load = state[port + at.AXES + i]
-        if pump == 0.0:
+        if pump_of(j, axes) == 0.0:
             first = max(first, load)
         else:
             second = max(second, load)
@@ -108,7 +111,7 @@ def bypass_conductances(valves: Array, axes: Array, plant: Array) -> tuple[float
     per_closed = 1.0 / plant[at.BYPASS_CLOSED]
     for j in range(at.SPOOLS):
         left = max(1.0 - abs(valves[j, at.SPOOL]) * per_closed, 0.0)
-        if (axes[j, at.PRIMARY_PUMP] if j < 3 else axes[j - 3, at.CONFLUX_PUMP]) == 0.0:
+        if pump_of(j, axes) == 0.0:
             first *= left * left
         else:
             second *= left * left

@@ -14,7 +14,7 @@ import numpy as np
 from edp.config.monitor import MonitorExperiment, monitor_toml
 from edp.errors import BundleError, ConfigError, DataError, closest
 from edp.logs.source import DataSource
-from edp.monitor.fitting import doubtful_sessions, fit_chain
+from edp.monitor.fitting import FittedChain, doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import save_monitor
@@ -148,39 +148,49 @@ def fit_to_recordings(
     fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note, side_by_side)
     if not again:
         note("sessions that trained, compared with the others")
-        trained = doubtful_sessions(
-            fitted, experiment.chain, sources, channels, (*train, *validation), side_by_side
-        )  # fmt: skip
+        trained = doubtful_sessions(fitted, experiment.chain, sources, channels, (*train, *validation), side_by_side)
         if trained:
             note(f"once more without {', '.join(trained)}")
             left = [session for session in sessions if session.name not in trained]
             better = fit_to_recordings(left, experiment, bundles, note, True, side_by_side)
             seconds = time.process_time() - began
             return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
-    provenance: dict[str, Any] = {
-        "sessions": len(sessions),
-        "hours": sum(session.duration_s for session in sessions) / 3600.0,
-        "doubtful": list(fitted.doubtful),
-        "trained_on": [session.name for session in (*train, *validation)],
-        "calibrated_on": [session.name for session in rest if session.name not in fitted.doubtful],
-        "seconds": time.process_time() - began,
-        "seed": experiment.seed,
-    }
-    monitor = Monitor(
-        channels,
-        recordings[0].rate_hz,
-        sources,
-        fitted.chain,
-        fitted.limit,
-        session_means(channels, sessions),
-        provenance=provenance,
-        scatter=scatter_of(fitted.chain, fitted.sessions, fitted.chain.summaries.block / recordings[0].rate_hz),
-    )
+    monitor = _assembled(material, sources, fitted, sessions, rest)
     healthy = [session for session in rest if session.name not in fitted.doubtful]
-    monitor = _with_dictionary(monitor, healthy, experiment, note)
+    provenance = dict(monitor.provenance) | {"seconds": time.process_time() - began}
+    monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, note)
     one_machine = not experiment.chain.tolerance and any(isinstance(source, FlowBalances) for source in sources)
     seconds = time.process_time() - began
     return FittedMonitor(monitor, fitted.doubtful, seconds, None, fitted.sessions, one_machine)
+
+
+def _assembled(
+    material: FitMaterial,
+    sources: tuple[ResidualSource, ...],
+    fitted: FittedChain,
+    sessions: Sequence[Recording],
+    rest: Sequence[Recording],
+) -> Monitor:
+    """The monitor without a dictionary; `rest` are the sessions that trained no residual."""
+    rate_hz, doubtful = material.rate_hz, fitted.doubtful
+    provenance: dict[str, Any] = {
+        "sessions": len(sessions),
+        "hours": sum(session.duration_s for session in sessions) / 3600.0,
+        "doubtful": list(doubtful),
+        "trained_on": [session.name for session in (*material.train, *material.validation)],
+        "calibrated_on": [session.name for session in rest if session.name not in doubtful],
+        "seed": material.seed,
+    }
+    return Monitor(
+        material.channels,
+        rate_hz,
+        sources,
+        fitted.chain,
+        fitted.limit,
+        session_means(material.channels, sessions),
+        provenance=provenance,
+        scatter=scatter_of(fitted.chain, fitted.sessions, fitted.chain.summaries.block / rate_hz),
+    )
 
 
 def _with_dictionary(
