@@ -14,7 +14,7 @@ import time
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -122,22 +122,22 @@ def main() -> None:
 
 
 def run(given: Any, work: Path) -> None:
-    """The models that were asked for; some of them take no whole result's place."""
-    logs = recordings(given, work)
+    """The models that were asked for; a result without static map and default is not kept."""
+    logs = cache(lambda: recordings(given, work))  # none are simulated where all is finished
     makers: Mapping[str, Callable[[], tuple[Any, float]]] = {
-        "static": partial(static_map, logs),
-        "default": partial(default_twin, logs, given),
-        "grey box": partial(grey_box, logs),
-        "grey box on a ground": partial(grounded, logs),
-        "network on the grey box": partial(topped, logs),
+        "static": lambda: static_map(logs()),
+        "default": lambda: default_twin(logs(), given),
+        "grey box": lambda: grey_box(logs()),
+        "grey box on a ground": lambda: grounded(logs()),
+        "network on the grey box": lambda: topped(logs()),
     }
     scores = {}
     for name in (name for name in MODELS if name in given.only):
         file = work / f"{name.replace(' ', '_')}{'_quick' if given.quick else ''}.json"
-        scores[name] = kept(file, partial(scored, logs, makers[name]))
+        scores[name] = kept(file, lambda name=name: scored(logs(), makers[name]))
     show(scores)
-    whole = set(scores) == set(MODELS)
-    finish("twin_soil", verdicts(scores, given.quick) if whole else [], given.seed, scores, keep=whole)
+    judged = {"static", "default"} <= set(scores)
+    finish("twin_soil", verdicts(scores, given.quick) if judged else [], given.seed, scores, keep=judged)
 
 
 def recordings(given: Any, work: Path) -> Logs:
