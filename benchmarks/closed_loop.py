@@ -8,12 +8,12 @@ position error to the reference of the same time; the distance to the path stand
 Part nmpc sets predictive control on a well-trained twin beside a PI loop that is tuned in the same run and an
 inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part
 o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
-plant; part o4_other the same for C14 in loam. Part grey asks parts nmpc, but for C14, and o4 of a grey box with a known
-linkage, fitted to 45 min of logs in free air, in place of the network: parts grey and o4_grey. Part grey_other does so
-for C14: predictive control on a grey box of 20 min of its logs in free air; o4_grey_other asks gains in loam of grey
-boxes of 5, 20 and 45 min, o4_ground of the one of 20 min with a ground that it learned from as many minutes in loam,
-on the plant with four draws of the ground. Their models are trained where --data has none: 3 h of recordings, some ten
-processor minutes.
+plant; part o4_other the same for C14 in loam, of models of 5, 20 and 45 min of its logs. Part grey asks parts nmpc, but
+for C14, and o4 of a grey box with a known linkage, fitted to 45 min of logs in free air, in place of the network: parts
+grey and o4_grey. Part grey_other does so for C14: predictive control on a grey box of 20 min of its logs in free air;
+o4_grey_other asks gains in loam of grey boxes of 5, 20 and 45 min, o4_ground of the one of 20 min with a ground that it
+learned from as many minutes in loam, on the plant with four draws of the ground. Their models are trained where --data
+has none: 3 h of recordings, some ten processor minutes.
 
 Results are kept part by part, `closed_loop_PART.json`; of another seed, with other logs and fits of the models but the
 same lines, in `closed_loop_PART_seedN.json`.
@@ -123,6 +123,7 @@ def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
         verdicts = tuning_of.tuning_verdicts(details[part], quick)
     else:
         details[part] = tuning_of.tuning_other(models, of_tuning, seed)
+        verdicts = tuning_of.other_verdicts(details[part], models.size.other, quick)
     finish(f"closed_loop_{part}{f'_seed{seed}' if seed else ''}", verdicts, seed, details, keep=not quick)
 
 

@@ -40,6 +40,8 @@ JUDGED = (
     *("judge.seconds=20", "judge.at_s=[1.0,5.0,10.0]", "judge.covered_at_s=[0.1,1.0,10.0]", "judge.floors=[]"),
     *("judge.ahead_ticks=20", "training.patience=0"),
 )
+BESIDE = {"one_step": "one-step network", "static": "static map", "arx": "ARX"}
+"""Models that stand beside the twin, and their names in words."""
 AHEAD = (1, 5, 10, 20, 50)
 """Ticks ahead of measured ports at which the twin is judged, told the commands."""
 GROUND = ("dry_sand", "sandy_loam", "clay")
@@ -174,12 +176,25 @@ class Models:
         return self._twin(source, name, ("twin.kind=greybox", f"twin.linkage={guess}", *fit))
 
     def beside(self, name: str) -> Path:
-        """A model that stands beside it: ``static``, ``arx`` or ``one_step``."""
+        """A model of `BESIDE` that stands beside the twin of M22."""
         settings = self.size.one_step if name == "one_step" else (f"twin.kind={name}",)
         return self._twin(self.recordings(), name, settings)
 
     def other_twin(self, minutes: int) -> Path:
         """The twin of M22 gone on with minutes of C14."""
+        return self._twin(
+            self._other_logs(minutes), f"c14_{minutes}_twin", tuple(_training(self.size.twin)), self.twin()
+        )
+
+    def other_beside(self, name: str, minutes: int) -> Path:
+        """A model that stands beside it, on the same minutes of C14: the one-step network of M22 goes on with them."""
+        source, own = self._other_logs(minutes), f"c14_{minutes}_{name}"
+        if name == "one_step":
+            return self._twin(source, own, tuple(_training(self.size.one_step)), self.beside(name))
+        return self._twin(source, own, (f"twin.kind={name}",))
+
+    def _other_logs(self, minutes: int) -> DataSource:
+        """Logs of C14 in free air and in soil."""
         order = SimulationOrder(
             machine="C14",
             minutes=float(minutes),
@@ -188,8 +203,7 @@ class Models:
             mix=MIX,
             materials=SOILS,
         )
-        source = self._simulated(f"c14_{minutes}", order)
-        return self._twin(source, f"c14_{minutes}_twin", tuple(_training(self.size.twin)), self.twin())
+        return self._simulated(f"c14_{minutes}", order)
 
     def _simulated(self, name: str, order: SimulationOrder) -> DataSource:
         simulate_data_set(self.folder / name, order, workers=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from closed_loop_models import Models
+from closed_loop_models import BESIDE, Models
 from common import Verdict, table, verdict
 from edp.config.control import ControlExperiment
 from edp.control.controllers import CONTROLLERS, ControllerSpec
@@ -48,7 +48,7 @@ def tuning(models: Models, size: TuningSize, seed: int) -> dict[str, dict[str, A
     on_plant = costs_of(plant, settings)
     other = costs_of(ControlBench(replace(experiment, seed=OTHER_SEED), ControlSources(), plant.models), settings)
     rows: dict[str, dict[str, Any]] = {}
-    runs = {"twin": models.twin(), **{name: models.beside(name) for name in ("one_step", "static", "arx")}}
+    runs = {"twin": models.twin(), **{name: models.beside(name) for name in BESIDE}}
     for name, run in runs.items():
         rows[name] = _row(costs_on(run, experiment, plant.models, settings), on_plant)
     rows["the plant, along other lines"] = _row(other, on_plant)
@@ -69,9 +69,30 @@ def tuning_on(run: Path, size: TuningSize, seed: int) -> dict[str, Any]:
 
 
 def tuning_other(models: Models, size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
-    """C14 in soil, on twins of M22 that went on with minutes of its logs; they know no soil but that of their logs."""
-    runs = {f"twin after {minutes} min": models.other_twin(minutes) for minutes in sorted(models.size.other)}
+    """C14 in soil, on models of M22 that went on with minutes of its logs or were fitted to them.
+
+    They know no soil but that of their logs.
+    """
+    runs: dict[str, Path] = {}
+    for minutes in sorted(models.size.other):
+        runs[after("twin", minutes)] = models.other_twin(minutes)
+        for name, title in BESIDE.items():
+            runs[after(title, minutes)] = models.other_beside(name, minutes)
     return tuning_in_soil(runs, size, seed)
+
+
+def after(model: str, minutes: int) -> str:
+    """Title of a model's row."""
+    return f"{model} after {minutes} min"
+
+
+def other_verdicts(rows: Mapping[str, Mapping[str, Any]], minutes: Sequence[int], quick: bool) -> list[Verdict]:
+    """Of the twins of C14, each beside the other models of its minutes."""
+    verdicts: list[Verdict] = []
+    for count in sorted(minutes):
+        own = {name: rows[after(title, count)] for name, title in {"twin": "twin", **BESIDE}.items()}
+        verdicts += tuning_verdicts(own, quick, f", C14 in loam, after {count} min")
+    return verdicts
 
 
 def tuning_in_soil(runs: Mapping[str, Path], size: TuningSize, seed: int) -> dict[str, dict[str, Any]]:
@@ -168,7 +189,7 @@ def show(title: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
 def tuning_verdicts(rows: Mapping[str, Mapping[str, Any]], quick: bool, where: str = "") -> list[Verdict]:
     """Of the model `twin` beside the others; `where` closes the questions."""
     ours = rows["twin"]
-    rivals = [row["rank_correlation"] for name, row in rows.items() if name in ("static", "arx", "one_step")]
+    rivals = [row["rank_correlation"] for name, row in rows.items() if name in BESIDE]
     name = f"o4: cost on the plant of the gains that the twin calls best, over the least cost{where}"
     ranks = f"o4: rank correlation of costs on the twin{where}"
     verdicts = [
@@ -176,6 +197,6 @@ def tuning_verdicts(rows: Mapping[str, Mapping[str, Any]], quick: bool, where: s
         verdict(name, ours["regret"], 1.0, "<= 1.15", "1", quick),
     ]
     if rivals:
-        name = "o4: rank correlation against the best of static, arx, one step"
+        name = f"o4: rank correlation against the best of static, arx, one step{where}"
         verdicts.append(verdict(name, ours["rank_correlation"], max(rivals), ">= 1", "1", quick))
     return verdicts

@@ -21,7 +21,10 @@ PlantOption = Annotated[
     Path | None, typer.Option("--plant", help="Run folder of a twin, or an FMU (.fmu), that is the plant instead.")
 ]
 YesOption = Annotated[bool, typer.Option("--yes", help="Run the native code of an FMU without confirmation.")]
-TwinOption = Annotated[Path | None, typer.Option("--twin", help="Run folder of a twin that the controller uses.")]
+TwinOption = Annotated[
+    Path | None,
+    typer.Option("--twin", help="Run folder of a twin that the controller uses, best a grey box of the machine."),
+]
 PredictorOption = Annotated[
     Path | None, typer.Option("--predictor", help="Run folder of edp train that the controller uses.")
 ]

@@ -123,6 +123,16 @@ class Controller(ABC):
         """
         raise ControlFault(f"it has no fallback where a guard asks for one{f' ({reason})' if reason else ''}")
 
+    def check(self, measured: Array) -> None:  # noqa: B027
+        """Refuse what makes no controller of it, before any loop; nothing by default.
+
+        Args:
+            measured: the channels of `reads` at a start, at rest.
+
+        Raises:
+            ConfigError: it could not control this plant.
+        """
+
     def missed(self, tick: int) -> None:
         """Called at each tick at which the safe command is given; a controller with memory brings it up to date."""
         self.info = {}

@@ -7,7 +7,7 @@ import pytest
 from edp.config.control import load_control_experiment
 from edp.logs import read_recording
 from edp.networks.twin import TWINS
-from edp.testing.control import sample_excavator_twin
+from edp.testing.control import sample_excavator_twin, sample_grey_box
 from edp.training.twin_bundle import TwinBundle, save_twin
 
 pytestmark = pytest.mark.training
@@ -138,6 +138,16 @@ def test_a_twin_of_another_machine_is_refused(edp, tmp_path):
         said = " ".join(ended.err.split())
         assert "strokes of 1.000, 1.000, 0.915 m, those of M22 have 1.260, 1.504, 1.104 m" in said
         assert not (tmp_path / "run").exists()
+
+
+def test_a_plan_shorter_than_the_machine_takes_to_answer_is_refused_before_anything_is_written(edp, tmp_path):
+    pytest.importorskip("daqp", reason="the solver is an optional package")
+    save_twin(sample_grey_box(), tmp_path / "grey" / "twin")
+    words = ("--controller", "nmpc", "--twin", tmp_path / "grey", "--set", "controller.blocks=[3,2]")
+    ended = edp("control", tmp_path / "run", "--seeds", 1, *LINE, *words)
+    assert ended.code == 1
+    assert "controller.blocks = [3, 2] plans 50 ms ahead" in " ".join(ended.err.split())
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):

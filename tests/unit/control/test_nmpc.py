@@ -25,7 +25,7 @@ from edp.control.valve_map import ValveMap
 from edp.errors import ConfigError
 from edp.sim.excitation.levers import speed_table
 from edp.sim.machine.machine_files import load_machine
-from edp.testing.control import sample_excavator_twin
+from edp.testing.control import sample_excavator_twin, sample_grey_box
 
 pytest.importorskip("daqp", reason="the solver is an optional package")
 
@@ -254,6 +254,22 @@ def test_a_reference_beyond_the_margin_is_kept_away_from_the_stop(env, models):
         farthest = max(farthest, observation[column] / full[2])
     assert 0.85 < farthest < 0.905
     assert controller.info["constraints"] > 0
+
+
+def test_a_plan_that_ends_before_the_machine_has_answered_is_refused(env, models, valves):
+    plant = interface_of(env)
+    observation, _ = env.reset(seed=0, options={"strokes": (0.3, 0.5, 0.7)})
+
+    def check(known, *blocks):
+        controller = CONTROLLERS["nmpc"](blocks=blocks).build(plant, LoopLimits(), known)
+        controller.check(np.asarray(observation, float)[plant.columns(controller.reads)])
+
+    for known in (ControlModels(valves, sample_grey_box().twin), models):
+        check(known, 4, 12, 24)
+        with pytest.raises(
+            ConfigError, match=r"blocks = \[3, 2\] plans 50 ms ahead, but by its twin the machine takes"
+        ):
+            check(known, 3, 2)
 
 
 @pytest.mark.parametrize(

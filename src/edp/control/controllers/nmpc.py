@@ -24,6 +24,7 @@ from edp.control.models import ControlModels
 from edp.control.nmpc.compiled import fill_limits, fill_normal
 from edp.control.nmpc.model import TwinModel
 from edp.control.nmpc.moves import Moves, SpeedToLever
+from edp.control.nmpc.response import response
 from edp.control.nmpc.tip import TipTable
 from edp.control.plant import STROKES, PlantInterface
 from edp.control.reference import TipReference
@@ -40,6 +41,8 @@ NO_LIMIT = -1e30
 """What DAQP takes for no limit."""
 SOFT = 8
 """DAQP's mark of a constraint that may be violated at a price."""
+LEAST_ANSWER, GOOD_ANSWER = 0.1, 0.5
+"""Shares of a speed that must be there where a plan ends, and that better are: short of them it sees no effect."""
 FAST_TIP_M_S = 0.02
 """Reference speed above which a tip error has a direction along the path and one across."""
 
@@ -144,6 +147,29 @@ class NmpcController(Controller):
         self._latest = np.zeros(AXES)
         self._row: Array | None = None
         self._tick = -1
+
+    def check(self, measured: Array) -> None:
+        """Refuse a plan that ends before the machine has answered, by the twin, from rest at this row.
+
+        Raises:
+            ConfigError: at its end less than `LEAST_ANSWER` of a speed is there, so that it would run away.
+        """
+        self.model.begin(measured)
+        shares = response(self.model, measured, self._valves, self._slew)
+        if shares is None:
+            return
+        weakest, ticks = shares.min(axis=1), self._moves.ticks
+        if weakest[min(ticks, len(weakest)) - 1] >= LEAST_ANSWER:
+            return
+        # From then on it stays.
+        enough = len(weakest) + 1 - int(np.argmax(weakest[::-1] < GOOD_ANSWER))
+        tick_ms, first = 1e3 / self.model.plant.rate_hz, PredictiveControl.blocks
+        longer = [*first[:-1], max(first[-1], enough - sum(first[:-1]))]
+        raise ConfigError(
+            f"controller.blocks = {list(self.spec.blocks)} plans {ticks * tick_ms:g} ms ahead, but by its twin the "
+            f"machine takes {enough * tick_ms:g} ms from rest to half the speed that a lever asks for; plan {enough} "
+            f"ticks or more, such as {longer}"
+        )
 
     def begin(self, measured: Array, reference: TipReference) -> None:
         """Form the twin's memory at rest; forget plan and disturbance."""

@@ -116,9 +116,10 @@ class ControlBench:
         """Build the controller of the experiment and hold its limits to references and plant, for a refusal only.
 
         Raises:
-            ConfigError: plant and controller do not fit, a model is missing, or limits contradict what is asked.
+            ConfigError: plant and controller do not fit, a model is missing, limits contradict what is asked, or the
+                controller could not control the plant.
         """
-        self.experiment.controller.build(self.plant, self.tasks[0].limits, self.models)
+        controller = self.experiment.controller.build(self.plant, self.tasks[0].limits, self.models)
         for task in self.tasks:
             if self.models.valve_map is not None:
                 check_levers(self.models.valve_map, task.reference, task.limits)
@@ -131,6 +132,10 @@ class ControlBench:
                     f"limits: pressure_pa = {first.limits.pressure_pa:g} Pa, but the machine rests with "
                     f"{channel.name} at {value:.3g} Pa; allow more"
                 )
+        measured = row[self.plant.columns(controller.reads)]
+        # A channel that is missing at the start is named where the loop begins.
+        if np.isfinite(measured).all():
+            controller.check(measured)
 
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""
