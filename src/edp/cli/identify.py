@@ -52,9 +52,11 @@ def identify(
             source_of(data, signal_map, repair), file, machine, experiment, run, display.on_event, display.on_step
         )
     numbers = [row.plain() for row in result.rows]
-    facts = {"machine": str(file), "numbers": numbers, "models": result.scores, "notes": result.notes}
     beaten = machine_beaten_by(result.scores)
-    facts["beaten_by"] = None if beaten is None else beaten.label
+    facts = {
+        "machine": str(file), "numbers": numbers, "models": result.scores, "notes": result.notes,
+        "beaten_by": None if beaten is None else beaten.label,
+    }  # fmt: skip
 
     def show() -> None:
         if beaten is not None:
