@@ -48,6 +48,8 @@ def main() -> None:
     arguments_of.add_argument("--machines", type=int, default=5, help="how many of the family")
     arguments_of.add_argument("--ticks", type=int, default=40_000, help="of a round of the fit")
     arguments_of.add_argument("--starts", type=int, default=3, help="of the first stage of the fit")
+    arguments_of.add_argument("--minutes", type=float, default=40.0, help="of logs of a machine")
+    arguments_of.add_argument("--short", action="store_true", help="a fit of few rounds, judged by runs of 10 s")
     arguments_of.add_argument("--only", type=int, nargs="*", default=None, help="machines of the family, from 0 on")
     arguments_of.add_argument("--work", type=Path, default=None, help="folder that keeps what is finished")
     given = arguments_of.parse_args()
@@ -58,25 +60,31 @@ def run(given: Any, work: Path) -> None:
     """All machines that were asked for; some of the family take no whole result's place."""
     every = range(1 if given.quick else given.machines)
     chosen, form = every if given.only is None else given.only, "_quick" if given.quick else ""
-    asked, details = {"ticks": given.ticks, "starts": given.starts}, {}
+    asked: dict[str, Any] = {"ticks": given.ticks, "starts": given.starts}
+    asked |= {"minutes": given.minutes, "short": True} if given.short else {}
+    details: dict[str, Any] = {}
     for index in chosen:
         name = f"family-{given.seed}-{index}"
         file = work / f"{name}{form}.json"
         details[name] = kept(file, lambda name=name: one_machine(given, name) | asked | {"environment": environment(0)})
-        if any(details[name][key] != value for key, value in asked.items()):
-            raise SystemExit(
-                f"{file} was measured with other --ticks or --starts: give these, or another --work folder"
-            )
+        if any(details[name].get(key) != value for key, value in asked.items()):
+            raise SystemExit(f"{file} was measured with other settings: give these, or another --work folder")
         show(name, details[name])
-    finish("identify", verdicts(details, given.quick), given.seed, details, keep=given.only is None)
+    finish(
+        "identify_short" if given.short else "identify",
+        verdicts(details, given.quick),
+        given.seed,
+        details,
+        keep=given.only is None,
+    )
 
 
 def one_machine(given: Any, name: str) -> dict[str, Any]:
     """A machine of the family, simulated, identified and compared."""
     quick, seed = given.quick, given.seed
-    minutes, recordings = (4.0, 8) if quick else (40.0, 16)
+    minutes, recordings = (4.0, 8) if quick else (given.minutes, 8 if given.short else 16)
     fit = f"twin.fit.ticks={given.ticks}", f"twin.fit.starts={given.starts}"
-    changes = QUICK if quick else (*fit, "judge.at_s=[1, 10, 60]")
+    changes = QUICK if quick else (*QUICK, *fit) if given.short else (*fit, "judge.at_s=[1, 10, 60]")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         source = (given.data or folder) / name

@@ -4,9 +4,9 @@ Machine M22 in free air, recordings that no training saw: a short measured prefi
 are asked of the formulation, network or grey box, that has less error on the validation part. One grey box is told the
 linkage, beside bodies that are 10 to 50 % off those of the machine. A grey box with that linkage, but without power
 limit, cushions and play, and a network on top of it, tell what a structure is worth that is not the simulator's. With
---only some of these are fitted, and the questions of the others are left out. With --soil a C14 in soil is asked after
-20 minutes of its logs. With --specialist it also asks whether one set of weights for all modes is as good as one that
-was only ever run free, and as one that only ever looked 0.1 s ahead.
+--only some of these are fitted, and the questions of the others are left out. With --specialist it also asks whether
+one set of weights for all modes is as good as one that was only ever run free, and as one that only ever looked 0.1 s
+ahead. A machine in soil is asked by `twin_soil.py`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ import torch
 
 from common import Verdict, finish, parser, table, verdict
 from edp.config.twin import TwinExperiment, load_twin_experiment
-from edp.data.splits import ByRecording
 from edp.evaluation.ahead import ahead_scores, look_ahead
 from edp.evaluation.free_run import calibrated, free_run_scores, free_runs
 from edp.logs.source import DataSource
@@ -62,9 +61,6 @@ WRONG = {
     "mass": (1.25, 0.8, 1.3), "com_x": (0.9, 1.1, 0.85), "com_y": (0.8, 1.2, 1.2), "inertia": (0.7, 1.4, 1.5),
 }  # fmt: skip
 """Factors on the bodies of the machine file that names the linkage: a tape measure does not find them."""
-SOIL = Path(__file__).parents[1] / "examples" / "scenarios" / "c14_soil.toml"
-SOIL_MINUTES = 20.0
-"""Of the logs of a machine in soil that train and choose; the rest tests."""
 QUICK_FIT = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(1, 1), final_rounds=1, ticks=1000, starts=1)
 MANY = 1000
 """Free runs in which those that diverge are counted."""
@@ -98,26 +94,25 @@ def main() -> None:
         bare, floor = (scores[name]["stroke_error"][-1]["mean"] for name in (TOPPED, "static"))
         name = "stroke error at 60 s without three parts of the structure, network on top, against the static map"
         verdicts.append(verdict(name, bare, floor, "<= 0.12", "mm", quick))
-    if arguments.soil:
-        in_soil = soil(seed, quick)
-        scores |= {f"C14 in soil, {name}": row for name, row in in_soil.items()}
-        verdicts.append(soil_verdict(in_soil, quick))
     if arguments.specialist:
         verdicts += specialist_verdicts(scores, quick)
-    finish("twin" if whole else "twin_residual" if only == [RESIDUAL] else "twin_part", verdicts, seed, scores)
+    names = {"twin_specialist": arguments.specialist, "twin": whole, "twin_residual": only == [RESIDUAL]}
+    finish(next((name for name, so in names.items() if so), "twin_part"), verdicts, seed, scores)
 
 
 def read_arguments() -> Any:
     """The command line."""
     of = parser(__doc__ or "")
-    of.add_argument("--soil", action="store_true", help="also a C14 in soil, which takes as long again")
     of.add_argument("--specialist", action="store_true", help="train a second one, which takes as long")
     of.add_argument("--only", nargs="+", choices=(*FITTED, RESIDUAL), default=(*FITTED, RESIDUAL))
     of.add_argument("--minutes", type=float, default=180.0, help="of recordings of 3 min each")
     of.add_argument("--ticks", type=int, default=GreyFitSpec().ticks, help="of a round of a grey box's fit")
     of.add_argument("--many", action="store_true", help=f"only the share of diverged ones of {MANY} runs")
-    of.add_argument("--kept", type=Path, help="folder of fitted grey boxes: read where there, else written")
+    of.add_argument("--kept", type=Path, help="folder of what was fitted: read where there, else written")
     of.add_argument("--starts", type=int, default=GreyFitSpec().starts, help="of a grey box's fit")
+    of.add_argument("--final-rounds", type=int, default=GreyFitSpec().final_rounds, help="of a grey box's fit")
+    memory = "share of what such a round knows that counts in the next one"
+    of.add_argument("--final-memory", type=float, default=GreyFitSpec().final_memory, help=memory)
     short = "the grey box below a network has fewer stretches in its curves and no final rounds"
     of.add_argument("--short", action="store_true", help=short)
     arguments = of.parse_args()
@@ -147,13 +142,17 @@ def floors(names: tuple[str, ...], parts: Any, seed: int) -> dict[str, tuple[Twi
 def fitted_models(arguments: Any, experiment: TwinExperiment, parts: Any) -> dict[str, tuple[Twin, float]]:
     """The twins that are asked for, each with the processor seconds of its training."""
     quick, only, seed = arguments.quick, arguments.only, arguments.seed
-    fit = QUICK_FIT if quick else GreyFitSpec(ticks=arguments.ticks, starts=arguments.starts)
+    fit = QUICK_FIT if quick else grey_fit(arguments)
     training = replace(experiment.training, seed=seed)
     if quick:
         training = replace(training, lengths_s=(0.1, 0.5, 2.0), updates=(60, 40, 16), validate_every=40)
     models: dict[str, tuple[Twin, float]] = {}
+
+    def network(name: str, how: FreeRunSpec) -> tuple[Twin, float]:
+        return fitted_once(arguments.kept, name, trained, (experiment, how, parts), experiment.twin)
+
     if "recurrent" in only:
-        models["recurrent"] = trained(experiment, training, parts)
+        models["recurrent"] = network("recurrent", training)
     for name, fitted in (("greybox", fitted_grey_box), (LINKED, fitted_linkage)):
         if name in only:
             print(f"fitting: {name}", flush=True)
@@ -167,10 +166,10 @@ def fitted_models(arguments: Any, experiment: TwinExperiment, parts: Any) -> dic
             models[BARE], models[TOPPED] = fitted_residual(parts, seed, form, arguments.kept)
     if arguments.specialist:
         free_only = replace(training, measured_share=0.0, mixed_share=0.0)
-        models[FREE_ONLY] = trained(experiment, free_only, parts)
+        models[FREE_ONLY] = network(FREE_ONLY, free_only)
         # As many updates, all on runs as long as a look ahead: it is told the commands in between, as the twin is.
         short = replace(training, lengths_s=(AHEAD / parts[0].rate_hz,), updates=(sum(training.updates),))
-        models[AHEAD_ONLY] = trained(experiment, short, parts)
+        models[AHEAD_ONLY] = network(AHEAD_ONLY, short)
     return models
 
 
@@ -249,16 +248,22 @@ def trained(experiment: TwinExperiment, training: FreeRunSpec, parts: Any) -> tu
     return twin, fitted.seconds
 
 
+def grey_fit(arguments: Any) -> GreyFitSpec:
+    """How grey boxes are fitted."""
+    spec = GreyFitSpec(ticks=arguments.ticks, starts=arguments.starts)
+    return replace(spec, final_rounds=arguments.final_rounds, final_memory=arguments.final_memory)
+
+
 def fitted_once(
-    folder: Path | None, name: str, fitted: Callable[..., tuple[GreyTwin, float]], how: tuple[Any, ...]
+    folder: Path | None, name: str, fitted: Callable[..., Any], how: tuple[Any, ...], spec: Any = None
 ) -> tuple[Twin, float]:
-    """A grey box and the processor seconds of its fit; from the folder where an earlier run with it was stopped."""
+    """A twin and the processor seconds of its fit; from the folder where an earlier run with it was stopped."""
     if folder is None:
         return fitted(*how)
     home = folder / name.replace(", ", "_").replace(" ", "_")
     if not (home / "seconds.json").exists():
         twin, seconds = fitted(*how)
-        save_twin(TwinBundle(twin.spec, twin), home)
+        save_twin(TwinBundle(spec or twin.spec, twin), home)
         (home / "seconds.json").write_text(json.dumps(seconds), encoding="utf-8")
     return load_twin(home).twin, json.loads((home / "seconds.json").read_text(encoding="utf-8"))
 
@@ -328,46 +333,6 @@ def told(event: FreeRunProgress) -> None:
     """Print a validation on the way."""
     text = f"update {event.update}/{event.updates}, {event.length_s:g} s, validation {event.validation:.4f}"
     print(text, flush=True)
-
-
-def soil(seed: int, quick: bool) -> dict[str, dict[str, Any]]:
-    """Scores of twins of a C14 in soil that know 20 minutes of its logs; a third of these choose."""
-    minutes: dict[str, Any] = {"minutes": 15.0, "recordings": 10} if quick else {}
-    taught_minutes = 5.0 if quick else SOIL_MINUTES
-    with tempfile.TemporaryDirectory() as temporary:
-        order = SimulationOrder.of(SOIL, seed=seed, **minutes)
-        simulate_data_set(Path(temporary) / "soil", order)
-        source = DataSource.of(Path(temporary) / "soil")
-        count = round(taught_minutes / order.minutes * order.recordings)
-        names = [recording.name for recording in source.read()]
-        drawn = [names[i] for i in np.random.default_rng(seed).permutation(len(names))]
-        split = ByRecording(validation=tuple(drawn[: count // 3]), test=tuple(drawn[count:]))
-        experiment = replace(load_twin_experiment(None, RECURRENT), split=split)
-        channels, data = prepare_twin(source, experiment)
-    parts = (channels, fit_scales(channels, data.train), data)
-    training = FreeRunSpec(seed=seed)
-    if quick:
-        training = replace(training, lengths_s=(0.1, 0.5), updates=(60, 60), validate_every=60)
-    floor: Twin = TWINS["static"]().start(channels, parts[1], data.train, seed)
-    models: dict[str, tuple[Twin, float]] = {"static": (floor, 0.0)}
-    models["recurrent"] = trained(experiment, training, parts)
-    form = small(Residual(fit=QUICK_FIT)) if quick else Residual(fit=GreyFitSpec())
-    models["greybox"], models["residual"] = fitted_residual(parts, seed, form, None)
-    scores = {}
-    for name, (twin, seconds) in models.items():
-        scores[name] = free_run_scores(free_runs(twin, data.test, 60.0, 4), experiment.judge)
-        scores[name] |= {"ahead": ahead_scores(look_ahead(twin, data.test, AHEAD)), "training_s": seconds}
-        scores[name]["validation_mae"] = validation_mae(twin, data, experiment)
-    show(scores)
-    return scores
-
-
-def soil_verdict(scores: dict[str, dict[str, Any]], quick: bool) -> Verdict:
-    """What is asked of the twin in soil that has less error on the validation part."""
-    best = min((name for name in scores if name != "static"), key=lambda name: scores[name]["validation_mae"])
-    ours, rival = (scores[name]["stroke_error"][-1]["mean"] for name in (best, "static"))
-    name = f"C14 in soil after 20 minutes, {best}: stroke error at 60 s against the static map"
-    return verdict(name, ours, rival, "<= 0.25", "mm", quick)
 
 
 def update_ms(experiment: TwinExperiment, parts: Any, how: Callable[..., Any]) -> float:

@@ -66,7 +66,7 @@ QUICK = re.compile(
     r"(init|inspect|evaluate|report|compare|adapt|replay|footprint|runs|registry|rollout|forecast|store|monitor r)"
 )
 """Commands that take fractions of a second."""
-ALLOWED = {"inspect": (0, 3), "evaluate": (0, 6), "twin": (0, 6), "monitor run": (0, 5)}
+ALLOWED = {"inspect": (0, 3), "evaluate": (0, 6), "twin": (0, 6), "identify": (0, 6), "monitor run": (0, 5)}
 """Exit codes that say something of the data or the model."""
 
 

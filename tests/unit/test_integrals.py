@@ -67,6 +67,14 @@ def test_a_twin_is_not_trained_on_a_stroke_in_another_unit():
     assert prepared_twin(fine, TwinExperiment(twin=StaticMap(prefix_ticks=5)))[0].strokes
 
 
+def test_a_twin_is_not_trained_on_commands_that_never_move():
+    recordings = [rescaled(rescaled(sample_actuators(seed=seed), "lever_1", 0.0), "lever_2", 0.0) for seed in range(4)]
+    with pytest.raises(DataError, match=r"no command \('lever_1', 'lever_2'\) changes in the training recordings"):
+        prepared_twin(recordings, TwinExperiment(twin=StaticMap(prefix_ticks=5)))
+    one = [rescaled(sample_actuators(seed=seed), "lever_1", 0.0) for seed in range(4)]
+    assert prepared_twin(one, TwinExperiment(twin=StaticMap(prefix_ticks=5)))[0].commands
+
+
 def test_coverage_says_so_and_asks_nothing_of_what_is_no_velocity():
     recordings = [rescaled(sample_actuators(seed=seed), "stroke_1", -1.0) for seed in range(3)]
     (told,) = cover(recordings).contradictions

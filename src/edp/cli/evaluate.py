@@ -118,6 +118,7 @@ def baseline_names(text: str) -> list[str]:
 def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | None, as_json: bool) -> None:
     """Judge a twin with a progress display, and print its scores."""
     from edp.cli.twin import ahead_table, coverage_table, score_table, situation_table
+    from edp.evaluation.beyond import beyond_sentence
     from edp.evaluation.guard import twin_beaten_by
     from edp.storage import read_object
     from edp.workflows.twin import evaluate_twin
@@ -138,6 +139,8 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
     def show() -> None:
         if beaten is not None:
             out.print(beaten.sentence(), style="bold red")
+        if note := beyond_sentence(scores["models"]["twin"].get("beyond", {})):
+            out.print(note, style="bold")
         score_table(scores["models"])
         for print_table in (coverage_table, situation_table, ahead_table):
             print_table(scores["models"]["twin"])

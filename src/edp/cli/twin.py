@@ -44,6 +44,7 @@ def twin(
     Example: `edp twin data/m22 --out runs/twin`
     """
     from edp.config.twin import load_twin_experiment, with_budget
+    from edp.evaluation.beyond import beyond_sentence
     from edp.evaluation.guard import twin_beaten_by
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.report.twin.ground import ground_line
@@ -73,6 +74,8 @@ def twin(
         if candidates:
             candidate_table(candidates)
             out.print(f"chosen: {choice_sentence(candidates)}")
+        if note := beyond_sentence(trained.scores.get("twin", {}).get("beyond", {})):
+            out.print(note, style="bold")
         score_table(trained.scores)
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
         if (folder / "datasheet.txt").is_file():
@@ -111,13 +114,17 @@ def rollout(
 
     Example: `edp rollout runs/twin logs/monday.parquet --seconds 60 --from 12.5 --out monday_free.parquet`
     """
+    from edp.evaluation.beyond import beyond_sentence
     from edp.workflows.twin import rollout_log
 
     result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file, plots, page)
     written = {"file": file and str(file), "plots": plots and str(plots), "page": page and str(page)}
     facts = {"start_s": result.start_s, "calibrated_s": result.calibrated_s, **written, **result.scores}
+    facts["beyond"] = result.beyond
 
     def show() -> None:
+        if result.beyond:
+            out.print(beyond_sentence(result.beyond), style="bold")
         error_table(result.scores)
         if result.coverage is not None and result.calibrated_s is not None:
             promise = f"{result.coverage:.0%} up to {result.calibrated_s:g} s"

@@ -10,6 +10,9 @@ from typing import Any
 NETWORK = "network"
 TWIN = "twin"
 TWIN_ADVICE = "take that floor by twin.kind, another formulation, or more recordings with more motion"
+MACHINE, GREY = "identified machine", "grey box"
+"""What an identification is judged as, and what it was made of."""
+MACHINE_ADVICE = "more rounds or starts of the fit (twin.fit), a nearer --machine, or more recordings with more motion"
 MEASURE = "rmse"
 """By which models are compared: here, in headlines and in tables. Trainings minimise squares, the preset auto chooses
 and promises by them, published floors state them; and of a machine that mostly rests the mean absolute error is decided
@@ -128,19 +131,34 @@ def twin_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
     Args:
         models: scores by name, as ``free_run.json`` has them; the twin's is ``twin``.
     """
-    own, better = _free_run_errors(models[TWIN]), []
+    return _beaten_on_free_runs(models, TWIN, TWIN, TWIN_ADVICE)
+
+
+def machine_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
+    """The guess, or the static map, that beats an identified machine by most on free runs; None where none does.
+
+    Args:
+        models: scores by name, as `edp.workflows.identify.identify` gives them. The grey box is what the machine was
+            made of, not what stands in its place.
+    """
+    rivals = {name: scores for name, scores in models.items() if name != GREY}
+    return _beaten_on_free_runs(rivals, MACHINE, "machine file", MACHINE_ADVICE)
+
+
+def _beaten_on_free_runs(models: Mapping[str, Any], judged: str, what: str, advice: str) -> Beaten | None:
+    own, better = _free_run_errors(models[judged]), []
     for name, scores in models.items():
         theirs = _free_run_errors(scores)
         by_actuator = {
             actuator: [math.log(a / b) for a, b in zip(errors, theirs[actuator], strict=True) if a > 0 and b > 0]
             for actuator, errors in own.items()
-            if name != TWIN
+            if name != judged
         }
         ratios = [ratio for actuator in by_actuator.values() for ratio in actuator]
         if ratios:
             lost = tuple(name for name, logs in by_actuator.items() if sum(logs) > LEAST * len(logs))
             mean = sum(ratios) / len(ratios)
-            better.append((mean, Beaten(name, 1.0 - math.exp(-mean), lost, TWIN, TWIN_ADVICE)))
+            better.append((mean, Beaten(name, 1.0 - math.exp(-mean), lost, what, advice)))
     mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
     return worst if mean > LEAST else None
 

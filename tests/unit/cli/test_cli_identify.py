@@ -44,7 +44,8 @@ def logs(tmp_path_factory):
 def test_a_machine_file_is_written_that_simulates_and_says_what_is_told(edp, logs, tmp_path):
     file = tmp_path / "mine.toml"
     ended = edp("identify", logs, "--out", file, *LINKED, "--json")
-    assert ended.code == 0, ended.err
+    # The guess is the machine of these logs, and nothing is nearer to them: it is said, and scripts see it.
+    assert (ended.code, ended.json["beaten_by"]) == (6, "machine M22"), ended.err
     machine = load_machine(str(file))
     assert machine.name == "mine"
     assert machine.bodies != load_machine("M22").bodies
@@ -79,7 +80,9 @@ def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs,
         settings = [f"twin.kind={kind}", *(word for word in SMALL if kind == "greybox" or "twin." not in word)]
         train_twin(DataSource.of(logs), load_twin_experiment(None, settings), tmp_path / file)
     ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", tmp_path / "grey")
-    assert ended.code == 0, ended.err
+    assert ended.code == 6, ended.err
+    assert "machine M22 has" in ended.out.splitlines()[0]
+    assert "less error than the machine file" in " ".join(ended.out.split())
     assert re.search(r"\d+ of \d+ numbers are told by the logs", ended.out)
     assert "next: edp simulate" in ended.out
     assert load_machine(str(tmp_path / "mine.toml")).bodies == load_machine("M22").bodies
@@ -166,5 +169,5 @@ def test_a_twin_with_a_linkage_is_another_one_once_its_machine_file_changes(edp,
     assert ended.code == 1
     assert "which is not that of --machine (M22): give the same machine" in " ".join(ended.err.split())
     ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", run)
-    assert ended.code == 0, ended.err
+    assert ended.code in (0, 6), ended.err  # the guess is the machine of these logs, and may be nearer
     assert load_machine(str(tmp_path / "mine.toml")).bodies != load_machine("M22").bodies

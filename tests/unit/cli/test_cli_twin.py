@@ -336,6 +336,8 @@ def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, t
     assert "6 recordings came" in edp("rollout", trained, logs).err
     slow = write_recording(sample_actuators(), tmp_path / "slow.parquet")
     (recording,) = DataSource.of(slow).read()
+    short = write_recording(replace(recording, values=recording.values[:15]), tmp_path / "short.parquet")
+    assert "has 15 ticks (0.3 s); the twin needs a prefix of 20" in " ".join(edp("rollout", trained, short).err.split())
     write_recording(replace(recording, rate_hz=25.0), slow)
     assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
     assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())

@@ -15,6 +15,7 @@ from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.free_run import free_run_scores
+from edp.evaluation.guard import GREY, MACHINE
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, UNEXCITED
@@ -371,9 +372,9 @@ def _scores(
     floor: TwinSpec = replace(TWINS["static"](), prefix_ticks=twin.prefix_ticks)
     static = floor.start(twin.channels, twin.scales, data.train, settings.training.seed)
     answers = {
-        "identified machine": runs.by_machine(machines[1], front),
+        MACHINE: runs.by_machine(machines[1], front),
         f"machine {machines[0].name}": runs.by_machine(machines[0], front),
-        "grey box": runs.by_twin(twin),
+        GREY: runs.by_twin(twin),
         "static map": runs.by_twin(static),
     }
     return {name: free_run_scores(runs.answered(twin, values), judge) for name, values in answers.items()}

@@ -18,6 +18,7 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scores
+from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
 from edp.evaluation.step_response import step_responses
 from edp.logs.source import DataSource
@@ -61,6 +62,9 @@ def judge_twin(
     tell("free runs of the twin")
     runs = free_runs(twin, data.test, spec.seconds, spec.starts)
     scores = {"twin": free_run_scores(runs, spec, bundle.intervals, labels) | _ahead(twin, data, spec)}
+    inputs = [part.inputs for part in data.test]
+    if beyond := commands_beyond(bundle.provenance.get(RANGES), twin.channels, inputs):
+        scores["twin"]["beyond"] = beyond
     for name in spec.floors:
         tell(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from edp.config.twin import TwinExperiment
 from edp.data.derived_velocities import complete_velocities
 from edp.data.integrals import contradiction, integral_fit
@@ -38,8 +40,27 @@ def prepared_twin(recordings: Sequence[Recording], experiment: TwinExperiment) -
         same_channels(channels, recording)
     data = prepare(recordings, channels.task(), experiment.split, experiment.twin.prefix_ticks)
     check_length(channels, experiment.twin.prefix_ticks, data.train)
+    check_moves(channels, data.train)
     check_integrals(channels, data.train)
     return channels, data
+
+
+def check_moves(channels: TwinChannels, train: Sequence[Series]) -> None:
+    """Refuse recordings in which no command ever moves: nothing could be learned of what drives a twin.
+
+    Raises:
+        DataError: names the commands.
+    """
+    moves = [
+        np.ptp(np.concatenate([part.inputs[:, column] for part in train])) > 0
+        for column in range(len(channels.commands))
+    ]
+    if not any(moves):
+        names = ", ".join(f"'{channel.name}'" for channel in channels.commands)
+        raise DataError(
+            f"twin: no command ({names}) changes in the training recordings; a twin is driven by commands alone: give "
+            "recordings in which at least one moves, or name the commands in channels.commands"
+        )
 
 
 def check_integrals(channels: TwinChannels, train: Sequence[Series]) -> None:

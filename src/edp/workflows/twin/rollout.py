@@ -11,6 +11,7 @@ import numpy as np
 
 from edp.data.derived_velocities import matched
 from edp.errors import ConfigError, DataError, closest
+from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
 from edp.logs import write_recording
 from edp.logs.source import DataSource
@@ -39,6 +40,7 @@ class Rollout:
         start_s: of the free run in the log.
         coverage: share that the intervals are meant to hold; None without intervals.
         calibrated_s: length of a free run up to which they are calibrated; beyond it they stay as wide.
+        beyond: commands of the free run beyond those that taught the twin, see `edp.evaluation.beyond`.
     """
 
     recording: Recording
@@ -46,6 +48,7 @@ class Rollout:
     start_s: float
     coverage: float | None
     calibrated_s: float | None
+    beyond: dict[str, dict[str, float]]
 
 
 def rollout_log(
@@ -99,6 +102,7 @@ def rollout_log(
         start / recording.rate_hz,
         None if intervals is None else intervals.coverage,
         None if intervals is None else intervals.ticks[-1] / recording.rate_hz,
+        commands_beyond(bundle.provenance.get(RANGES), twin.channels, [commands[0, prefix:]]),
     )
     if out is not None:
         write_recording(result.recording, out)
@@ -127,6 +131,11 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
         raise ConfigError(f"--from {start_s:g}: {span(0.0, MOST_SECONDS).rule('from')} must hold")
     start = prefix if start_s is None else round(start_s * rate)
     ticks = max(1, round(seconds * rate))
+    if recording.samples < prefix + 2:
+        raise DataError(
+            f"'{recording.name}' has {recording.samples} ticks ({recording.duration_s:g} s); the twin needs a prefix "
+            f"of {prefix} measured ones ({prefix / rate:g} s) and two more: give a longer log"
+        )
     if start < prefix:
         raise DataError(
             f"a free run from {start / rate:g} s has {start} measured ticks before it; the twin needs a prefix of "

@@ -12,6 +12,7 @@ from typing import Any
 from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.data.prepared import Prepared
+from edp.evaluation.beyond import RANGES, command_ranges
 from edp.evaluation.free_run import calibrated
 from edp.evaluation.step_response import step_responses
 from edp.logs.source import DataSource
@@ -115,6 +116,8 @@ def train_twin(
         tell("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
         provenance = _provenance(source, experiment, data, fitted) | _full_strokes(recordings) | result.facts
+        before = None if base is None else base.bundle.provenance.get(RANGES)
+        provenance[RANGES] = command_ranges(channels, [*data.train, *data.validation], before)
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
         write_scores(run.path, scores, runs, intervals)

@@ -1,0 +1,82 @@
+"""Commands beyond those that taught a twin: its errors and intervals there were never compared with anything."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+
+MARGIN = 0.02
+"""Share of a command's range by which it may leave that range: noise of its sensor."""
+RANGES = "command_ranges"
+"""Key of the ranges in the provenance of a twin."""
+
+
+def command_ranges(channels: TwinChannels, series: Sequence[Series], before: Any = None) -> dict[str, list[float]]:
+    """Least and largest value of each command, SI units, by name.
+
+    Args:
+        channels: of the twin.
+        series: that taught it.
+        before: those of the twin that it began as, where it went on with these series.
+    """
+    low = np.min([part.inputs.min(axis=0) for part in series], axis=0)
+    high = np.max([part.inputs.max(axis=0) for part in series], axis=0)
+    ranges = {c.name: [float(a), float(b)] for c, a, b in zip(channels.commands, low, high, strict=True)}
+    for name, taught in before.items() if isinstance(before, Mapping) else ():
+        if name in ranges and (ends := _ends(taught)):
+            ranges[name] = [min(ranges[name][0], ends[0]), max(ranges[name][1], ends[1])]
+    return ranges
+
+
+def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArray[Any]]) -> dict[str, dict[str, float]]:
+    """Commands that leave their ranges, by name: share of the ticks, how far they go, and how far they did.
+
+    Args:
+        ranges: of `command_ranges`, from a file that may hold anything; a command without two numbers is left out.
+        channels: of the twin.
+        inputs: commands ``(tick, command)``, SI units.
+    """
+    found: dict[str, dict[str, float]] = {}
+    if not isinstance(ranges, Mapping) or not inputs:
+        return found
+    values = np.concatenate([np.asarray(rows, dtype=np.float64) for rows in inputs])
+    for column, channel in enumerate(channels.commands):
+        ends = _ends(ranges.get(channel.name))
+        if ends is None:
+            continue
+        low, high = ends
+        margin, own = MARGIN * (high - low), values[:, column]
+        share = float(((own < low - margin) | (own > high + margin)).mean())
+        if share > 0.0:
+            found[channel.name] = {
+                "share": share, "low": low, "high": high, "least": float(own.min()), "largest": float(own.max()),
+            }  # fmt: skip
+    return found
+
+
+def _ends(value: Any) -> tuple[float, float] | None:
+    """Two finite numbers that do not fall; None: something else."""
+    if not isinstance(value, list) or len(value) != 2:
+        return None
+    if not all(isinstance(end, int | float) and math.isfinite(end) for end in value) or value[0] > value[1]:
+        return None
+    return float(value[0]), float(value[1])
+
+
+def beyond_sentence(found: Mapping[str, Mapping[str, float]]) -> str:
+    """What a person must know before they trust errors and intervals there; empty where nothing is beyond."""
+    if not found:
+        return ""
+    listed = ", ".join(
+        f"{name} ({row['share']:.2g} of the ticks, {row['least']:.3g} to {row['largest']:.3g}; learned from "
+        f"{row['low']:.3g} to {row['high']:.3g})"
+        for name, row in sorted(found.items(), key=lambda pair: -pair[1]["share"])
+    )
+    return f"commands beyond all that taught the twin: {listed}; intervals promise nothing there"
