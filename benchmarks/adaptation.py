@@ -69,7 +69,7 @@ SIZES = {True: Size(6.0, 14, 2, 30, 8.5, 10.0, 60_000), False: Size(120.0, 60, 2
 
 def machines(folder: Path) -> dict[str, tuple[str, str]]:
     """Machine file and soil of each scenario."""
-    source = Path(machine_files.__file__).parent / "machines" / "m22.toml"
+    source = Path(machine_files.__file__).parents[1] / "machines" / "m22.toml"
     text, made = source.read_text(), {}
     cold = text.replace("temperature = 45.0", "temperature = 20.0")
     worn = cold.replace("[0.14, 0.13, 0.12]", "[0.17, 0.16, 0.15]").replace("[0.22, 0.22, 0.22]", "[0.25, 0.25, 0.25]")

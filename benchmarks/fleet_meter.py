@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,6 +57,8 @@ class Meter:
     workers: set[int] = field(default_factory=set)
     done: threading.Event = field(default_factory=threading.Event)
     marked: dict[int, float] = field(default_factory=dict)
+    own: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    """Processor time of the looking itself, in a thread of this process: in all, and until it was marked."""
 
     def look(self) -> None:
         own = os.getpid()
@@ -72,15 +75,17 @@ class Meter:
     def watch(self) -> None:
         while not self.done.wait(TICK_S):
             self.look()
+            self.own[0] = time.thread_time()
 
     def mark(self) -> None:
         """What was spent until now counts no more."""
         self.look()
+        self.own[1] = self.own[0]
         self.marked = {process: spent for place in self.seen.values() for process, spent in place.items()}
 
     def here(self) -> float:
-        """Of this process and what is no worker, since the meter began or was marked."""
-        return self._since(self.seen.get(os.getpid(), {}))
+        """Of this process and what is no worker, since the meter began or was marked; looking does not count."""
+        return self._since(self.seen.get(os.getpid(), {})) - (self.own[0] - self.own[1])
 
     def busiest(self) -> float:
         """Of the worker that took most, likewise."""

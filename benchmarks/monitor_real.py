@@ -32,7 +32,7 @@ from edp.logs.source import DataSource
 from edp.monitor.monitor import Monitor
 from edp.recording import Recording
 from edp.workflows.monitor import fit_to_recordings
-from monitor_rig import BEST_PYOD, GOALS, MINUTES, lowest, read_rig, rig_results
+from monitor_rig import BEST_PYOD, GOALS, lowest, read_rig, rig_results
 from monitor_rivals import CHARTS, has_pyod, limit_of, raised, rivals_of
 from real_recordings import EXAMPLES, VARIABLE, shared_folder
 
@@ -45,6 +45,8 @@ SPANS_TICKS = (1, 2, 4, 8, 16, 32)
 QUICK_SETS = ("cylinders", "sjoberg")
 COMMANDS = ("u", "valve", "current", "reference", "r0", "r1")
 """Columns that no sensor shows."""
+MINUTES = 0.3
+"""Processor time of the networks of a monitor here: there are minutes of data."""
 HEALTHY_SHARE, SEGMENTS, ONSET = 0.6, 3, 1 / 3
 SIZES: Mapping[str, tuple[float, ...]] = {
     "bias": (0.1, 0.3, 1.0),

@@ -16,7 +16,7 @@ from edp.errors import DataError
 from edp.monitor.detectors import EwmaSpec, statistics
 from edp.monitor.fitting import ChainSpec, fit_from_blocks
 from edp.monitor.residuals.base import FitMaterial
-from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
+from edp.monitor.residuals.cycles import CyclesSpec
 from edp.monitor.session_blocks import blocks_of, fit_summaries
 from edp.monitor.watches import WatchSpec
 from edp.recording import Recording
@@ -26,9 +26,8 @@ from monitor_rivals import Rival, has_pyod, rivals_of
 
 Values = NDArray[np.float32]
 BEST_PYOD = ("CBLOF", "GMM")
-MINUTES = 0.3
-"""Processor time of the networks of a monitor here: there are minutes of data."""
-RIG_SENSORS = VirtualSensorsSpec(lags_s=(1.0, 4.0), units=16, least=-0.99)
+RIG_CYCLES = CyclesSpec()
+"""Each log is a cycle of the rig, which repeats it second by second."""
 RIG_CHAIN = ChainSpec(settle_s=0.0, clip=1000.0, folds=4, doubtful=1e6, watches=(WatchSpec(detector=EwmaSpec()),))
 """Without bounds that need hours of healthy work: what is far off is to be as far off as it is."""
 CONDITIONS = {"cooler_percent": 100, "valve_percent": 100, "pump_leak": 0, "accumulator_bar": 130}
@@ -95,14 +94,14 @@ def our_score(rig: Rig, training: Sequence[int], seed: int) -> Score:
     """The largest statistic of the monitor's parts in a cycle.
 
     `edp.workflows.monitor` refuses logs of ten minutes; here its parts are put together without an operating point, for
-    which there are too few blocks. Every other cycle trains virtual sensors, the rest sets scales and covariance.
+    which there are too few blocks. Every other cycle tells what is expected at each second, the rest sets scales and
+    covariance.
     """
     sessions = [rig.recording(i) for i in training]
     channels = sessions[0].channels
-    material = FitMaterial(sessions[2::2], sessions[:1], channels, 1.0, seed=seed, minutes=MINUTES)
-    source = RIG_SENSORS.fit(material)
+    source = RIG_CYCLES.fit(FitMaterial(sessions[2::2], sessions[:1], channels, 1.0, seed=seed))
     if source is None:
-        raise DataError("no sensor of the rig follows from the others")
+        raise DataError("no sensor of the rig changes")
     rest = sessions[1::2]
     summaries = fit_summaries(RIG_CHAIN.block_s, (source,), channels, rest)
     summaries = replace(summaries, moving=summaries.moving[:0], level=summaries.level[:0])

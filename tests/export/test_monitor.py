@@ -22,6 +22,7 @@ from edp.export.monitor import monitor_files, write_monitor
 from edp.export.monitor.golden import drawn_rows
 from edp.monitor.detectors import EDetectorSpec
 from edp.monitor.monitor_file import save_monitor
+from edp.monitor.residuals.virtual_sensors import VirtualSensors
 from edp.networks.backbones import GruSpec
 from edp.networks.outputs import OUTPUTS
 from edp.networks.predictor import ModelSpec, build_model
@@ -326,6 +327,48 @@ def test_look_ahead_networks_and_twins_with_free_ports(c, ahead_monitor, tmp_pat
     assert np.isnan(expected[0]).any()
     scale = np.nanstd(expected, axis=0)
     assert (np.nan_to_num(np.abs(residuals - expected)) < 1e-3 * scale).all()
+
+
+@pytest.fixture(scope="module")
+def turns_monitor(rig_monitor):
+    """Virtual sensors by turns, as if they had been trained so: what they say does not matter here."""
+    source = rig_monitor.sources[0]
+    assert len(source.bundles) > 3
+    turns = VirtualSensors(source.bundles, source.inputs, source.middle, every=3)
+    return replace(rig_monitor, sources=(turns, *rig_monitor.sources[1:]))
+
+
+def test_networks_that_take_turns(c, turns_monitor, rig_fault, tmp_path):
+    c.need("gcc")
+    write_monitor(monitor_parts(turns_monitor), "watch", tmp_path)
+    flags = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    c.run("gcc", *c.flags, *flags, *sources(tmp_path), "host_test.c", "-lm", "-o", "program", folder=tmp_path)
+    assert "all tests passed" in c.run(tmp_path / "program").decode()
+    rows = rig_fault[900:1300].copy()
+    rows[150:160, 2] = np.nan
+    rows[250] = np.nan
+    rows[301, 3] = np.nan
+    residuals, _, _ = streamed(c, tmp_path / "program", rows, turns_monitor)
+    expected, _ = turns_monitor.residuals(rows, turns_monitor.initial_state())
+    np.testing.assert_array_equal(np.isnan(residuals), np.isnan(expected))
+    held = np.nan_to_num(np.abs(residuals - expected))
+    assert (held <= monitor_parts(turns_monitor).golden_residuals.tolerance).all()
+    own = turns_monitor.sources[0].bundles.values()
+    of_second = len(next(iter(own)).task.targets)
+    # The second network runs at ticks 1, 4, 7 and so on.
+    changes = np.flatnonzero(np.diff(residuals[:100, of_second]) != 0.0)
+    assert np.isnan(residuals[0, of_second])
+    assert {int(tick) % 3 for tick in changes[1:]} == {0}
+
+
+def test_the_footprint_counts_turns(rig_monitor, turns_monitor):
+    each = monitor_footprint(monitor_parts(rig_monitor, golden=False))
+    turns = monitor_footprint(monitor_parts(turns_monitor, golden=False))
+    high = [network.cycles("cortex_m4f")[2] for network in each.networks]
+    saved = sum(high) - max(sum(high[first::3]) for first in range(3))
+    assert each.cycles["cortex_m4f"][2] - turns.cycles["cortex_m4f"][2] == pytest.approx(saved, abs=1.0)
+    assert turns.cycles["cortex_m4f"][0] < each.cycles["cortex_m4f"][0]
+    assert turns.ram_bytes > each.ram_bytes
 
 
 def test_the_footprint_is_that_of_the_code(c, folder, rig_monitor, tmp_path):

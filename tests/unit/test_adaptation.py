@@ -11,13 +11,18 @@ from typer.testing import CliRunner
 
 from edp.cli import app
 from edp.config.experiment import load_experiment
+from edp.data.twin_channels import TwinChannels
 from edp.errors import BundleError, ConfigError, ExportError
 from edp.ir.rls import AdaptationSpec, RlsStatus
 from edp.networks import AdaptedStream
+from edp.networks.twin import TWINS, fit_scales
+from edp.networks.twin.greybox import GreyBox
+from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
 from edp.training import load_bundle, save_bundle, upgrade_bundle
 from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
-from edp.workflows.adaptation import adapt, fit_adaptation, replay
+from edp.training.twin_bundle import TwinBundle, save_twin
+from edp.workflows.adaptation import adapt, fit_adaptation, replay, replay_run
 from edp.workflows.deployment import footprint_of
 from edp.workflows.train_evaluate import evaluate, train, trained_run
 
@@ -160,6 +165,32 @@ def test_commands_say_what_it_is_worth(run, adapted, lever_sessions, tmp_path):
     c = runner.invoke(app, ["export", str(folder), "--to", "c", "--out", str(tmp_path / "c")])
     assert "predictor_adaptation.h" in c.output
     assert "holds the network alone" not in c.output
+
+
+def saved_twin(kind, sessions, folder, rate_hz=100.0):
+    """An unfitted twin of the lever and its speed."""
+    channels = TwinChannels((Channel("lever", Kind.GENERIC),), (Channel("speed", Kind.VELOCITY),), (), (), rate_hz)
+    series = [channels.task().series(dataclasses.replace(one, rate_hz=rate_hz)) for one in sessions.read()]
+    twin = kind.start(channels, fit_scales(channels, series), series, 0)
+    save_twin(TwinBundle(kind, twin), folder)
+    return str(folder)
+
+
+def test_a_grey_box_that_follows_the_machine_moves_what_is_replayed(adapted, lever_sessions, tmp_path):
+    folder, command = str(adapted[0]), CliRunner()
+    twin = saved_twin(GreyBox(), lever_sessions, tmp_path / "grey")
+    plain, moved = (
+        json.loads(command.invoke(app, ["replay", folder, str(lever_sessions.path), *more, "--json"]).stdout)["mae"]
+        for more in ((), ("--twin", twin))
+    )
+    assert [row["base"] for row in moved] == [row["base"] for row in plain]
+    assert [row["adapted"] for row in moved] != [row["adapted"] for row in plain]
+    slow = saved_twin(GreyBox(), lever_sessions, tmp_path / "slow", 50.0)
+    with pytest.raises(ConfigError, match="the twin has 50 Hz, the network 100 Hz"):
+        replay_run(folder, lever_sessions, twin=slow)
+    static = saved_twin(TWINS["static"](), lever_sessions, tmp_path / "static")
+    with pytest.raises(ConfigError, match="only a grey box"):
+        replay_run(folder, lever_sessions, twin=static)
 
 
 def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, lever_sessions, tmp_path):

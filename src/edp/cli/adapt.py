@@ -56,6 +56,10 @@ def replay(
         bool, typer.Option(help="Carry the learned coefficients from one log to the next, as on one machine.")
     ] = False,
     frozen: Annotated[bool, typer.Option("--frozen", help="Apply the correction without learning.")] = False,
+    twin: Annotated[
+        Path | None,
+        typer.Option("--twin", help="Grey box of the machine as it was, whose numbers follow it and move predictions."),
+    ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
@@ -63,12 +67,14 @@ def replay(
     """Run logs through a network and its adaptation, tick by tick: the error with and without, over time in motion.
 
     Example: `edp replay runs/first_adapted logs/monday --carry`
+
+    Example: `edp replay runs/first_adapted logs/monday --twin runs/grey`
     """
     from edp.workflows.adaptation import replay_run
 
     with progress(as_json) as shown:
         on_recording = counted(shown, Steps(as_json), "replay", "done")
-        facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, on_recording)
+        facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, on_recording, twin)
 
     emit(as_json, facts, lambda: replay_tables(facts))
 

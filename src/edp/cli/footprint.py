@@ -68,8 +68,9 @@ def _of_monitor(file: Path, limits: Budget, as_json: bool) -> None:
 
     def show() -> None:
         networks = facts["networks"]
-        rows = [(i, n["number_format"], n["parameters"], n["runs"], n["macs_tick"]) for i, n in enumerate(networks)]
-        table(file.name, ["network", "numbers", "parameters", "runs per tick", "MACs per tick"], rows)
+        keys = ("number_format", "parameters", "runs", "every", "macs_tick")
+        rows = [(i, *(network[key] for key in keys)) for i, network in enumerate(networks)]
+        table(file.name, ["network", "numbers", "parameters", "runs", "every, ticks", "MACs"], rows)
         chain = counts.chain
         out.print(
             f"behind the residuals, in double precision: {chain.mean:,.0f} cycles a tick of a Cortex-M4F on average, "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +11,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.workforce import WorkersOption
 
 # Scripts can tell alarms by the exit code.
 ALARMS = 5
@@ -47,6 +50,7 @@ def fit(
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example chain.block_s=2.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    workers: WorkersOption = 1,
     as_json: JsonFlag = False,
 ) -> None:
     """Fit a monitor: what each channel should read is learned from healthy logs, and so is when to raise an alarm.
@@ -68,6 +72,7 @@ def fit(
     options |= {} if machine is None else {"dictionary": {"machine": machine}}
     experiment = load_monitor_experiment(config, changes, options)
     *runs, logs = arguments
+    began = time.monotonic()
     with progress(as_json) as shown:
         bar, steps = shown.add_task("monitor", total=None, note="reading recordings"), Steps(as_json)
 
@@ -75,11 +80,13 @@ def fit(
             shown.update(bar, note=text)
             steps.say(f"monitor: {text}", force=True)
 
-        fitted = fit_monitor(runs, source_of(logs, signal_map, repair), experiment, folder, note)
+        fitted = fit_monitor(runs, source_of(logs, signal_map, repair), experiment, folder, note, workers)
     monitor = fitted.monitor
-    facts = {
+    facts: dict[str, Any] = {
         "monitor": str(folder),
         "seconds": fitted.seconds,
+        "wall_s": time.monotonic() - began,
+        "workers": workers or os.cpu_count() or 1,
         "residuals": list(monitor.residual_names),
         "doubtful": list(fitted.doubtful),
         "one_machine": fitted.one_machine,
@@ -96,7 +103,10 @@ def fit(
                 "its balances of flow know this machine's valves to 1 %: it belongs to this one machine and raises "
                 "alarms on others of its series; for those, fit with --set chain.tolerance=0.01, which finds less"
             )
-        out.print(f"fitted in {duration(fitted.seconds)} of processor time; monitor in {folder}")
+        spent = f"{duration(fitted.seconds)} of processor time"
+        if workers != 1:
+            spent = f"{duration(facts['wall_s'])} by {facts['workers']} processes"
+        out.print(f"fitted in {spent}; monitor in {folder}")
         out.print(f"next: edp monitor run {folder} LOGS")
 
     emit(as_json, facts, show)

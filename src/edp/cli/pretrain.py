@@ -16,7 +16,7 @@ from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 def pretrain(
     data: Annotated[Path, typer.Argument(help="Recordings of many machines: folder, data-set file, or store.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
-    method: Annotated[str, typer.Option(help="joint, fomaml, maml or reptile.")] = "joint",
+    method: Annotated[str, typer.Option(help="joint, codes, fomaml, maml or reptile.")] = "joint",
     start: Annotated[
         Path | None, typer.Option(help="Run folder or bundle of the initial weights; default: random.")
     ] = None,

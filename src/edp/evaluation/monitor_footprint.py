@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from edp.export.monitor import (
     WatchPart,
     monitor_files,
 )
+from edp.export.monitor.parts import PIECE, ROW, pieces
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 
@@ -106,11 +108,49 @@ def _slices(parts: MonitorParts) -> list[float]:
     of_summary = 2.0 * product * parts.points + 6.0 * double
     costs += len(parts.residuals) * [parts.each * CORE_COSTS["summary"], *(parts.each * [of_summary])]
     for watch in parts.chain.watches:
-        directions = watch.directions
-        each, steps = DETECTOR[watch.detector], watch.rows if watch.detector == "glr" else 1
-        costs += [CENTRE * double * summaries, *(directions * [product * (1 if watch.own else summaries)])]
-        costs += steps * [each * double * directions]
-    return [*costs, VERDICT * double * summaries]
+        costs += [CENTRE * double * size for size in pieces(summaries, ROW)]
+        if watch.own:
+            costs += [product * size for size in pieces(watch.directions, ROW)]
+        else:
+            costs += watch.directions * [product * summaries]
+        once = [double * size for size in pieces(watch.directions, PIECE)]
+        costs += [share * cycles for share in _shares(watch) for cycles in once]
+    return [*costs, 0.0, *(VERDICT * double * size for size in pieces(summaries, ROW))]
+
+
+def _shares(watch: WatchPart) -> list[float]:
+    """Of each pass of a detector through its directions; the second of a CUSUM has a product alone."""
+    each = DETECTOR[watch.detector]
+    return [0.75 * each, 0.25 * each] if watch.detector == "cusum" else watch.passes * [each]
+
+
+@dataclass(frozen=True)
+class NetworkCost:
+    """A network of a monitor.
+
+    Attributes:
+        footprint: by itself.
+        number_format: that it is exported in.
+        runs: in one of its ticks.
+        every: ticks from one of its ticks to the next.
+        first: the first of them.
+    """
+
+    footprint: Footprint
+    number_format: str
+    runs: int = 1
+    every: int = 1
+    first: int = 0
+
+    @property
+    def estimate(self) -> Estimate:
+        """Of one run."""
+        return self.footprint.estimate(self.number_format)
+
+    def cycles(self, core: str) -> tuple[float, float, float]:
+        """Low and typical estimate of a tick on average, and the high one of one of its ticks."""
+        low, typical, high = self.estimate.cycles[core]
+        return self.runs * low / self.every, self.runs * typical / self.every, self.runs * high
 
 
 @dataclass(frozen=True)
@@ -118,8 +158,7 @@ class MonitorFootprint:
     """What a monitor takes on a controller.
 
     Attributes:
-        networks: footprint of each of its networks with the number format that it is exported in, and how often it runs
-            a tick.
+        networks: each of them.
         chain: cycles behind the residuals.
         cycles: low, typical and high estimate of a tick by core; the high one decides and is that of the longest tick.
         constants: bytes in read-only memory.
@@ -128,7 +167,7 @@ class MonitorFootprint:
         state_bytes: of the chain alone.
     """
 
-    networks: tuple[tuple[Footprint, str, int], ...]
+    networks: tuple[NetworkCost, ...]
     chain: ChainCycles
     cycles: dict[str, tuple[int, int, int]]
     constants: int
@@ -140,8 +179,14 @@ class MonitorFootprint:
         """Plain values with the verdict against `budget`."""
         return {
             "networks": [
-                {"parameters": f.parameters, "macs_tick": runs * f.macs_tick, "number_format": form, "runs": runs}
-                for f, form, runs in self.networks
+                {
+                    "parameters": network.footprint.parameters,
+                    "macs_tick": network.runs * network.footprint.macs_tick,
+                    "number_format": network.number_format,
+                    "runs": network.runs,
+                    "every": network.every,
+                }
+                for network in self.networks
             ],
             "chain": asdict(self.chain),
             "cycles": {core: list(values) for core, values in self.cycles.items()},
@@ -177,31 +222,48 @@ def monitor_footprint(parts: MonitorParts) -> MonitorFootprint:
     """
     files = monitor_files(parts, "monitor")
     networks = tuple(_network(part) for part in parts.sources if isinstance(part, NetworkPart | TwinPart))
-    estimates: list[tuple[Estimate, int]] = [(f.estimate(form), runs) for f, form, runs in networks]
     chain, state = chain_cycles(parts), state_bytes(parts)
     cycles = {}
     for name, core in CORES.items():
-        sums = [sum(runs * entry.cycles[name][side] for entry, runs in estimates) for side in range(3)]
-        low, typical = round(chain.mean * core.low), round(chain.mean * core.typical * BOARD_TYPICAL)
-        cycles[name] = (sums[0] + low, sums[1] + typical, sums[2] + round(chain.most * BOARD_SLOW))
+        low, typical, high = _network_cycles(networks, name)
+        low, typical = low + chain.mean * core.low, typical + chain.mean * core.typical * BOARD_TYPICAL
+        cycles[name] = (round(low), round(typical), round(high + chain.most * BOARD_SLOW))
     return MonitorFootprint(
         networks=networks,
         chain=chain,
         cycles=cycles,
-        constants=files.tables.bytes + sum(entry.parameter_bytes for entry, _ in estimates),
-        ram_bytes=STACK_BYTES + state + sum(runs * (entry.ram_bytes - STACK_BYTES) for entry, runs in estimates),
-        program_bytes=CHAIN_PROGRAM_BYTES + sum(entry.program_bytes for entry, _ in estimates),
+        constants=files.tables.bytes + sum(one.estimate.parameter_bytes for one in networks),
+        ram_bytes=STACK_BYTES + state + sum(one.runs * (one.estimate.ram_bytes - STACK_BYTES) for one in networks),
+        program_bytes=CHAIN_PROGRAM_BYTES + sum(one.estimate.program_bytes for one in networks),
         state_bytes=state,
     )
 
 
-def _network(part: NetworkPart | TwinPart) -> tuple[Footprint, str, int]:
-    network, runs = part.bundle.predictor, len(part.groups) if isinstance(part, TwinPart) else 1
+def _network_cycles(networks: Sequence[NetworkCost], core: str) -> tuple[float, float, float]:
+    """Low and typical estimate of all networks at a tick on average, and the high one of the longest tick.
+
+    Networks that run at the same ticks add up; of several periods the longest ticks are taken to fall together.
+    """
+    low, typical, at_once = 0.0, 0.0, dict[tuple[int, int], float]()
+    for network in networks:
+        costs, turn = network.cycles(core), (network.every, network.first)
+        low, typical = low + costs[0], typical + costs[1]
+        at_once[turn] = at_once.get(turn, 0.0) + costs[2]
+    periods = {every for every, _ in at_once}
+    longest = [max(cycles for (every, _), cycles in at_once.items() if every == period) for period in periods]
+    return low, typical, sum(longest)
+
+
+def _network(part: NetworkPart | TwinPart) -> NetworkCost:
+    network = part.bundle.predictor
     whole = isinstance(network, IntegerPredictor)
     counted = (
         network.in_float() if isinstance(network, IntegerPredictor) and not isinstance(network, TwinPlant) else network
     )
-    return footprint(counted), "w8a16" if whole else "float32", runs
+    form = "w8a16" if whole else "float32"
+    if isinstance(part, TwinPart):
+        return NetworkCost(footprint(counted), form, runs=len(part.groups))
+    return NetworkCost(footprint(counted), form, every=part.every, first=part.first)
 
 
 def state_bytes(parts: MonitorParts) -> int:
@@ -234,4 +296,5 @@ def _source_bytes(part: SourcePart) -> int:
     coverages = len(part.bundle.predictor.output.coverages)
     out = len(task.targets) * len(task.horizons) * (1 + 2 * coverages)
     rings = 0 if max(part.delays) == 0 else (max(part.delays) + 1) * len(part.judged) * (2 if part.scaled else 1)
-    return buffers + network + 4 * (out + rings)
+    last = 0 if part.every == 1 else 1 + len(part.judged)
+    return buffers + network + 4 * (out + rings + last)

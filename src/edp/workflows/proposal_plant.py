@@ -1,4 +1,4 @@
-"""Whether proposed columns can train a plant model, which runs on commands alone, and what it needs to be told."""
+"""Whether proposed columns can train a plant model, which runs on commands alone, and what a user must name for it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class PlantProposal:
     """What of the logs a plant model would read and answer with.
 
     Attributes:
-        parts: channels that `edp twin` must be told, by part; a part that it finds by itself is not among them.
+        parts: channels that `edp twin` must be assignments, by part; a part that it finds by itself is not among them.
         why_not: a sentence: why the logs cannot train one, and what to record or to name; empty where they can.
     """
 
@@ -47,19 +47,19 @@ def propose_plant(proposal: MapProposal, targets: Sequence[str], inputs: Sequenc
         return PlantProposal(why_not="no column but the command moves: record what answers it, a position or a speed")
     # Of two experiments side by side the names of the columns are others, and their kinds unknown.
     answers = {kinds.get(name, Kind.GENERIC) for name in targets}
-    told = {"commands": tuple(inputs)}
+    assignments = {"commands": tuple(inputs)}
     if answers <= {*INTEGRAL, Kind.GENERIC}:
-        return PlantProposal(told | ({"velocities": tuple(targets)} if Kind.GENERIC in answers else {}))
+        return PlantProposal(assignments | ({"velocities": tuple(targets)} if Kind.GENERIC in answers else {}))
     if not answers <= {*RATE_OF}:
         return PlantProposal(
             why_not=f"it answers with positions or speeds, and {_shown(targets)} are none: record one, or give what "
             "shall answer the kind generic in the map and name it, edp twin --set 'channels.velocities=[...]'"
         )
-    return _of_positions(proposal, kinds, commands, told)
+    return _of_positions(proposal, kinds, commands, assignments)
 
 
 def _of_positions(
-    proposal: MapProposal, kinds: dict[str, Kind], commands: Sequence[str], told: dict[str, tuple[str, ...]]
+    proposal: MapProposal, kinds: dict[str, Kind], commands: Sequence[str], assignments: dict[str, tuple[str, ...]]
 ) -> PlantProposal:
     """Of logs without a measured velocity: `edp twin` takes the changes of the positions."""
     asked = [name for name, kind in kinds.items() if kind in INTEGRAL]
@@ -68,11 +68,13 @@ def _of_positions(
             why_not=f"it would take {_shown(asked)}, which no measurement follows, for an answer: record the speed "
             "itself, or give this column the kind generic in the map"
         )
-    if not told["commands"] and not any(kinds[name] in COMMANDS for name in commands):
-        told = {"commands": tuple(commands)}
+    if not assignments["commands"] and not any(kinds[name] in COMMANDS for name in commands):
+        assignments = {"commands": tuple(commands)}
     measured = tuple(guess.channel for guess in proposal.of_role("measured") if guess.kind.kind in RATE_OF)
-    others = [name for name, kind in kinds.items() if kind in RATE_OF and name not in (*measured, *told["commands"])]
-    return PlantProposal(told | ({"strokes": measured} if others else {}))
+    others = [
+        name for name, kind in kinds.items() if kind in RATE_OF and name not in (*measured, *assignments["commands"])
+    ]
+    return PlantProposal(assignments | ({"strokes": measured} if others else {}))
 
 
 def _shown(names: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ import pytest
 from edp.config.monitor import load_monitor_experiment
 from edp.logs import write_recording
 from edp.logs.source import DataSource
+from edp.monitor.monitor_file import load_monitor
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY
 from edp.testing.monitor import rig_sessions
@@ -60,6 +61,39 @@ def test_fit_says_what_is_watched_and_what_is_promised(edp, healthy, tmp_path):
     assert "virtual:CylVels_1" in facts["residuals"]
     assert "asked for one in 0.06 h" in facts["promise"]
     assert facts["doubtful"] == []
+
+
+def test_processes_side_by_side_give_the_same_monitor(edp, healthy, fitted, tmp_path):
+    folder = tmp_path / "monitor"
+    options = ("--hours-per-false-alarm", 0.06, "--minutes", 0.05, "--workers", 2, "--json")
+    ended = edp("monitor", "fit", healthy, "--out", folder, *options)
+    assert ended.code == 0, ended.err
+    assert ended.json["workers"] == 2
+    one, two = load_monitor(fitted), load_monitor(folder)
+    assert one.limit == two.limit
+    for before, after in zip(one.chain.watches, two.chain.watches, strict=True):
+        np.testing.assert_array_equal(before.matrix, after.matrix)
+    assert one.provenance["trained_on"] == two.provenance["trained_on"]
+    session = logs(1, first=30)[0]
+    residuals = [m.residuals(session.select(m.inputs), m.initial_state())[0] for m in (one, two)]
+    np.testing.assert_array_equal(*residuals)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--machine", "M99"), "unknown machine 'M99'; known: C14, M22"),
+        (("--set", 'dictionary.kinds=["leak"]'), "leak"),
+        (("--hours-per-false-alarm", -1), "hours_per_false_alarm = -1"),
+        (("--minutes", -1), "minutes = -1"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_trained(edp, healthy, tmp_path, options, told):
+    ended = edp("monitor", "fit", healthy, "--out", tmp_path / "monitor", "--hours-per-false-alarm", 0.06, *options)
+    assert ended.code == 1
+    assert told in ended.err
+    assert "virtual sensors" not in ended.err
+    assert not (tmp_path / "monitor" / "monitor.json").exists()
 
 
 def test_alarms_are_logged_and_end_with_exit_code_5(edp, fitted, tmp_path):

@@ -28,6 +28,8 @@ class NetworkPart:
         delays: ticks by which each prediction is older than what it is compared with; 0 for a virtual sensor.
         scaled: whether residuals are divided by half the width of the first interval.
         least_width: of that half.
+        every: ticks from one run of the network to the next, between which its residuals hold; 1 where it has delays.
+        first: tick of its first run, below `every`.
     """
 
     bundle: Bundle
@@ -38,6 +40,8 @@ class NetworkPart:
     delays: Places
     scaled: bool = False
     least_width: float = 0.0
+    every: int = 1
+    first: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +173,13 @@ class FlowPart:
 
 
 SourcePart = NetworkPart | BalancePart | TwinPart | FlowPart
+PIECE, ROW = 8, 32
+"""Directions of a detector, and summaries, that one part of the work on a block takes; in C `EDP_PIECE`, `EDP_ROW`."""
+
+
+def pieces(count: int, size: int) -> list[int]:
+    """Sizes of the pieces of so many things."""
+    return [min(size, count - first) for first in range(0, count, size)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +214,11 @@ class WatchPart:
     def rows(self) -> int:
         """Of the detector's memory, each as wide as its view."""
         return int(self.option) if self.detector == "glr" else 2 if self.detector == "separate_cusums" else 1
+
+    @property
+    def passes(self) -> int:
+        """Of the detector through its directions in a block."""
+        return self.rows if self.detector == "glr" else 2 if self.detector == "cusum" else 1
 
 
 @dataclass(frozen=True, eq=False)

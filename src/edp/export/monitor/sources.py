@@ -30,6 +30,23 @@ static void {own}_residuals({name}_state *s) {{
     }}
 }}
 """
+TURNS = """
+/* Runs every {every} ticks, by turns with others; residuals hold in between, but not what came of a missing value. */
+static void {own}_residuals({name}_state *s) {{
+{hold}    if (s->{own}_due == 0u) {{
+        const bool known = {model}_step(&s->{own}, s->{own}_in, &s->{own}_out) <= EDP_WARMING;
+        const bool fed = all_there(s, {own}_reads, {reads}u);
+        for (uint32_t i = 0; i < {residuals}u; i++) {{
+            const float expected = (&s->{own}_out.prediction[0][0])[{own}_results[i]];
+            const uint16_t judged = {own}_judged[i];
+            s->{own}_kept[i] = (known && fed && s->there[judged]) ? (s->row[judged] - expected) : (float)edp_unknown();
+        }}
+        s->{own}_due = {every}u;
+    }}
+    s->{own}_due--;
+    edp_copy(s->{own}_kept, {residuals}u, &s->residuals[{first}u]);
+}}
+"""
 AHEAD = """
 /* Predictions wait in a ring until what they are about is measured. */
 static void {own}_residuals({name}_state *s) {{
@@ -146,6 +163,7 @@ class NetworkCode:
         self.prefix = model
         self.residuals = len(part.judged)
         self.ahead = part.scaled or max(part.delays) > 0
+        self.turns = part.every > 1
 
     def fields(self) -> list[str]:
         """See `SourceCode`."""
@@ -155,6 +173,11 @@ class NetworkCode:
             lines += [f"uint32_t {self.own}_at;", f"uint32_t {self.own}_seen;"]
             rings = ("past", "width") if self.part.scaled else ("past",)
             lines += [f"float {self.own}_{ring}[{max(self.part.delays) + 1}][{self.residuals}];" for ring in rings]
+        if self.turns:
+            lines += [
+                f"uint32_t {self.own}_due; /* ticks until it runs */",
+                f"float {self.own}_kept[{self.residuals}];",
+            ]
         return lines
 
     def constants(self, tables: MonitorTables) -> None:
@@ -181,17 +204,25 @@ class NetworkCode:
             "width": WIDTH.format(own=own, least=number(part.least_width)) if part.scaled else "",
             "value": f"({value} / s->{own}_width[back][i])" if part.scaled else value,
             "length": max(part.delays) + 1,
+            "every": part.every,
+            "reads": len(part.reads),
         }
-        return (AHEAD if self.ahead else NETWORK).format(**blanks)
+        return (AHEAD if self.ahead else TURNS if self.turns else NETWORK).format(**blanks)
 
     def reset(self) -> list[str]:
         """See `SourceCode`."""
         filled_inputs = f"edp_copy({self.own}_middle, {len(self.part.reads)}u, s->{self.own}_in);"
-        return [f"{self.prefix}_reset(&s->{self.own});", filled_inputs]
+        due = [f"s->{self.own}_due = {self.part.first}u;"] if self.turns else []
+        return [f"{self.prefix}_reset(&s->{self.own});", filled_inputs, *due, *self._unknown()]
 
     def forget(self) -> list[str]:
         """See `SourceCode`."""
-        return [f"{self.prefix}_reset(&s->{self.own});", *([f"s->{self.own}_seen = 0u;"] if self.ahead else [])]
+        seen = [f"s->{self.own}_seen = 0u;"] if self.ahead else []
+        return [f"{self.prefix}_reset(&s->{self.own});", *seen, *self._unknown()]
+
+    def _unknown(self) -> list[str]:
+        """Statements after which its residuals are not known until it runs."""
+        return [f"edp_fill((float)edp_unknown(), {self.residuals}u, s->{self.own}_kept);"] if self.turns else []
 
 
 class BalanceCode:

@@ -20,7 +20,7 @@ from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.folder import write_export
 from edp.export.monitor.golden import JUDGED_BLOCKS, MISSING, SEED, SHIFT, golden_blocks
 from edp.export.monitor.numbers import MonitorTables, double_number, golden_header
-from edp.export.monitor.parts import MonitorParts, WatchPart
+from edp.export.monitor.parts import PIECE, ROW, MonitorParts, WatchPart, pieces
 from edp.export.monitor.sources import SourceCode, reads_tables, source_code
 from edp.export.sizes import check_sizes
 from edp.networks.input_range import HOLD_TICKS
@@ -85,8 +85,10 @@ class MonitorFiles:
 
     @property
     def slices(self) -> int:
-        """Parts of the work on a block: operating point, residuals and their summaries, watches, the verdict."""
-        return 2 + (self.parts.each + 1) * len(self.parts.residuals) + sum(map(_watch_slices, self.parts.chain.watches))
+        """Parts of the work on a block: operating point, residuals and their summaries, watches, verdict, evidence."""
+        residuals = (self.parts.each + 1) * len(self.parts.residuals)
+        evidence = len(pieces(self.parts.summaries, ROW))
+        return 2 + residuals + sum(map(_watch_slices, self.parts.chain.watches)) + evidence
 
     def _numbers(self) -> Code:
         head = f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */\n"
@@ -291,8 +293,10 @@ def _memory(watch: WatchPart) -> int:
 
 
 def _watch_slices(watch: WatchPart) -> int:
-    """Centring, each direction, and the steps of the detector."""
-    return 1 + watch.directions + (watch.rows if watch.detector == "glr" else 1)
+    """Centring, white numbers, and the steps of the detector; as `edp_watch_part` takes them."""
+    detector = len(pieces(watch.directions, PIECE)) * watch.passes
+    white = len(pieces(watch.directions, ROW)) if watch.own else watch.directions
+    return len(pieces(len(watch.mean), ROW)) + white + detector
 
 
 def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:

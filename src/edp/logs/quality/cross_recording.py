@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -114,12 +115,20 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
 
 def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
     """Which two units explain both ratios, empty where none do."""
-    unit_factors = [(name, unit.factor) for name, unit in UNITS.items() if kind in unit.kinds and not unit.offset]
-    for name, factor in unit_factors:
-        for other, base in unit_factors:
-            ratio = base / factor
-            if max(ratio, 1 / ratio) < _LEAST_RATIO:
-                continue
-            if all(abs(math.log10(observed_ratio / ratio)) < _NEAR_DECADES for observed_ratio in ratios):
-                return f"{name} read as {other}?"
+    decades = [math.log10(ratio) for ratio in ratios]
+    for text, between in _unit_pairs(kind):
+        if all(abs(one - between) < _NEAR_DECADES for one in decades):
+            return text
     return ""
+
+
+@cache
+def _unit_pairs(kind: Kind) -> tuple[tuple[str, float], ...]:
+    """Each two units of a kind that lie well apart: what it is called, and their ratio in decades."""
+    unit_factors = [(name, unit.factor) for name, unit in UNITS.items() if kind in unit.kinds and not unit.offset]
+    return tuple(
+        (f"{name} read as {other}?", math.log10(base / factor))
+        for name, factor in unit_factors
+        for other, base in unit_factors
+        if max(base / factor, factor / base) >= _LEAST_RATIO
+    )

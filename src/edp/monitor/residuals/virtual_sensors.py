@@ -2,6 +2,9 @@
 
 A network that is fed the past of a faulty channel follows the fault; one that never sees the channel cannot. Each group
 has a predictor of horizon 0: its residual is what was measured less what the others say.
+
+On a controller the networks may take turns, one of them at a tick: each is then a network of a slower rate, and its
+residuals keep their values in between.
 """
 
 from __future__ import annotations
@@ -32,11 +35,22 @@ from edp.monitor.residuals.committees import CommitteeOptions, constant_channels
 from edp.monitor.residuals.groups import Group, groups_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
-from edp.settings.bounds import above, check_bounds
+from edp.settings.bounds import above, check_bounds, integer, shown
 from edp.signals import Channel
 from edp.training.bundle import Bundle
 
 PREFIX = "virtual:"
+MOST_EVERY = 1000
+"""Ticks from one run of a network to the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """Of one network: ticks until it runs next, its last residuals (streams, judged), its memory."""
+
+    due: int
+    residuals: Rows
+    network: Any
 
 
 class VirtualSensors(ResidualSource):
@@ -46,10 +60,12 @@ class VirtualSensors(ResidualSource):
         bundles: by the name of the group.
         inputs: raw channels, SI units, in the order in which they are fed.
         middle: mean of each on healthy sessions.
+        every: ticks from one run of a network to the next; network n runs first at tick n modulo `every`.
     """
 
-    def __init__(self, bundles: dict[str, Bundle], inputs: Sequence[str], middle: Rows) -> None:
-        self.bundles, self.inputs = dict(bundles), tuple(inputs)
+    def __init__(self, bundles: dict[str, Bundle], inputs: Sequence[str], middle: Rows, every: int = 1) -> None:
+        self.bundles, self.inputs, self.every = dict(bundles), tuple(inputs), every
+        self.delay = every - 1
         self.middle = np.asarray(middle, np.float32)
         names, judged, reads, units = [], [], [], []
         for bundle in self.bundles.values():
@@ -67,28 +83,44 @@ class VirtualSensors(ResidualSource):
 
     def _start(self, streams: int) -> Any:
         return [
-            bundle.predictor.initial_state(streams, next(bundle.predictor.parameters()))
-            for bundle in self.bundles.values()
+            _Turn(
+                number % self.every,
+                np.full((streams, len(judged)), np.nan, np.float32),
+                bundle.predictor.initial_state(streams, next(bundle.predictor.parameters())),
+            )
+            for number, (bundle, (_, judged)) in enumerate(zip(self.bundles.values(), self._columns, strict=True))
         ]
 
     def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
-        parts, states = [], []
+        parts, turns = [], []
         with torch.inference_mode():
-            for bundle, (fed, judged), state in zip(self.bundles.values(), self._columns, own, strict=True):
-                expected, new = bundle.predictor.predict(torch.from_numpy(np.ascontiguousarray(rows[..., fed])), state)
-                parts.append(rows[..., judged] - expected[..., 0, :].numpy())
-                states.append(new)
-        return np.concatenate(parts, axis=-1), states
+            for bundle, (fed, judged), turn in zip(self.bundles.values(), self._columns, own, strict=True):
+                at = slice(turn.due, None, self.every)
+                residuals, network = turn.residuals[:, None], turn.network
+                if turn.due < rows.shape[1]:
+                    fed_rows = torch.from_numpy(np.ascontiguousarray(rows[:, at, fed]))
+                    expected, network = bundle.predictor.predict(fed_rows, turn.network)
+                    differences = rows[:, at, judged] - expected[..., 0, :].numpy()
+                    # What stood in for a missing value must not outlast the tick.
+                    differences[~(there[:, at, fed].all(axis=-1, keepdims=True) & there[:, at, judged])] = np.nan
+                    residuals = np.concatenate([residuals, differences], axis=1)
+                newest = (np.arange(rows.shape[1]) - turn.due) // self.every + 1
+                parts.append(residuals[:, newest])
+                turns.append(_Turn((turn.due - rows.shape[1]) % self.every, residuals[:, -1], network))
+        return np.concatenate(parts, axis=-1), turns
 
     def parts(self) -> SourceParts:
         """See `ResidualSource.parts`."""
-        plain = {"inputs": list(self.inputs), "groups": list(self.bundles)}
+        plain = {"inputs": list(self.inputs), "groups": list(self.bundles), "every": self.every}
         return SourceParts(plain, {"middle": self.middle}, dict(self.bundles))
 
     @classmethod
     def of_parts(cls, parts: SourceParts) -> VirtualSensors:
         """See `ResidualSource.of_parts`."""
         (inputs, middle), groups = middle_of(parts), texts_of(parts.plain["groups"], "its groups")
+        every = parts.plain.get("every", 1)  # monitors of earlier versions have none
+        if type(every) is not int or not 1 <= every <= MOST_EVERY:
+            raise ValueError(f"its networks run every {shown(every)} ticks; an integer of 1 to {MOST_EVERY} must hold")
         bundles = {}
         for group in groups:
             bundle = parts.bundles[group]
@@ -97,7 +129,7 @@ class VirtualSensors(ResidualSource):
             if not {*bundle.task.inputs, *bundle.task.targets} <= {*inputs}:
                 raise ValueError(f"the network of '{group[:80]}' reads what is no input of the monitor")
             bundles[group] = bundle
-        return cls(bundles, inputs, middle)
+        return cls(bundles, inputs, middle, every)
 
 
 @RESIDUALS.register("virtual_sensors")
@@ -108,6 +140,9 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
     Attributes:
         least: share of a channel's mean deviation that a virtual sensor must explain on the sessions that choose; a
             channel that the others say less about is not judged.
+        every: ticks from one run of a network to the next, 1 by default. Networks take turns, are trained at that
+            slower rate (spans in `lags_s` shorter than it are one run), and residuals hold in between: a controller
+            has one of n networks to run at a tick where it is n or more.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -115,10 +150,11 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
 
     source: ClassVar[type[ResidualSource]] = VirtualSensors
     least: float = 0.1
+    every: int = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_bounds("virtual_sensors", self, least=above(-1.0, 1.0))
+        check_bounds("virtual_sensors", self, least=above(-1.0, 1.0), every=integer(1, MOST_EVERY))
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
@@ -146,16 +182,17 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         """The network of a group, in its part of the time of so many; None where it explains none of its channels."""
         constant = constant_channels(material)
         changing = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
+        if self.every > 1:
+            changing = slower(changing, self.every)
         return self._fitted(group, changing, 0.8 * material.minutes / networks)
 
-    @staticmethod
-    def together(bundles: dict[str, Bundle], material: FitMaterial) -> VirtualSensors | None:
+    def together(self, bundles: dict[str, Bundle], material: FitMaterial) -> VirtualSensors | None:
         """The source of these networks; None without any."""
         if not bundles:
             return None
         used = {name for b in bundles.values() for name in (*b.task.inputs, *b.task.targets)}
         inputs = tuple(name for name in material.names if name in used)
-        return VirtualSensors(bundles, inputs, mean_inputs(material, inputs))
+        return VirtualSensors(bundles, inputs, mean_inputs(material, inputs), self.every)
 
     def _fed(self, group: Group, material: FitMaterial) -> tuple[Channel, ...]:
         """Channels that the network of a group reads."""
@@ -177,6 +214,16 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
     def _task(self, group: Group, judged: tuple[str, ...], material: FitMaterial) -> Task:
         features = FeatureSet("others", tuple(channel.name for channel in self._fed(group, material)))
         return Task(features, judged, (0,), TargetMode.ABSOLUTE, material.rate_hz)
+
+
+def slower(material: FitMaterial, every: int) -> FitMaterial:
+    """Material in which only every n-th tick was recorded."""
+    rate = material.rate_hz / every
+    train, validation = (
+        tuple(replace(part, values=part.values[::every], rate_hz=rate) for part in parts)
+        for parts in (material.train, material.validation)
+    )
+    return replace(material, train=train, validation=validation, rate_hz=rate)
 
 
 def _explained(predictor: Predictor, series: Sequence[Series]) -> list[float]:

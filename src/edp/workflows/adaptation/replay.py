@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 from edp.training import load_bundle
+from edp.training.twin_bundle import load_twin
+from edp.workflows.adaptation.with_twin import TwinMoves
 
 # 60 s are the usual forgetting time: beyond it the adaptation is settled.
 BINS = (0.0, 10.0, 30.0, 60.0)
@@ -114,6 +117,7 @@ def replay(
     carry: bool = False,
     learn: bool = True,
     on_recording: Callable[[str, int, int], None] | None = None,
+    moves: Callable[[Sequence[Rows]], Sequence[Rows]] | None = None,
 ) -> Replay:
     """Run recordings one after the other through a network and its adaptation.
 
@@ -124,6 +128,8 @@ def replay(
         carry: keep what was learned from one recording to the next, as on one machine; else each starts from nothing.
         learn: False freezes the adaptation.
         on_recording: called with name, how many are done and of how many.
+        moves: what becomes of the network's predictions ``(time, horizon, target)`` of the recordings before the
+            adaptation corrects them; None: nothing.
 
     Raises:
         DataError: no recording is longer than start-up and horizon.
@@ -135,7 +141,9 @@ def replay(
             "take; give longer"
         )
     adapter, replayed = RlsCorrector(adaptation), []
-    for done, (part, base) in enumerate(zip(series, stream_predictions(predictor, series), strict=True)):
+    plain = stream_predictions(predictor, series)
+    moved = plain if moves is None else moves(plain)
+    for done, (part, base, start) in enumerate(zip(series, plain, moved, strict=True)):
         if on_recording is not None:
             on_recording(part.name, done, len(series))
         # The gap between recordings is no motion: predictions from before it must not be judged after it.
@@ -143,7 +151,7 @@ def replay(
         if not carry:
             adapter.reset()
         adapted, status = np.empty_like(base), np.zeros(len(base), dtype=np.int64)
-        for tick, (x, y) in enumerate(zip(part.inputs, base, strict=True)):
+        for tick, (x, y) in enumerate(zip(part.inputs, start, strict=True)):
             # Before a whole window the network itself is not warm; its errors would teach the wrong thing.
             adapted[tick], status[tick] = adapter.step(x, y, fresh=tick + 1 >= skip, learn=learn)
         replayed.append(Replayed(part.name, base, adapted, motion_s(adaptation, part.targets), status, part.targets))
@@ -156,15 +164,30 @@ def replay_run(
     carry: bool = False,
     learn: bool = True,
     on_recording: Callable[[str, int, int], None] | None = None,
+    twin: str | Path | None = None,
 ) -> dict[str, Any]:
     """Replay logs through a run that `edp adapt` wrote; see `replay`.
 
+    Args:
+        run: with an adaptation.
+        source: the logs.
+        carry: keep what was learned from one recording to the next.
+        learn: False freezes what was learned.
+        on_recording: called with name, how many are done and of how many.
+        twin: run folder of a grey box of the machine as it was, whose numbers follow the machine and move the
+            network's predictions before they are corrected (`edp.networks.twin.tuned_correction`); None: none does.
+
     Raises:
-        EdpError: a run without adaptation, or logs that do not go with its network.
+        EdpError: a run without adaptation, logs that do not go with its network, or a twin that does not.
     """
     bundle = load_bundle(run)
     if bundle.adaptation is None:
         raise BundleError(f"'{run}' has no adaptation; edp adapt {run} --out FOLDER makes a run that has one")
-    series = [bundle.task.series(recording) for recording in source.read()]
-    result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording)
+    recordings = source.read()
+    series = [bundle.task.series(recording) for recording in recordings]
+    moves = None
+    if twin is not None:
+        by_twin = TwinMoves(load_twin(twin).twin, bundle.adaptation, bundle.task)
+        moves = partial(by_twin, recordings, carry=carry, learn=learn)
+    result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording, moves)
     return result.to_json(bundle.task, bundle.target_kinds)

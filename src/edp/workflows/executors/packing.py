@@ -24,6 +24,8 @@ from edp.errors import DataError
 T = TypeVar("T")
 TREE, KIND, VALUE = "tree", "of", "is"
 MOST_DEPTH = 40
+_classes: dict[type, Mapping[str, type]] = {}
+"""What `classes_in` found."""
 
 
 def packed(value: Any) -> bytes:
@@ -82,7 +84,7 @@ def unpacked(data: bytes, kind: type[T]) -> T:
     return value
 
 
-def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: dict[str, type], depth: int) -> Any:
+def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str, type], depth: int) -> Any:
     if depth > MOST_DEPTH:
         raise ValueError(f"nested deeper than {MOST_DEPTH} levels")
     if isinstance(tree, list):
@@ -105,8 +107,10 @@ def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: dict[str, ty
     return classes[kind](**{name: _together(part, tensors, classes, depth + 1) for name, part in value.items()})
 
 
-def classes_in(kind: type) -> dict[str, type]:
-    """A dataclass and all that the types of its fields name, by name."""
+def classes_in(kind: type) -> Mapping[str, type]:
+    """A dataclass and all that the types of its fields name, by name; asked for once a unit, found once a process."""
+    if kind in _classes:
+        return _classes[kind]
     classes: dict[str, type] = {}
     waiting: list[Any] = [kind]
     while waiting:
@@ -116,4 +120,4 @@ def classes_in(kind: type) -> dict[str, type]:
             waiting += list(typing.get_type_hints(one).values())
         elif isinstance(one, types.UnionType) or typing.get_origin(one) is not None:
             waiting += list(typing.get_args(one))
-    return classes
+    return _classes.setdefault(kind, types.MappingProxyType(classes))

@@ -19,7 +19,7 @@ from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import SideBySide
 from edp.recording import MACHINE, Recording
-from edp.sim.machine.machine_files import machine_names
+from edp.sim.machine.machine_files import load_machine, machine_names
 from edp.workflows.monitor.fault_sessions import (
     FaultSession,
     cases_of,
@@ -55,6 +55,17 @@ def machine_of(spec: DictionarySpec, recordings: Sequence[Recording]) -> str:
     only = next(iter(named)) if len(named) == 1 else ""
     # A name of a file that came with a log is not followed to wherever it leads.
     return only if only in machine_names() else ""
+
+
+def check_dictionary(spec: DictionarySpec) -> None:
+    """Refuse a machine or a kind of fault that cannot be before networks are trained.
+
+    Raises:
+        EdpError: an unknown machine, a file that holds none, or an unknown kind.
+    """
+    if spec.machine not in (AUTOMATIC, NO_MACHINE):
+        load_machine(spec.machine)
+    fault_classes(spec.kinds or None)
 
 
 def build_dictionary(

@@ -153,7 +153,7 @@ def source_parts(source: ResidualSource, columns: Mapping[str, int]) -> list[Sou
         ExportError: it has no form in C.
     """
     if isinstance(source, VirtualSensors):
-        return [_virtual(source, bundle, columns) for bundle in source.bundles.values()]
+        return [_virtual(source, number, columns) for number in range(len(source.bundles))]
     if isinstance(source, LookAhead):
         return [_look_ahead(source, bundle, columns) for bundle in source.bundles.values()]
     if isinstance(source, TwinPorts):
@@ -168,8 +168,8 @@ def source_parts(source: ResidualSource, columns: Mapping[str, int]) -> list[Sou
     )
 
 
-def _virtual(source: VirtualSensors, bundle: Bundle, columns: Mapping[str, int]) -> NetworkPart:
-    own = {name: i for i, name in enumerate(source.inputs)}
+def _virtual(source: VirtualSensors, number: int, columns: Mapping[str, int]) -> NetworkPart:
+    own, bundle = {name: i for i, name in enumerate(source.inputs)}, list(source.bundles.values())[number]
     reads, targets = bundle.task.inputs, bundle.task.targets
     return NetworkPart(
         bundle=bundle,
@@ -178,6 +178,8 @@ def _virtual(source: VirtualSensors, bundle: Bundle, columns: Mapping[str, int])
         judged=tuple(columns[name] for name in targets),
         results=tuple(range(len(targets))),
         delays=(0,) * len(targets),
+        every=source.every,
+        first=number % source.every,
     )
 
 
@@ -329,7 +331,8 @@ def _allowed(part: SourcePart, rows: Rows) -> NDArray[np.float64]:
         return np.zeros(len(part.chambers))
     if isinstance(part, TwinPart):
         return _allowed_of_twin(part, rows)
-    network, fed, judged = part.bundle.predictor, rows[:, part.reads], rows[:, part.judged]
+    network, ran = part.bundle.predictor, rows[part.first :: part.every]
+    fed, judged = ran[:, part.reads], ran[:, part.judged]
     outputs = stream(network, fed)
     # A predictor whose trees may take another leaf there is off by a step.
     off = (tolerance(network, fed, outputs) + at_thresholds(network, fed).max(axis=0)).astype(np.float64)

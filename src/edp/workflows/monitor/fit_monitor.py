@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import itertools
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import BundleError, ConfigError, DataError, closest
+from edp.errors import BundleError, ConfigError, DataError, LostError, closest
 from edp.logs.source import DataSource
 from edp.monitor.fitting import FittedChain, doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
@@ -24,12 +26,13 @@ from edp.monitor.residuals.groups import Group, sensed_channels
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.recording import Recording
+from edp.sandbox.helpers import Helpers
 from edp.signals import Channel
 from edp.storage import check_writable, write_bytes
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
-from edp.workflows.monitor.dictionary import build_dictionary, machine_of
+from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, machine_of
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
@@ -48,7 +51,7 @@ class FittedMonitor:
     Attributes:
         monitor: ready to run.
         doubtful: names of healthy sessions that were left out.
-        seconds: processor time.
+        seconds: processor time of this process.
         folder: where it lies; None where it was not saved.
         sessions: blocks of those that set the limit.
         one_machine: it knows the machine of the logs so well that others of its series raise alarms.
@@ -68,6 +71,7 @@ def fit_monitor(
     experiment: MonitorExperiment,
     out: str | Path,
     note: Callable[[str], None] = note_nothing,
+    workers: int = 1,
 ) -> FittedMonitor:
     """Fit a monitor to healthy logs and write its folder.
 
@@ -77,17 +81,39 @@ def fit_monitor(
         experiment: settings.
         out: folder of the monitor.
         note: called with what begins.
+        workers: processes side by side, 0 for one a core; the monitor does not depend on it, unless the dictionary has
+            not the time for all of its draws: several processes make them all.
 
     Raises:
-        EdpError: runs or logs that cannot be used, or too few hours for the promise.
+        EdpError: runs or logs that cannot be used, or too few hours for the promise, or a process died.
     """
     check_writable(out)
     bundles = [_network_of(run) for run in runs]
     recordings = source.read()
-    fitted = fit_to_recordings(recordings, experiment, bundles, note)
+    with Helpers(workers or os.cpu_count() or 1, _died) as helpers:
+
+        def side_by_side(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
+            return helpers.ordered(partial(_in_one_thread, function), jobs)
+
+        fitted = fit_to_recordings(
+            recordings, experiment, bundles, note, side_by_side=map if helpers.workers == 1 else side_by_side
+        )
     folder = save_monitor(fitted.monitor, out)
     write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
     return replace(fitted, folder=folder)
+
+
+def _in_one_thread(function: Callable[[Any], Any], job: Any) -> Any:
+    """A job with the sums of a fit in one process."""
+    with one_blas_thread():
+        return function(job)
+
+
+def _died(label: str) -> LostError:
+    return LostError(
+        f"a worker process died at '{label}' (out of memory, or stopped from outside; a calling script needs "
+        "`if __name__ == '__main__':`); run the same command again with --workers 1"
+    )
 
 
 def _network_of(run: str | Path) -> Bundle | TwinBundle:
@@ -127,6 +153,7 @@ def fit_to_recordings(
         EdpError: recordings that cannot be used, or too few hours for the promise.
     """
     began = time.process_time()
+    check_dictionary(experiment.dictionary)
     channels = watched_channels(recordings, experiment)
     _check_values(recordings, channels)
     sessions = _enough_sessions(recordings)
@@ -158,7 +185,7 @@ def fit_to_recordings(
     monitor = _assembled(material, sources, fitted, sessions, rest)
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     provenance = dict(monitor.provenance) | {"seconds": time.process_time() - began}
-    monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, note)
+    monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, note, side_by_side)
     one_machine = not experiment.chain.tolerance and any(isinstance(source, FlowBalances) for source in sources)
     seconds = time.process_time() - began
     return FittedMonitor(monitor, fitted.doubtful, seconds, None, fitted.sessions, one_machine)
@@ -194,7 +221,11 @@ def _assembled(
 
 
 def _with_dictionary(
-    monitor: Monitor, healthy: Sequence[Recording], experiment: MonitorExperiment, note: Callable[[str], None]
+    monitor: Monitor,
+    healthy: Sequence[Recording],
+    experiment: MonitorExperiment,
+    note: Callable[[str], None],
+    side_by_side: SideBySide,
 ) -> Monitor:
     """The monitor with a dictionary of faults, where there is a machine to simulate them on."""
     machine = machine_of(experiment.dictionary, healthy)
@@ -205,7 +236,12 @@ def _with_dictionary(
         if done % NOTED_SESSIONS == 0 or done == total:
             note(f"{what}: {done} of {total} sessions")
 
-    dictionary = build_dictionary(monitor, healthy, machine, experiment.dictionary, experiment.seed, noted)
+    if side_by_side is not map:
+        note(f"faults on {machine}")
+    dictionary = build_dictionary(
+        monitor, healthy, machine, experiment.dictionary, experiment.seed, noted,
+        None if side_by_side is map else side_by_side,
+    )  # fmt: skip
     return replace(monitor, diagnosis=dictionary)
 
 
@@ -293,17 +329,23 @@ def _sources(
         DataError: none does.
     """
     jobs = []
+    # Other processes cannot call what shows progress here.
+    elsewhere = side_by_side is not map
+    if elsewhere:
+        note, material = material.note, replace(material, note=note_nothing)
     for spec in experiment.residuals:
         groups = spec.groups(material) if isinstance(spec, VirtualSensorsSpec) else (None,)
         jobs += [_Fit(spec, material, group, len(groups)) for group in groups]
     fits: dict[ResidualSpec, ResidualSource | None] = {}
     networks: dict[ResidualSpec, dict[str, Bundle]] = {}
     for job, result in zip(jobs, side_by_side(_fit_source, jobs), strict=True):
+        if elsewhere:
+            note(f"{job.label}, done")
         if job.group is None:
             fits[job.spec] = result
-        elif result is not None:
+        elif result is not None and isinstance(job.spec, VirtualSensorsSpec):
             networks.setdefault(job.spec, {})[job.group.name] = result
-            fits[job.spec] = VirtualSensorsSpec.together(networks[job.spec], material)
+            fits[job.spec] = job.spec.together(networks[job.spec], material)
     sources = tuple(source for spec in experiment.residuals if (source := fits.get(spec)) is not None)
     if not sources:
         raise DataError(

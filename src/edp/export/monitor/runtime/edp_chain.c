@@ -69,14 +69,6 @@ float edp_dot(const float *x, const float *y, uint32_t n) {
     return sum;
 }
 
-double edp_squares(const double *x, uint32_t n) {
-    double sum = 0.0;
-    for (uint32_t i = 0; i < n; i++) {
-        sum += x[i] * x[i];
-    }
-    return sum;
-}
-
 uint32_t edp_crc_doubles(uint32_t crc, const double *values, uint32_t n) {
     uint32_t left = crc ^ 0xFFFFFFFFu;
     for (uint32_t i = 0; i < n; i++) {
@@ -221,95 +213,156 @@ void edp_clear(uint32_t n, double *values) {
     }
 }
 
-double edp_cusum(double slack, const double *row, uint32_t n, double *sums) {
-    double length;
-    double left;
-    double share;
-    for (uint32_t i = 0; i < n; i++) {
-        sums[i] += row[i];
+uint32_t edp_pieces(uint32_t n, uint32_t piece) { return (n + (piece - 1u)) / piece; }
+
+/* The place behind the last of a piece. */
+static uint32_t end_of(uint32_t first, uint32_t piece, uint32_t n) { return ((n - first) > piece) ? (first + piece) : n; }
+
+/* First the sums and their squares, piece by piece; behind the last of them the statistic; then what is left of the sums. */
+static void step_cusum(const edp_watch *w, uint32_t step, const double *row, double *sums, double *kept,
+                       double *statistic) {
+    const uint32_t pieces = edp_pieces(w->directions, EDP_PIECE);
+    const uint32_t first = (step % pieces) * EDP_PIECE;
+    const uint32_t end = end_of(first, EDP_PIECE, w->directions);
+    if (step < pieces) {
+        double squares = (step == 0u) ? 0.0 : *kept;
+        for (uint32_t i = first; i < end; i++) {
+            sums[i] += row[i];
+            squares += sums[i] * sums[i];
+        }
+        *kept = squares;
+        if (end == w->directions) {
+            const double length = edp_root(squares);
+            const double left = ((length - w->option) > 0.0) ? (length - w->option) : 0.0;
+            *statistic = left / w->scale;
+            *kept = left / ((length > 1e-300) ? length : 1e-300);
+        }
+    } else {
+        for (uint32_t i = first; i < end; i++) {
+            sums[i] *= *kept;
+        }
     }
-    length = edp_root(edp_squares(sums, n));
-    left = ((length - slack) > 0.0) ? (length - slack) : 0.0;
-    share = left / ((length > 1e-300) ? length : 1e-300);
-    for (uint32_t i = 0; i < n; i++) {
-        sums[i] *= share;
-    }
-    return left;
 }
 
-double edp_ewma(double weight, double factor, const double *row, uint32_t n, double *means) {
-    for (uint32_t i = 0; i < n; i++) {
-        means[i] += weight * (row[i] - means[i]);
+static void step_ewma(const edp_watch *w, uint32_t step, const double *row, double *means, double *kept,
+                      double *statistic) {
+    const uint32_t first = step * EDP_PIECE;
+    const uint32_t end = end_of(first, EDP_PIECE, w->directions);
+    double squares = (step == 0u) ? 0.0 : *kept;
+    for (uint32_t i = first; i < end; i++) {
+        means[i] += w->option * (row[i] - means[i]);
+        squares += means[i] * means[i];
     }
-    return edp_squares(means, n) * factor;
+    *kept = squares;
+    if (end == w->directions) {
+        *statistic = (squares * w->factor) / w->scale;
+    }
 }
 
-double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32_t length, double *sums) {
-    for (uint32_t i = 0; i < n; i++) {
-        sums[i] = ((before == NULL) ? 0.0 : before[i]) + row[i];
-    }
-    return edp_squares(sums, n) / (2.0 * (double)length);
-}
-
-double edp_separate_cusums(double slack, const double *row, uint32_t n, double *sums) {
-    double largest = 0.0;
-    for (uint32_t i = 0; i < n; i++) {
-        const double up = (sums[i] + row[i]) - slack;
-        const double down = (sums[n + i] - row[i]) - slack;
+static void step_separate_cusums(const edp_watch *w, uint32_t step, const double *row, double *sums, double *kept,
+                                 double *statistic) {
+    const uint32_t n = w->directions;
+    const uint32_t first = step * EDP_PIECE;
+    const uint32_t end = end_of(first, EDP_PIECE, n);
+    double largest = (step == 0u) ? 0.0 : *kept;
+    for (uint32_t i = first; i < end; i++) {
+        const double up = (sums[i] + row[i]) - w->option;
+        const double down = (sums[n + i] - row[i]) - w->option;
         sums[i] = (up > 0.0) ? up : 0.0;
         sums[n + i] = (down > 0.0) ? down : 0.0;
         largest = (sums[i] > largest) ? sums[i] : largest;
         largest = (sums[n + i] > largest) ? sums[n + i] : largest;
     }
-    return largest;
-}
-
-/* ---- watches ------------------------------------------------------------------------------------------------------- */
-
-void edp_watch_centre(const edp_watch *w, const double *z, float *centred) {
-    for (uint32_t i = 0; i < w->summaries; i++) {
-        centred[i] = edp_known(z[i]) ? (float)(z[i] - (double)w->mean[i]) : 0.0f;
+    *kept = largest;
+    if (end == n) {
+        *statistic = largest / w->scale;
     }
 }
 
-double edp_watch_white(const edp_watch *w, const float *centred, uint32_t direction) {
-    double white;
-    if (w->own) {
-        const float product = centred[direction] * w->matrix[direction];
-        white = (double)product;
-    } else {
-        white = (double)edp_dot(centred, &w->matrix[(size_t)direction * w->summaries], w->summaries);
-    }
-    return white;
-}
-
-uint32_t edp_watch_steps(const edp_watch *w) { return (w->detector == EDP_GLR) ? w->rows : 1u; }
-
-void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *seen,
-                    double *statistic) {
+/* Longest first: the sum of a length is that of the next shorter one before this row, and the row. */
+static void step_glr(const edp_watch *w, uint32_t step, const double *row, double *memory, uint32_t *seen, double *kept,
+                     double *statistic) {
     const uint32_t n = w->directions;
-    if (w->detector == EDP_CUSUM) {
-        *statistic = edp_cusum(w->option, white, n, memory) / w->scale;
-    } else if (w->detector == EDP_EWMA) {
-        *statistic = edp_ewma(w->option, w->factor, white, n, memory) / w->scale;
-    } else if (w->detector == EDP_SEPARATE_CUSUMS) {
-        *statistic = edp_separate_cusums(w->option, white, n, memory) / w->scale;
-    } else {
-        /* Longest first: each sum rests on the next shorter one of the row before. */
-        const uint32_t length = w->rows - step;
-        double *const sums = &memory[(size_t)(length - 1u) * n];
-        const double *const before = (length > 1u) ? &memory[(size_t)(length - 2u) * n] : NULL;
-        const double ratio = edp_glr_ratio(white, n, before, length, sums);
-        if (step == 0u) {
-            *seen += (*seen < w->rows) ? 1u : 0u;
-            *statistic = 0.0;
-        }
+    const uint32_t pieces = edp_pieces(n, EDP_PIECE);
+    const uint32_t length = w->rows - (step / pieces);
+    const uint32_t first = (step % pieces) * EDP_PIECE;
+    const uint32_t end = end_of(first, EDP_PIECE, n);
+    double *const sums = &memory[(size_t)(length - 1u) * n];
+    const double *const before = (length > 1u) ? &memory[(size_t)(length - 2u) * n] : NULL;
+    double squares = (first == 0u) ? 0.0 : *kept;
+    for (uint32_t i = first; i < end; i++) {
+        sums[i] = ((before == NULL) ? 0.0 : before[i]) + row[i];
+        squares += sums[i] * sums[i];
+    }
+    *kept = squares;
+    if (step == 0u) {
+        *seen += (*seen < w->rows) ? 1u : 0u;
+        *statistic = 0.0;
+    }
+    if (end == n) {
+        const double ratio = squares / (2.0 * (double)length);
         if ((length <= *seen) && (ratio > *statistic)) {
             *statistic = ratio;
         }
         if (length == 1u) {
             *statistic /= w->scale;
         }
+    }
+}
+
+/* ---- watches ------------------------------------------------------------------------------------------------------- */
+
+static uint32_t centre_parts(const edp_watch *w) { return edp_pieces(w->summaries, EDP_ROW); }
+
+static uint32_t white_parts(const edp_watch *w) {
+    return w->own ? edp_pieces(w->directions, EDP_ROW) : w->directions;
+}
+
+static void centre_part(const edp_watch *w, uint32_t part, const double *z, float *centred) {
+    const uint32_t first = part * EDP_ROW;
+    const uint32_t end = end_of(first, EDP_ROW, w->summaries);
+    for (uint32_t i = first; i < end; i++) {
+        centred[i] = edp_known(z[i]) ? (float)(z[i] - (double)w->mean[i]) : 0.0f;
+    }
+}
+
+static void white_part(const edp_watch *w, uint32_t part, const float *centred, double *white) {
+    if (w->own) {
+        const uint32_t first = part * EDP_ROW;
+        const uint32_t end = end_of(first, EDP_ROW, w->directions);
+        for (uint32_t i = first; i < end; i++) {
+            const float product = centred[i] * w->matrix[i];
+            white[i] = (double)product;
+        }
+    } else {
+        white[part] = (double)edp_dot(centred, &w->matrix[(size_t)part * w->summaries], w->summaries);
+    }
+}
+
+static void detector_part(const edp_watch *w, uint32_t part, const double *white, const edp_watch_memory *m) {
+    if (w->detector == EDP_CUSUM) {
+        step_cusum(w, part, white, m->sums, m->kept, m->statistic);
+    } else if (w->detector == EDP_EWMA) {
+        step_ewma(w, part, white, m->sums, m->kept, m->statistic);
+    } else if (w->detector == EDP_SEPARATE_CUSUMS) {
+        step_separate_cusums(w, part, white, m->sums, m->kept, m->statistic);
+    } else {
+        step_glr(w, part, white, m->sums, m->seen, m->kept, m->statistic);
+    }
+}
+
+void edp_watch_part(const edp_watch *w, uint32_t part, bool judged, const double *z, float *centred, double *white,
+                    const edp_watch_memory *m) {
+    const uint32_t whitens = centre_parts(w);
+    const uint32_t detects = whitens + white_parts(w);
+    if (part < whitens) {
+        centre_part(w, part, z, centred);
+    } else if (part < detects) {
+        white_part(w, part - whitens, centred, white);
+    } else if (judged) {
+        detector_part(w, part - detects, white, m);
+    } else {
+        /* Not judged yet. */
     }
 }
 

@@ -19,8 +19,6 @@ bool edp_known(double x);
 double edp_unknown(void);
 /* The sum of products x[i] y[i] over i < n, in single precision. */
 float edp_dot(const float *x, const float *y, uint32_t n);
-/* The sum of squares over i < n. */
-double edp_squares(const double *x, uint32_t n);
 /* Whether a measurement is one: finite, and at most `limit` usual widths from its usual value. */
 bool edp_plausible(float x, double centre, double spread, double limit);
 
@@ -73,20 +71,6 @@ double edp_conditioned(double summary, const float *point, uint32_t n, const flo
 /* A number within limits; NaN stays. */
 double edp_within(double x, double low, double high);
 
-/* ---- detectors: one row of white residuals in, a statistic out ---------------------------------------------------- */
-
-/* Multivariate CUSUM; `sums` (n) is its memory. */
-double edp_cusum(double slack, const double *row, uint32_t n, double *sums);
-/* T2 of exponentially weighted means; `means` (n) is its memory, `factor` is (2 - weight) / weight. */
-double edp_ewma(double weight, double factor, const double *row, uint32_t n, double *means);
-/* Likelihood ratio of a shift that began `length` rows ago; `sums` (n) of that length. The sum of a length is that of the
-   next shorter one before this row, and the row: lengths are taken from the longest down, `before` is that of length - 1,
-   NULL for length 1. */
-double edp_glr_ratio(const double *row, uint32_t n, const double *before, uint32_t length, double *sums);
-/* A CUSUM up and one down for each residual, the largest counts; `sums` (2 n) is its memory, those up first. */
-double edp_separate_cusums(double slack, const double *row, uint32_t n, double *sums);
-void edp_clear(uint32_t n, double *values);
-
 /* ---- watches: a view of the conditioned summaries, and a detector on it --------------------------------------------- */
 
 typedef enum { EDP_CUSUM = 0, EDP_EWMA = 1, EDP_GLR = 2, EDP_SEPARATE_CUSUMS = 3 } edp_detector;
@@ -104,15 +88,27 @@ typedef struct {
     const float *matrix; /* (directions, summaries); its own: (summaries) */
 } edp_watch;
 
-/* Summaries less their mean; a missing one counts as healthy. */
-void edp_watch_centre(const edp_watch *w, const double *z, float *centred);
-/* One number of the white row. */
-double edp_watch_white(const edp_watch *w, const float *centred, uint32_t direction);
-/* Steps that a detector takes for one row. */
-uint32_t edp_watch_steps(const edp_watch *w);
-/* One of them; `seen` counts rows since a reset up to `rows`. The statistic stands in `statistic` behind the last. */
-void edp_watch_step(const edp_watch *w, uint32_t step, const double *white, double *memory, uint32_t *seen,
-                    double *statistic);
+#define EDP_PIECE 8u /* directions of a detector that one part of the work takes */
+#define EDP_ROW 32u  /* summaries that one part of the work takes, where that is little work for each */
+
+/* How many pieces n things are. */
+uint32_t edp_pieces(uint32_t n, uint32_t piece);
+void edp_clear(uint32_t n, double *values);
+
+/* What a watch remembers. */
+typedef struct {
+    double *sums;      /* (directions, rows): multivariate CUSUM and weighted means one row; separate CUSUMs two, those up
+                          first; likelihood ratio a row for each length */
+    uint32_t *seen;    /* rows since a reset, up to `rows` */
+    double *kept;      /* from one part of the work to the next */
+    double *statistic; /* over its scale; whole behind the last part */
+} edp_watch_memory;
+
+/* One part of the work on a block, all about as long: summaries `z` less their mean, EDP_ROW at a time, where a missing one
+   counts as healthy; white numbers; steps of the detector, unless the block is not `judged`, EDP_PIECE directions at a
+   time. The multivariate CUSUM goes through them twice, the likelihood ratio once for each length. */
+void edp_watch_part(const edp_watch *w, uint32_t part, bool judged, const double *z, float *centred, double *white,
+                    const edp_watch_memory *m);
 void edp_watch_reset(const edp_watch *w, double *memory, uint32_t *seen);
 
 #endif

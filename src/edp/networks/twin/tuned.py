@@ -1,0 +1,310 @@
+"""A grey box whose numbers follow the machine: what wears and warms is learned from its own free runs, within bounds.
+
+An observer follows the machine as in `edp.networks.twin.forecast`. Every `learn_ticks` ticks the stretch that has just
+been measured is run again, freely, from the observer's state at its beginning with the commands that came: once with
+the present numbers, and once for each *group* of numbers a little grown. With e the errors of the velocities in units
+of what they lately were (root mean square), S the slopes of the runs by the logarithms x of the groups, and P their
+covariance::
+
+    P = (P^-1 + S' S / n)^-1,  x = x + P S' clip(e) / n,   n ticks of the stretch, whose errors count as one tick's
+    x = a x,  P = a^2 P + (1 - a^2) prior,                 a = exp(-learn_ticks / forgetting)
+
+which is a Kalman filter on numbers that fade to what they were. Forces that no number stands for, as those of soil, are
+estimated tick by tick (`LoadEstimate`). What the machine's change is worth to any predictor is the difference of two
+forecasts: of the tuned numbers with these forces, and of the numbers as they were without.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError
+from edp.networks.twin.base import Twin, TwinState
+from edp.networks.twin.greybox import GreyTwin
+from edp.networks.twin.load import LoadEstimate
+from edp.registry import Registry
+from edp.settings.bounds import above, check_bounds, integer, span
+
+Array = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+STEP = 0.02
+"""Share by which a group grows to see its effect: large against rounding, small against curvature."""
+CLIP = 3.0
+"""Units beyond which an error teaches no more."""
+BOUND = 3.0
+"""Groups are held within so many prior deviations."""
+LEAST = 1e-3
+"""Of errors, as a share of the velocities' spread: a perfect run must not teach without end."""
+LATELY = 30
+"""Stretches over which errors are averaged."""
+HOTTEST_C = 150.0
+"""Of oil (degC); a thermometer that says more is broken."""
+WARMER = 0.02
+"""Change of a logarithm by temperature from which numbers are made anew: about a kelvin."""
+REST = 1e-3
+"""Speed (m/s or rad/s) below which a stretch tells nothing of valves and friction."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NumberGroup:
+    """Numbers of a grey box that grow and shrink together.
+
+    Attributes:
+        names: how their names begin.
+        deviation: prior deviation of the logarithm of their factor.
+        shared: one group for the machine; else one for each actuator, its valves included.
+        per_kelvin: by how much the logarithm changes with the oil's temperature, where that is measured.
+    """
+
+    names: tuple[str, ...]
+    deviation: float
+    shared: bool = False
+    per_kelvin: float = 0.0
+
+
+NUMBER_GROUPS: Registry[NumberGroup] = Registry("group of numbers")
+NUMBER_GROUPS.register("dead_band")(NumberGroup(names=("dead_band_",), deviation=0.25))
+NUMBER_GROUPS.register("gain")(NumberGroup(names=("into_", "out_of_"), deviation=0.15))
+# The viscosity of mineral oil falls by some 3.5 % a K about 40 degC: leakage goes with its inverse, friction in seals
+# and bearings with about its root.
+NUMBER_GROUPS.register("friction")(NumberGroup(names=("viscous",), deviation=0.5, per_kelvin=-0.0175))
+NUMBER_GROUPS.register("leakage")(
+    NumberGroup(names=("piston_leakage", "spool_leakage"), deviation=1.0, shared=True, per_kelvin=0.035)
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TunedSpec:
+    """How fast and how far numbers follow.
+
+    Attributes:
+        groups: of `NUMBER_GROUPS`, what is learned.
+        learn_ticks: length of a stretch that is run again.
+        forgetting_s: seconds of motion after which what was learned has 1/e of its weight.
+        gain: of the observer, as a share of the way to the measurement.
+        load_share: of a new force that the estimate takes over in a tick; 0: no forces are estimated.
+        oil_c: temperature of the oil (degC) in the logs to which the twin was fitted, for ticks that tell theirs; NaN:
+            not known.
+
+    Raises:
+        ConfigError: a value out of range or a group that does not exist.
+    """
+
+    groups: tuple[str, ...] = ("dead_band", "gain", "friction", "leakage")
+    learn_ticks: int = 20
+    forgetting_s: float = 60.0
+    gain: float = 0.3
+    load_share: float = 0.15
+    oil_c: float = math.nan
+
+    def __post_init__(self) -> None:
+        check_bounds("tuning", self, learn_ticks=integer(2, 1000), forgetting_s=above(0.0, 1e6), gain=span(0.0, 1.0),
+                     load_share=span(0.0, 1.0))  # fmt: skip
+        if not (math.isnan(self.oil_c) or abs(self.oil_c) <= HOTTEST_C):
+            raise ConfigError(f"tuning: oil_c = {self.oil_c}; degrees Celsius within {HOTTEST_C:g}, or NaN, must hold")
+        for name in self.groups:
+            NUMBER_GROUPS[name]
+        if not self.groups:
+            raise ConfigError(f"tuning: groups is empty; name at least one of {', '.join(NUMBER_GROUPS)}")
+
+
+def group_matrix(twin: GreyTwin, groups: Sequence[str]) -> tuple[tuple[str, ...], Doubles, Doubles, Doubles]:
+    """Labels, numbers that each group moves ``(number, group)``, deviations and changes by a kelvin ``(group,)``.
+
+    Raises:
+        ConfigError: the twin has no number of a group.
+    """
+    owner = {valve.name: valve.actuator for valve in twin.spec.elements(twin.channels).valves}
+    labels: list[str] = []
+    columns, deviations, warmth = [], [], []
+    for kind in groups:
+        group = NUMBER_GROUPS[kind]
+        by_element: dict[str, list[int]] = {}
+        for index, number in enumerate(twin.table.numbers):
+            if number.name.startswith(group.names) and number.positive:
+                element = "" if group.shared else owner.get(number.element, number.element)
+                by_element.setdefault(element, []).append(index)
+        if not by_element:
+            raise ConfigError(f"tuning: the grey box has no number of the group '{kind}'; leave it out of groups")
+        for element, places in by_element.items():
+            labels.append(f"{element}.{kind}".lstrip("."))
+            columns.append(np.isin(np.arange(len(twin.table.numbers)), places).astype(np.float64))
+            deviations.append(group.deviation)
+            warmth.append(group.per_kelvin)
+    return tuple(labels), np.stack(columns, axis=1), np.array(deviations), np.array(warmth)
+
+
+class TunedTwin:
+    """A grey box that follows one machine, tick by tick.
+
+    Args:
+        twin: the grey box of the machine as it was.
+        spec: how it follows.
+
+    Attributes:
+        labels: of the groups.
+        logs: logarithms of the groups' factors, less `by_oil` ``(group,)``; 0 where nothing has changed.
+        by_oil: what the oil's temperature makes of them ``(group,)``.
+        learn: False freezes them.
+        learned: stretches that have taught.
+
+    Raises:
+        ConfigError: a twin that is no grey box, or a group that it has no number of.
+    """
+
+    def __init__(self, twin: Twin, spec: TunedSpec | None = None) -> None:
+        if not isinstance(twin, GreyTwin):
+            raise ConfigError(
+                f"a twin of class {type(twin).__name__} came; only a grey box has dead bands and gains that can "
+                "follow the machine: train one with --set twin.kind=greybox"
+            )
+        self.twin, self.spec = twin, spec or TunedSpec()
+        self._speeds = np.arange(len(twin.channels.velocities))
+        self.labels, self._moves, self._deviation, self._warmth = group_matrix(twin, self.spec.groups)
+        self._floor = (LEAST * np.asarray(twin.scales.answer_width[self._speeds], np.float64)) ** 2
+        self.learn = True
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the machine and all that was learned."""
+        self.logs, self._prior = np.zeros(len(self.labels)), np.diag(self._deviation**2)
+        self.by_oil = np.zeros(len(self.labels))
+        self._covariance, self.learned = self._prior.copy(), 0
+        self._square, self._judged = np.zeros(len(self._speeds)), 0
+        self._plain_runner = self.twin.runner()
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Tell that ticks are missing: the observer begins anew at the next one; what was learned stays."""
+        self._renew(np.zeros(len(self._speeds)))
+        self._plain: TwinState | None = None
+        self._tuned: TwinState | None = None
+        self._commands: list[Array] = []
+        self._measured: list[Array] = []
+        self._begin: tuple[TwinState, Array, Doubles] | None = None
+        self._now: tuple[Array, tuple[TwinState, Array], tuple[TwinState, Array]] | None = None
+        self._ticks = 0
+
+    def _renew(self, forces: Doubles) -> None:
+        self._runner = self._with(self.logs).runner()
+        self._load = LoadEstimate(self._runner, self._speeds, self.spec.load_share)
+        self._runner.resistance = forces.copy()
+
+    def _with(self, logs: Doubles) -> GreyTwin:
+        return self.twin.with_numbers(self.twin.numbers * np.exp(self._moves @ (self.by_oil + logs)))
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """Of each group, against the machine as it was."""
+        return dict(zip(self.labels, np.exp(self.by_oil + self.logs).tolist(), strict=True))
+
+    def step(self, command: Array, measured: Array, oil_c: float = math.nan) -> None:
+        """Take one tick in.
+
+        Args:
+            command: ``(command,)``; one that is missing interrupts, since nothing is known of what moves then.
+            measured: ``(answer,)``, NaN where a sensor is missing: that port runs free.
+            oil_c: temperature of the oil (degC); NaN, or beyond what oil can have: not measured.
+        """
+        self._warm(oil_c)
+        if not np.isfinite(command).all():
+            self.interrupt()
+            return
+        if self._plain is None or self._tuned is None:
+            if not (np.isfinite(measured).all() and self.twin.within_stops(measured[None])[0]):
+                return
+            rest = self.twin.initial_state(command[None], measured[None])
+            self._plain, self._tuned = dict(rest), dict(rest)
+        self._take(measured)
+        self._load.update(measured[self._speeds].astype(np.float64))
+        plain, tuned = (self._port(state, measured) for state in (self._plain, self._tuned))
+        self._now = (command, (self._plain, plain), (self._tuned, tuned))
+        self._ticks += 1
+        if self._begin is None and self._ticks > self.twin.prefix_ticks:
+            self._begin = (self._tuned, tuned, np.array(self._runner.resistance))
+            self._commands, self._measured = [], []
+        if self._begin is not None:
+            self._commands.append(command)
+        self._plain = self._plain_runner.step(command, self._plain, plain)
+        after = self._runner.step(command, self._tuned, tuned)
+        self._load.expect(command, tuned, self._tuned, after)
+        self._tuned = after
+
+    def forecast(self, ticks: int) -> tuple[Doubles, Doubles] | None:
+        """Velocities so many ticks ahead with the command held: as the machine was, and as it is; None at the start."""
+        if self._now is None or self._ticks <= self.twin.prefix_ticks:
+            return None
+        command, plain, tuned = self._now
+        commands, first = np.repeat(command[None, None], ticks, axis=1), np.zeros(1, np.int64)
+        as_it_was, as_it_is = (
+            runner.branches(commands, state, row, first)[0, -1, self._speeds]
+            for runner, (state, row) in ((self._plain_runner, plain), (self._runner, tuned))
+        )
+        return as_it_was, as_it_is
+
+    def _warm(self, oil_c: float) -> None:
+        """Move the numbers by what the temperature of the oil makes of them."""
+        apart = oil_c - self.spec.oil_c
+        if not (abs(apart) <= 2.0 * HOTTEST_C and abs(oil_c) <= HOTTEST_C):
+            return
+        logs = self._warmth * apart
+        if (np.abs(logs - self.by_oil) > WARMER).any():
+            self.by_oil = logs
+            self._renew(np.array(self._runner.resistance))
+
+    def _port(self, state: TwinState, measured: Array) -> Array:
+        own = np.asarray(state["answer"][0], np.float32)
+        # Without a measurement the difference is NaN, which is what leaves a port free.
+        return np.asarray(own + np.float32(self.spec.gain) * (measured - own), dtype=np.float32)
+
+    def _take(self, measured: Array) -> None:
+        """Note what a stretch has come to, and learn at its end."""
+        if self._begin is None or not self._commands:
+            return
+        self._measured.append(measured[self._speeds])
+        if len(self._commands) < self.spec.learn_ticks:
+            return
+        truth = np.array(self._measured, np.float64)
+        if self.learn and np.isfinite(truth).all() and (np.abs(truth) > REST).any():
+            self._learn(truth)
+        self._begin = None
+
+    def _errors(self, truth: Doubles, logs: Doubles) -> Doubles:
+        """Of the present stretch with these numbers, SI units ``(tick, velocity)``."""
+        if self._begin is None:
+            raise ValueError("no stretch has begun")
+        state, row, forces = self._begin
+        runner = self._with(logs).runner()
+        runner.resistance = forces
+        commands = np.array(self._commands, np.float32)[None]
+        answers = runner.branches(commands, state, row, np.zeros(1, np.int64))[0][:, self._speeds]
+        return np.asarray(truth - answers, dtype=np.float64)
+
+    def _learn(self, truth: Doubles) -> None:
+        error = self._errors(truth, self.logs)
+        grown = np.eye(len(self.labels)) * STEP
+        slopes = np.stack([error - self._errors(truth, self.logs + one) for one in grown], axis=-1) / STEP
+        if not (np.isfinite(slopes).all() and np.isfinite(error).all()):
+            return
+        unit = self._unit(error)
+        count, clipped = len(truth), np.clip(error / unit, -CLIP, CLIP).ravel()
+        slopes = (slopes / unit[:, None]).reshape(len(clipped), -1)
+        posterior = np.linalg.inv(np.linalg.inv(self._covariance) + slopes.T @ slopes / count)
+        keep = math.exp(-self.spec.learn_ticks / (self.spec.forgetting_s * self.twin.channels.rate_hz))
+        most = BOUND * self._deviation
+        self.logs = np.clip(keep * (self.logs + posterior @ (slopes.T @ clipped) / count), -most, most)
+        # Its symmetric part, so that rounding of thousands of inversions does not add up.
+        self._covariance = keep**2 * 0.5 * (posterior + posterior.T) + (1.0 - keep**2) * self._prior
+        self.learned += 1
+        self._renew(np.array(self._runner.resistance))
+
+    def _unit(self, error: Doubles) -> Doubles:
+        """What errors lately were ``(velocity,)``, SI units, with this stretch; never nothing."""
+        self._judged = min(self._judged + 1, LATELY)
+        self._square = self._square + ((error**2).mean(axis=0) - self._square) / self._judged
+        return np.asarray(np.sqrt(np.maximum(self._square, self._floor)))

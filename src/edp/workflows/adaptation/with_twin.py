@@ -1,0 +1,72 @@
+"""Predictions of recordings, moved by a grey box that follows the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.derived_velocities import matched
+from edp.data.task import Task
+from edp.errors import ConfigError, DataError
+from edp.ir.rls import Adaptation
+from edp.networks.twin import Twin
+from edp.networks.twin.tuned import TunedSpec, TunedTwin
+from edp.networks.twin.tuned_correction import TunedCorrection
+from edp.recording import Recording
+
+Rows = NDArray[np.float32]
+
+
+class TwinMoves:
+    """Recordings of one machine through a `TunedCorrection`, one after the other.
+
+    Args:
+        twin: a grey box of the machine as it was.
+        adaptation: of the network, which tells horizons, and by its units what a large correction is.
+        task: of the network.
+        spec: how the numbers follow.
+
+    Raises:
+        ConfigError: another rate than the network's, no grey box, or a target that is no velocity of it.
+    """
+
+    def __init__(self, twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpec | None = None) -> None:
+        if twin.channels.rate_hz != task.rate_hz:
+            raise ConfigError(
+                f"the twin has {twin.channels.rate_hz:g} Hz, the network {task.rate_hz:g} Hz; train a twin at the "
+                "network's rate"
+            )
+        limit = adaptation.spec.limit * adaptation.unit.astype(np.float64)
+        self._twin = twin
+        self.correction = TunedCorrection(TunedTwin(twin, spec), task.targets, adaptation.horizons, limit)
+
+    def __call__(
+        self, recordings: Sequence[Recording], predictions: Sequence[Rows], carry: bool, learn: bool
+    ) -> list[Rows]:
+        """Predictions ``(time, horizon, target)`` of each recording, moved.
+
+        Args:
+            recordings: with the twin's channels.
+            predictions: the network's own.
+            carry: keep what was learned from one recording to the next.
+            learn: False freezes the numbers.
+
+        Raises:
+            DataError: a channel of the twin is missing.
+        """
+        self.correction.tuned.learn = learn
+        task, moved = self._twin.channels.task(), []
+        for recording, predicted in zip(recordings, predictions, strict=True):
+            try:
+                part = task.series(matched(self._twin.channels, recording))
+            except DataError as error:
+                raise DataError(f"recording '{recording.name}': {error}") from error
+            if carry:
+                self.correction.interrupt()
+            else:
+                self.correction.reset()
+            rows = zip(part.inputs, part.targets, predicted, strict=True)
+            moved.append(np.stack([self.correction.step(*row) for row in rows]))
+        return moved
