@@ -1,11 +1,12 @@
 """Where is the error of the best networks, and what would remove it?
 
-Machine M22, default mix. Networks of the preset ``quick`` with equal updates read what is measured, then besides it one
-group of what only the simulator knows (an oracle): pump displacements, spool positions, noise-free pressures, oil
-temperature, strokes where these are not measured. Their errors, and those of the forecasts of a grey box where
-``--forecasts`` names the folder of ``twin_forecast.py --work``, are divided by situations that the simulator's own
-channels tell: relief, power limit, regeneration, conflux, spools that cross their dead band, end stops, reversals. A
-ridge regression on the inputs' history says how much of each group it holds already.
+Machine M22, default mix, in free air or, with ``--soil``, in it and three soils. Networks of the preset ``quick`` with
+equal updates read what is measured, then besides it one group of what only the simulator knows (an oracle): pump
+displacements, spool positions, noise-free pressures, oil temperature, strokes where these are not measured. Their
+errors, and those of the forecasts of a grey box where ``--forecasts`` names the folder of ``twin_forecast.py --work``,
+are divided by situations that the simulator's own channels tell: relief, power limit, regeneration, conflux, spools
+that cross their dead band, end stops, reversals. A ridge regression on the inputs' history says how much of each group
+it holds already.
 """
 
 from __future__ import annotations
@@ -52,13 +53,16 @@ EVENTS = {
     "power limit": "Event_PowerLimit",
     "soil contact": "Event_SoilContact",
 }
+SOILS = ("air", "sandy_loam", "clay", "gravel")
 LAGS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
 """Ticks back that the ridge regression reads."""
 
 
 def main() -> None:
     made = parser(__doc__ or "")
-    made.add_argument("--minutes", type=float, default=60.0, help="of recordings of 3 min each")
+    made.add_argument("--minutes", type=float, default=60.0, help="of all recordings")
+    made.add_argument("--each", type=float, default=3.0, help="minutes of one recording")
+    made.add_argument("--soil", action="store_true", help="let grading and digs work soils, too")
     made.add_argument("--updates", type=int, default=1200)
     made.add_argument("--forecasts", type=Path, default=None, help="folder that twin_forecast.py --work left")
     made.add_argument("--work", type=Path, default=None, help="folder that keeps the data")
@@ -94,8 +98,9 @@ def run(arguments: Any, work: Path) -> None:
 def data_of(arguments: Any, work: Path) -> list[Recording]:
     """Recordings with true pressures beside the measured ones; those of the forecasts' folder where it is named."""
     logs = work / "logs" if arguments.forecasts is None else arguments.forecasts / "logs"
-    count = 7 if arguments.quick else round(arguments.minutes / 3)
-    order = SimulationOrder(minutes=arguments.minutes, recordings=count, seed=arguments.seed + 1)
+    count = 7 if arguments.quick else round(arguments.minutes / arguments.each)
+    materials = dict.fromkeys(SOILS, 1.0) if arguments.soil else {}
+    order = SimulationOrder(minutes=arguments.minutes, recordings=count, seed=arguments.seed + 1, materials=materials)
     simulate_data_set(logs, order)
     silent = work / "silent.toml"
     silent.write_text(_machine_text().replace("pressure = 1.5e4 ", "pressure = 0.0 "), encoding="utf-8")

@@ -222,13 +222,41 @@ GROUND_CHANNELS: Mapping[str, Channel] = {
 }
 """Logged beside `EXTRA_CHANNELS` where a recording was made in soil."""
 
+
+def _motors() -> dict[str, Channel]:
+    channels = [
+        Channel("SwingAngle", Kind.ANGLE, "angle of the upper structure from where the recording began"),
+        Channel("SwingVel", Kind.ANGULAR_VELOCITY, "angular velocity of the upper structure"),
+    ]
+    tracks = ("left", "right")
+    channels += [Channel(f"TrackVel_{n}", Kind.VELOCITY, f"velocity of the {s} track") for n, s in enumerate(tracks, 1)]
+    ports = [("Swing", 1, "swing motor, port that drives it onwards"), ("Swing", 2, "swing motor, the other port")]
+    for n, side in enumerate(tracks):
+        ports += [("Track", 2 * n + 1, f"{side} track's motor, port that drives it forwards")]
+        ports += [("Track", 2 * n + 2, f"{side} track's motor, the other port")]
+    channels += [Channel(f"{what}Pressure_{n}", Kind.PRESSURE, f"pressure of the {text}") for what, n, text in ports]
+    for word, text in (("Demand", "demand of the section, as a share of full"), ("Spool", "spool position")):
+        channels += [Channel(f"Swing{word}", Kind.RATIO, f"swing: {text}")]
+        channels += [Channel(f"Track{word}_{n}", Kind.RATIO, f"{s} track: {text}") for n, s in enumerate(tracks, 1)]
+    return {channel.name: channel for channel in channels}
+
+
+MOTOR_CHANNELS: Mapping[str, Channel] = _motors()
+"""Logged beside `EXTRA_CHANNELS`, without noise, where a recording swings and travels."""
+
 FAULT_CHANNELS: Mapping[str, Channel] = {
     name: Channel(name, Kind.RATIO, "share of the full size of a fault that is there, in the order of the recording's")
     for name in (f"Fault_{k}" for k in range(1, 9))
 }
 """Logged beside `EXTRA_CHANNELS` where a recording was made with faults."""
 
-VOCABULARY: Mapping[str, Channel] = {**TABLE_A1, **EXTRA_CHANNELS, **GROUND_CHANNELS, **FAULT_CHANNELS}
+VOCABULARY: Mapping[str, Channel] = {
+    **TABLE_A1,
+    **EXTRA_CHANNELS,
+    **GROUND_CHANNELS,
+    **MOTOR_CHANNELS,
+    **FAULT_CHANNELS,
+}
 
 
 _SLOWEST, _FASTEST = 1e-9, 1e9

@@ -9,7 +9,7 @@ import pytest
 from edp.data.splits import ByRecording
 from edp.errors import ConfigError
 from edp.recording import Recording
-from edp.signals import EXTRA_CHANNELS, TABLE_A1
+from edp.signals import EXTRA_CHANNELS, MOTOR_CHANNELS, TABLE_A1
 from edp.sim import (
     EXCITATIONS,
     Scenario,
@@ -82,7 +82,8 @@ def test_a_recording_of_a_family_knows_its_machine_and_mass():
 def test_recording_has_table_a1_first_in_si_units(excitation):
     seen = []
     recording = simulate(Scenario(excitation=excitation, duration_s=20.0, seed=5), seen.append)
-    assert recording.channel_names == (*TABLE_A1, *EXTRA_CHANNELS)
+    motors = MOTOR_CHANNELS if EXCITATIONS[excitation].swings else ()
+    assert recording.channel_names == (*TABLE_A1, *EXTRA_CHANNELS, *motors)
     assert recording.samples == 2000
     assert recording.source == "sim:M22"
     assert recording.meta["excitation"] == excitation

@@ -15,7 +15,8 @@ from typing import Any, Protocol
 from edp import __version__
 from edp.errors import BusyError, ConfigError, EdpError, StorageError, closest
 from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
-from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1
+from edp.sim.excitation import EXCITATIONS
 from edp.sim.plan import DataSetSpec, simulate_many
 from edp.sim.predictability import LimitJob, LimitSpec, find_limit, plan_limit
 from edp.sim.scenario import Scenario, plain
@@ -302,8 +303,14 @@ def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".p
 def bytes_needed(plan: Sequence[Scenario], suffix: str) -> int:
     """Room that the logs of a plan take, rounded up."""
     usual = len(TABLE_A1) + len(EXTRA_CHANNELS)
-    values = sum(s.samples * (usual + (len(GROUND_CHANNELS) if s.material else 0) + len(s.faults)) for s in plan)
+    values = sum(s.samples * (usual + _further_channels(s)) for s in plan)
     return int(values * BYTES_PER_VALUE.get(suffix, max(BYTES_PER_VALUE.values())))
+
+
+def _further_channels(scenario: Scenario) -> int:
+    ground = len(GROUND_CHANNELS) if scenario.material else 0
+    motors = len(MOTOR_CHANNELS) if EXCITATIONS[scenario.excitation].swings else 0
+    return ground + motors + len(scenario.faults)
 
 
 def check_room(folder: Path, plan: Sequence[Scenario], suffix: str) -> None:

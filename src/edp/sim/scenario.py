@@ -14,6 +14,7 @@ from edp.sim.machine.machine import Machine, Sensors
 from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics import soil
+from edp.sim.physics.motor_circuit import motors_of
 from edp.sim.physics.plant import steps_per_sample
 
 START_STROKES = (0.3, 0.7)
@@ -64,8 +65,10 @@ class Scenario:
     def __post_init__(self) -> None:
         object.__setattr__(self, "start_strokes", tuple(self.start_strokes))
         object.__setattr__(self, "faults", faults_of(self.faults, "scenario"))
-        self.load()
-        EXCITATIONS[self.excitation]
+        machine = self.load()
+        if EXCITATIONS[self.excitation].swings:
+            # For its refusal only: the plant asks for the motors again.
+            motors_of(machine)
         if self.material:
             soil.load_material(self.material)
         for key in ("duration_s", "rate_hz", "step_s"):

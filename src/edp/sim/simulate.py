@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.recording import Recording
-from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.faults.course import MachineCourse, SensorCourse, numbers_of, shares_at, spare_s
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import known_mass
-from edp.sim.physics.jit import rehearsal
+from edp.sim.physics.jit import motor_rehearsal, rehearsal
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.snapshot import Snapshot, capture, restored
 from edp.sim.scenario import Scenario, SimulationError, plain
@@ -34,18 +34,19 @@ class Simulation:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        rehearse()
+        rehearse(EXCITATIONS[scenario.excitation].swings)
         self.scenario = scenario
         machine = scenario.load()
         hand = np.random.default_rng(seeds_of(scenario)[1])
         self.machine = machine
         ground, strokes = start_of(scenario, machine)
-        self.plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground, spare_s(scenario.faults))
+        swings, spare = EXCITATIONS[scenario.excitation].swings, spare_s(scenario.faults)
+        self.plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground, spare, swings)
         self._course = MachineCourse(scenario.faults, numbers_of(self.plant))
         self.operator = EXCITATIONS[scenario.excitation](hand, scenario.rate_hz, machine)
         self.samples = 0
         self._hand = hand
-        self._waiting = np.zeros((0, at.AXES))
+        self._waiting = np.zeros((0, self.operator.levers()))
         self._logs: list[Array] = []
         self._targets: list[Array] = []
 
@@ -56,8 +57,8 @@ class Simulation:
 
     @property
     def targets(self) -> Array:
-        """Lever targets since this object was made or restored, shape (time, 3)."""
-        return np.concatenate(self._targets) if self._targets else np.zeros((0, at.AXES))
+        """Lever targets since this object was made or restored, shape (time, levers)."""
+        return np.concatenate(self._targets) if self._targets else np.zeros((0, self.operator.levers()))
 
     def run(self, samples: int, progress: Callable[[float], None] | None = None) -> Array:
         """Run for `samples`; the rows that were logged in them, shape (samples, LOG_COLUMNS).
@@ -78,7 +79,7 @@ class Simulation:
         return np.concatenate(self._logs[first:])
 
     def follow(self, targets: Array) -> Array:
-        """Run with lever targets given from outside, shape (samples, 3), as the operator's were; returns the log.
+        """Run with lever targets given from outside, shape (samples, levers), as the operator's were; returns the log.
 
         Raises:
             SimulationError: the state became non-finite.
@@ -188,7 +189,8 @@ def _recording(scenario: Scenario, machine: Machine, log: Array, clamps: int) ->
     truth = sensors.truth_signals(log)
     # Strokes, pump pressures and oil temperature as they are shown: only a fault makes them differ from the truth.
     truth |= {name: measured[:, column] for name, column in sensors.shown_names().items()}
-    extra = {name: channel for name, channel in {**EXTRA_CHANNELS, **GROUND_CHANNELS}.items() if name in truth}
+    further = {**EXTRA_CHANNELS, **GROUND_CHANNELS, **MOTOR_CHANNELS}
+    extra = {name: channel for name, channel in further.items() if name in truth}
     facts = {key: value for key, value in plain(scenario).items() if key != "name"}
     mass = known_mass(scenario.machine)
     if mass is not None:
@@ -210,12 +212,20 @@ def _recording(scenario: Scenario, machine: Machine, log: Array, clamps: int) ->
     )
 
 
-def rehearse() -> None:
-    """Compile everything that a simulation runs, once for each cache folder."""
+def rehearse(swings: bool = False) -> None:
+    """Compile everything that a simulation runs, once for each cache folder; what only `swings` needs on demand."""
     rehearsal.once(_play)
+    if swings:
+        motor_rehearsal.once(_play_motors)
 
 
 def _play() -> None:
     """Call all compiled code: in free air and in soil, open and closed loops, light and full sensors."""
     simulate(Scenario(excitation="combined", duration_s=0.5))
     simulate(Scenario(machine="C14", excitation="dig", material="clay", duration_s=0.5))
+
+
+def _play_motors() -> None:
+    """Call all compiled code that swings and travels, by hand and not."""
+    for excitation in ("six_levers", "swing_dig"):
+        simulate(Scenario(excitation=excitation, duration_s=0.1))

@@ -27,6 +27,8 @@ class View(NamedTuple):
         attitude: absolute angle of the bucket, rad.
         ground: height of the ground below the tip, m; NaN in free air.
         payload_kg: mass in the bucket.
+        swing: angle of the upper structure from where it began, rad; 0 where it does not swing.
+        swing_rate: its rate, rad/s.
     """
 
     strokes: Array
@@ -38,6 +40,8 @@ class View(NamedTuple):
     attitude: float
     ground: float = math.nan
     payload_kg: float = 0.0
+    swing: float = 0.0
+    swing_rate: float = 0.0
 
     @property
     def depth(self) -> float:
@@ -51,4 +55,5 @@ def view_of(plant: Plant) -> View:
     pose.look_at(plant.state, plant.axes, plant.plant, look)
     x, y, attitude = look[pose.TIP :].tolist()
     ground = math.nan if plant.ground is None else plant.ground.height(x)
-    return View(look[0:3], look[3:6], look[6:9], look[9:12], x, y, attitude, ground, plant.payload_kg)
+    swing = (0.0, 0.0) if plant.motors is None else plant.motors.swing
+    return View(look[0:3], look[3:6], look[6:9], look[9:12], x, y, attitude, ground, plant.payload_kg, *swing)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, TABLE_A1, Channel, Kind
+from edp.signals import EXTRA_CHANNELS, FAULT_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1, Channel, Kind
 
 SENSED = ("PumpPressure_1", "PumpPressure_2", "CylStroke_1", "CylStroke_2", "CylStroke_3", "OilTemperature")
 """Of `EXTRA_CHANNELS`, those that a machine may have sensors for; the others only a simulation knows."""
@@ -32,7 +32,7 @@ class Group:
 
 def sensed_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """Channels that sensors can give: without truth of a simulation."""
-    truth = {*EXTRA_CHANNELS, *GROUND_CHANNELS, *FAULT_CHANNELS} - {*SENSED}
+    truth = {*EXTRA_CHANNELS, *GROUND_CHANNELS, *MOTOR_CHANNELS, *FAULT_CHANNELS} - {*SENSED}
     return tuple(channel for channel in channels if channel.name not in truth)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edp.sim.episodes import blocks
 from edp.sim.machine import layout as at
-from edp.sim.physics import plant, terramechanics
+from edp.sim.physics import commands, plant, terramechanics
 from edp.sim.physics import scratch as places
 from edp.sim.physics.jit import compiled, inlined, pasted, plainly_inlined
 from edp.sim.sensors import chain, logbook
@@ -98,7 +98,7 @@ def move(memory: Array, lever: Array, setup: Setup, room: Array) -> int:
     count = past.shape[0]
     one_demand = room[: at.SPOOLS]
     demands = room[at.SPOOLS : at.SPOOLS * (count + 2)].reshape(count + 1, at.SPOOLS)
-    plant.shape_commands(lever, hand, numbers[blocks.HAND_S], past, setup, demands, one_demand)
+    commands.shape_commands(lever, hand, numbers[blocks.HAND_S], past, setup, demands, one_demand)
     row = blocks.line(blocks.ROW, memory, memory)
     return plant.run_sample(state, valves, demands, count, times, setup, row, one_demand)
 

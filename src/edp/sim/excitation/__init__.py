@@ -1,6 +1,17 @@
 """Excitation in the loop: who moves the levers, and how; one file and one registration a family."""
 
-from edp.sim.excitation import aprbs, broadband, combined, dig, end_stops, grading, isolated, reversals
+from edp.sim.excitation import (
+    aprbs,
+    broadband,
+    combined,
+    dig,
+    end_stops,
+    grading,
+    isolated,
+    reversals,
+    six_levers,
+    swing_dig,
+)
 from edp.sim.excitation.base import EXCITATIONS, Excitation
 
 __all__ = [
@@ -14,4 +25,6 @@ __all__ = [
     "grading",
     "isolated",
     "reversals",
+    "six_levers",
+    "swing_dig",
 ]

@@ -13,6 +13,7 @@ from edp.sim.view import View
 
 Array = NDArray[np.float64]
 AXES = 3
+MOTORS = 3
 
 
 class Excitation:
@@ -24,16 +25,23 @@ class Excitation:
     Attributes:
         by_hand: whether targets pass through an operator's hand; False for test signals and automatic control.
         works_ground: whether the family is meant for soil; the others always move in free air.
+        swings: whether it moves swing and travel, too, of a machine that has their motors.
     """
 
     by_hand: bool = True
     works_ground: bool = False
+    swings: bool = False
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         self._rng, self._rate, self._machine = rng, rate_hz, machine
 
+    @classmethod
+    def levers(cls) -> int:
+        """How many levers it moves: boom, arm, bucket, and where it swings also swing, left and right track."""
+        return AXES + MOTORS if cls.swings else AXES
+
     def block(self, view: View) -> Array:
-        """The next lever targets in [-1, 1], shape (samples, 3), given what is seen now."""
+        """The next lever targets in [-1, 1], shape (samples, `levers`), given what is seen now."""
         raise TypeError(f"{type(self).__name__} does not say what it does next; give it a `block`")
 
     def redraw(self, unused: int) -> None:
@@ -55,8 +63,8 @@ def extend_probability(stroke: float, pull: float = 1.1) -> float:
 
 
 def held(levels: Sequence[float] | Array, samples: int) -> Array:
-    """The same levers at every sample, shape (samples, 3)."""
-    targets = np.empty((samples, AXES))
+    """The same levers at every sample, shape (samples, levers)."""
+    targets = np.empty((samples, len(levels)))
     targets[:] = levels
     return targets
 

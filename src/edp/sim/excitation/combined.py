@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from edp.sim.excitation.base import AXES, EXCITATIONS, Array, AxisStream, Excitation, held
@@ -19,9 +21,13 @@ class Combined(Excitation):
 
     def block(self, view: View) -> Array:
         """Levers up to the next change of any of them."""
-        for i, stream in enumerate(self._streams):
+        return self.until_a_change(view.strokes)
+
+    def until_a_change(self, strokes: Sequence[float] | Array) -> Array:
+        """The same, given each lever's place between its ends as a share."""
+        for stream, stroke in zip(self._streams, strokes, strict=True):
             if stream.hold.left == 0:
-                stream.next(view.strokes[i])
+                stream.next(stroke)
         samples = min(stream.hold.left for stream in self._streams)
         for stream in self._streams:
             stream.hold.spend(samples)

@@ -27,7 +27,17 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError
-from edp.sim.machine.machine import Bodies, BucketLinkage, Cylinders, Machine, PinTriangle, Ratings, Triple, Valves
+from edp.sim.machine.machine import (
+    Bodies,
+    BucketLinkage,
+    Cylinders,
+    Machine,
+    PinTriangle,
+    Ratings,
+    SwingMotor,
+    Triple,
+    Valves,
+)
 
 BASE_MASS_T = 21.7
 """Operating weight of M22, t."""
@@ -149,7 +159,32 @@ def scaled_machine(
             pitch_frequency=base.chassis.pitch_frequency / np.sqrt(s),
             lift_moment=base.chassis.lift_moment * s**4,
         ),
+        swing=None if base.swing is None else _swing(base.swing, s),
+        travel=None if base.travel is None else _motor(base.travel, s, 2.0, 3.0),
     )
+
+
+def _motor(motor: Any, s: float, sweep: float, weight: float) -> Any:
+    """A motor by its exponents of displacement and inertia; pressures stay, forces go with the displacement."""
+    forces = ("displacement", "coulomb", "viscous", "brake")
+    changed = {key: getattr(motor, key) * s**sweep for key in forces}
+    flows = {key: (getattr(motor, key)[0] * s**2, getattr(motor, key)[1]) for key in ("meter_in", "meter_out")}
+    leaks = {key: getattr(motor, key) * s for key in ("leakage", "drain_leakage")}
+    leaks["relief_slope"] = motor.relief_slope * s**2
+    slower = {key: float(getattr(motor, key) / np.sqrt(s)) for key in ("pilot_frequency", "spool_frequency")}
+    return replace(
+        motor,
+        inertia=motor.inertia * s**weight,
+        volume=motor.volume * s**3,
+        dead_time=float(motor.dead_time * np.sqrt(s)),
+        **{**changed, **flows, **leaks, **slower},
+    )
+
+
+def _swing(swing: SwingMotor, s: float) -> SwingMotor:
+    """Speeds of the swing fall with the root of the length."""
+    scaled: SwingMotor = replace(_motor(swing, s, 2.5, 5.0), boom_foot_ahead=swing.boom_foot_ahead * s)
+    return scaled
 
 
 def _times(values: Triple, factor: Any) -> Triple:

@@ -56,6 +56,17 @@ PLANT_VALUES = 57
 HEAD_IN_1, HEAD_IN_2, ROD_IN_1, ROD_IN_2, HEAD_OUT, ROD_OUT, HEAD_TO_ROD, ROD_TO_HEAD = range(8)
 OPENINGS = 8
 
+# motors: swing, left track, right track; numbers[motor, ...], the boom foot's place of the swing alone
+MOTORS = 3
+(
+    MOTOR_PUMP, SWEPT, MOTOR_INERTIA, MOTOR_VOLUME, MOTOR_LEAK, MOTOR_DRAIN, MOTOR_COULOMB, MOTOR_VISCOUS, BRAKE,
+    BRAKE_DELAY, MOTOR_RELIEF, MOTOR_SLOPE, MOTOR_DEAD_BAND, MOTOR_DEMAND, MOTOR_IN, MOTOR_OUT, FOOT_AHEAD,
+) = range(17)  # fmt: skip
+MOTOR_VALUES = 17
+# state[motor, ...]: speed (rad/s, of tracks m/s), pressures of its ports, way (rad, m), time since its spool closed (s)
+SPEED, PORT_A, PORT_B, WAY, IDLE = range(5)
+MOTOR_STATES = 5
+
 ATMOSPHERE = 1.013e5
 LOWEST_PRESSURE = 0.1e5 - ATMOSPHERE
 """Gauge pressure of 0.1 bar absolute: the floor at which pressures are clamped, and counted."""
@@ -76,6 +87,10 @@ LOG_PORT = LOG_EVENTS + EVENTS  # pressures of heads and rods at the valve (Pa);
 LOG_COLUMNS = LOG_PORT + 2 * AXES
 LOG_GROUND = LOG_COLUMNS
 """First of the ground's height columns, `GROUND_POINTS` of them, which a log has only where there is ground."""
+
+# columns of the motors in one logged sample, behind all others, only where they move; three of a kind stand together
+LOG_MOTOR_SPEED, LOG_MOTOR_A, LOG_MOTOR_B, LOG_MOTOR_DEMAND, LOG_MOTOR_SPOOL, LOG_SWING = 0, 3, 6, 9, 12, 15
+MOTOR_COLUMNS = 16
 
 # memory[...]: what the ground remembers; behind it the depth of the rut (m) at each of its points
 (

@@ -219,6 +219,66 @@ class Chassis:
 
 
 @dataclass(frozen=True)
+class Motor:
+    """A hydraulic motor with its gear and its section of the main valve, by the motion that it makes; SI units.
+
+    Of `travel` the motion is that of one track in m, and every number is that of one track.
+
+    Attributes:
+        pump: 1 or 2, that feeds it; of `travel` the left track's, the right one has the other.
+        displacement: volume swept for 1 rad (of a track: 1 m) of motion, m^3.
+        inertia: kg m^2 (kg) that it moves; of `swing` without the front, whose own follows from its pose.
+        volume: of each port with its line, m^3.
+        leakage: between the ports, m^3/s/Pa.
+        drain_leakage: from each port to tank, m^3/s/Pa.
+        coulomb: dry friction and rolling resistance, N m (N).
+        viscous: N m s (N s/m).
+        brake: of the parking brake, N m (N).
+        brake_delay: s after which it falls in, once its spool has closed.
+        relief: pressure at which the valve of each port opens, Pa.
+        relief_slope: flow through it for each Pa above, m^3/s/Pa.
+        pilot_frequency: Hz, as in `Valves`.
+        spool_frequency: Hz.
+        dead_time: of its command, s.
+        dead_band: share of full spool travel, both ways.
+        pump_demand: share of full displacement that its full pilot asks for.
+        meter_in: from the pump, at full opening.
+        meter_out: to the tank.
+    """
+
+    pump: int
+    displacement: float
+    inertia: float
+    volume: float
+    leakage: float
+    drain_leakage: float
+    coulomb: float
+    viscous: float
+    brake: float
+    brake_delay: float
+    relief: float
+    relief_slope: float
+    pilot_frequency: float
+    spool_frequency: float
+    dead_time: float
+    dead_band: float
+    pump_demand: float
+    meter_in: Rating
+    meter_out: Rating
+
+
+@dataclass(frozen=True)
+class SwingMotor(Motor):
+    """The motor that swings the upper structure.
+
+    Attributes:
+        boom_foot_ahead: of the axis of the swing, m.
+    """
+
+    boom_foot_ahead: float
+
+
+@dataclass(frozen=True)
 class Sensors:
     """What sensors and bus do to the truth; SI units, degrees where the name says so; a size of zero turns it off.
 
@@ -265,7 +325,10 @@ class Sensors:
 
 @dataclass(frozen=True)
 class Machine:
-    """One parameter set of the simulator; order of triples: boom, arm, bucket."""
+    """One parameter set of the simulator; order of triples: boom, arm, bucket.
+
+    What swings and travels may be left out, both or none; it moves only where a way of driving uses it.
+    """
 
     name: str
     description: str
@@ -282,3 +345,5 @@ class Machine:
     bucket: Bucket
     chassis: Chassis
     sensors: Sensors
+    swing: SwingMotor | None = None
+    travel: Motor | None = None

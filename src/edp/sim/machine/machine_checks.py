@@ -53,6 +53,27 @@ SHARE, SOME_SHARE, DEAD = ParameterBound(0.0, 1.0), ParameterBound(0.0, 1.0, abo
 PUMP = ParameterBound(1.0, 2.0, integer=True)
 LENGTH, SMALL = ParameterBound(0.0, 30.0, above=True), ParameterBound(0.0, 1.0, above=True)
 FREQUENCY = ParameterBound(0.0, 500.0, above=True)
+SECTIONS_OF_MOTORS = ("swing", "travel")
+_MOTOR: Mapping[str, ParameterBound] = {
+    "pump": PUMP,
+    "displacement": SMALL,
+    "inertia": POSITIVE,
+    "volume": ParameterBound(1e-5, 0.1),
+    "leakage": NOT_NEGATIVE,
+    "drain_leakage": NOT_NEGATIVE,
+    "coulomb": NOT_NEGATIVE,
+    "viscous": NOT_NEGATIVE,
+    "brake": NOT_NEGATIVE,
+    "brake_delay": ParameterBound(0.0, 60.0),
+    "relief": POSITIVE,
+    "relief_slope": POSITIVE,
+    "pilot_frequency": FREQUENCY,
+    "spool_frequency": FREQUENCY,
+    "dead_time": ParameterBound(0.0, 2.0),
+    "dead_band": DEAD,
+    "pump_demand": SHARE,
+    "boom_foot_ahead": ParameterBound(-5.0, 5.0),
+}
 BOUNDS: Mapping[str, ParameterBound] = {
     "gravity": POSITIVE,
     "bodies.length": LENGTH,
@@ -165,12 +186,13 @@ BOUNDS: Mapping[str, ParameterBound] = {
     "sensors.can_jitter": ParameterBound(0.0, 10.0),
     "sensors.can_loss": SHARE,
     "sensors.instance_seed": ParameterBound(0.0, 2.0**63, integer=True),
+    **{f"{section}.{key}": bound for section in SECTIONS_OF_MOTORS for key, bound in _MOTOR.items()},
 }
 """By `section.key`; a number without an entry must be finite."""
 WORDS: Mapping[str, tuple[str, ...]] = {"flow_sharing": FLOW_SHARING, "pressure_at": ("cylinder", "valve")}
 """What a key that takes a word may say."""
-FLOWING = ("meter_in_extend", "meter_in_retract", "meter_out_extend", "meter_out_retract")
-"""Ratings without which a cylinder could not move."""
+FLOWING = ("meter_in_extend", "meter_in_retract", "meter_out_extend", "meter_out_retract", "meter_in", "meter_out")
+"""Ratings without which a cylinder or a motor could not move."""
 
 
 def check_machine(machine: Machine, where: str) -> None:
@@ -205,7 +227,7 @@ def _leaves(machine: Machine) -> Iterator[tuple[str, str, str, Any]]:
         if is_dataclass(value):
             for inner in fields(value):
                 yield field.name, inner.name, str(inner.type), getattr(value, inner.name)
-        else:
+        elif value is not None:
             yield "", field.name, str(field.type), value
 
 
@@ -252,6 +274,7 @@ def _check_pairs(machine: Machine, where: str) -> None:
     option_checks.check_engine(machine, where)
     option_checks.check_load_sensing(machine, where)
     option_checks.check_lines(machine, where)
+    option_checks.check_motors(machine, where)
     for key, (low, high) in (
         ("pressure_offset", machine.sensors.pressure_offset),
         ("can_latency", machine.sensors.can_latency),

@@ -1,4 +1,4 @@
-"""What must hold of a machine's options: engine, pumps that sense loads, long lines; contradictions are refused."""
+"""What must hold of a machine's options: engine, load sensing, long lines, motors; contradictions are refused."""
 
 from __future__ import annotations
 
@@ -98,4 +98,23 @@ def check_lines(machine: Machine, where: str) -> None:
             raise ConfigError(
                 f"machine file {where} [cylinders]: line_bore[{name}] = {bore!r} m makes of hose_volume[{name}] a line "
                 f"of {length:.3g} m; must be from {LINE_LENGTHS[0]:g} to {LINE_LENGTHS[1]:g} m"
+            )
+
+
+def check_motors(machine: Machine, where: str) -> None:
+    """Swing and travel or neither, and motors that can turn against their own friction."""
+    if (machine.swing is None) != (machine.travel is None):
+        absent = "swing" if machine.swing is None else "travel"
+        raise ConfigError(
+            f"machine file {where}: the table [{absent}] is missing; give both [swing] and [travel], or neither"
+        )
+    if machine.swing is None or machine.travel is None:
+        return
+    for section, motor in (("swing", machine.swing), ("travel", machine.travel)):
+        # The pump's relief opens first where it is the lower one.
+        most = motor.displacement * (min(motor.relief, machine.pumps.relief) - machine.oil.tank_pressure)
+        if motor.coulomb >= most:
+            raise ConfigError(
+                f"machine file {where} [{section}]: coulomb = {motor.coulomb!r} must be below what the motor gives at "
+                f"its relief, {most:.4g} (displacement times pressure), or it never moves"
             )

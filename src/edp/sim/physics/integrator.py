@@ -28,16 +28,17 @@ from edp.sim.physics import (
     terramechanics,
     valve,
 )
+from edp.sim.physics import motors as places
+from edp.sim.physics.equations import factorise, solve
 from edp.sim.physics.jit import inlined
+from edp.sim.physics.motors import Motors
 
 # Side by side, as they are in their file: one a line would be a page.
 # isort: off
 from edp.sim.physics.scratch import (
-    ACROSS, ANCHOR, ANCHOR_COS, ANCHOR_SIN, ANGLES, BRISTLE_K, BYPASS, C_HEAD, C_PUMP_1, C_ROD, CONTACT, F_BY_V,
-    F_BY_Z, FROZEN, FROZEN_W, GRAVITY_T, H_BY_1, H_BY_2, H_BY_W, HEAD_BY_1, HEAD_BY_2, HEAD_BY_HEAD, HEAD_K, K1,
-    K2, LEVERS, LOST_1, LU, MASS, OPENED, PER_HEAD, PER_ROD, PORT_H_BY_W, PORT_HEAD_K, PORT_ROD_K, PUMP_ROW,
-    R_BY_1, R_BY_2, R_BY_W, RATES, RHS, ROD_BY_1, ROD_BY_2, ROD_BY_ROD, ROD_K, SINES, SLOPE, SLOPES, STAGE,
-    STROKES_W, T_HH, T_HR, T_RH, T_RR, Z_BY_V, Z_BY_W, Z_BY_Z, Z_LEFT,
+    ACROSS, ANCHOR, ANCHOR_COS, ANCHOR_SIN, ANGLES, BYPASS, C_HEAD, C_PUMP_1, C_ROD, CONTACT, F_BY_V, F_BY_Z, FROZEN,
+    FROZEN_W, GRAVITY_T, HEAD_BY_1, HEAD_BY_2, HEAD_BY_HEAD, K1, K2, LEVERS, LOST_1, MASS, OPENED, PER_HEAD, PER_ROD,
+    PUMP_ROW, RATES, RHS, ROD_BY_1, ROD_BY_2, ROD_BY_ROD, SINES, SLOPE, SLOPES, STAGE, STROKES_W, Z_BY_V, Z_BY_Z,
 )  # fmt: skip
 # isort: on
 
@@ -96,11 +97,22 @@ def freeze_geometry(state: Array, axes: Array, plant: Array, strokes: Array, s: 
 
 
 @inlined
-def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian: bool) -> None:
+def section_loads(w: Array, opened: Array, plant: Array, jacobian: bool, motors: Motors | None) -> tuple[float, float]:
+    """Largest pressure (Pa) that either pump is open to."""
+    first, second = hydraulics.highest_load(0, w, opened, plant), hydraulics.highest_load(1, w, opened, plant)
+    if motors is not None:
+        turning = places.present(motors, jacobian)
+        first = max(first, places.highest_load(0, turning, motors))
+        second = max(second, places.highest_load(1, turning, motors))
+    return first, second
+
+
+@inlined
+def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian: bool, motors: Motors | None) -> None:
     """F(w) into `work[RATES]`: torque balance (not yet divided by M), pressure and bristle rates.
 
     `w` is a state vector; its part from RATE to BRISTLE is used, and that of the lines where there are any. Derivatives
-    go to `work[SLOPE]` if asked for.
+    go to `work[SLOPE]` if asked for. Motors are at their state then, and at that of the stage otherwise.
     """
     s, strokes, opened, e, out = work[FROZEN_W], work[STROKES_W], work[OPENED], work[SLOPE], work[RATES]
     w1, w2, w3, pump_1, pump_2 = w[at.RATE], w[at.RATE + 1], w[at.RATE + 2], w[at.PUMP], w[at.PUMP + 1]
@@ -114,11 +126,13 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
     # Parallel orifices see their own load only: no section may find a higher pressure here.
     highest = loads = (-1e9, -1e9)
     if plant[at.COMPENSATED] > 0.0 or plant[at.LOAD_MARGIN] > 0.0:
-        loads = (hydraulics.highest_load(0, w, opened, plant), hydraulics.highest_load(1, w, opened, plant))
+        loads = section_loads(w, opened, plant, jacobian, motors)
     if plant[at.COMPENSATED] > 0.0:
         highest = loads
     long, port = plant[at.LINES] > 0.0, lines.at_valve(plant)
     drawn_1 = drawn_2 = 0.0
+    if motors is not None:
+        drawn_1, drawn_2 = places.rates((w1, w2, w3), (pump_1, pump_2, *highest), motors, plant, jacobian, out)
     for i in range(at.AXES):
         head, rod, v = w[at.HEAD + i], w[at.ROD + i], s[LEVERS + i] * w[at.RATE + i]
         ends = (w[port + i], w[port + at.AXES + i], pump_1, pump_2)
@@ -156,137 +170,22 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
 
 
 @inlined
-def eliminate(g: float, axes: Array, s: Array, e: Array) -> None:
-    """Chamber pressures and bristles as linear functions of joint rates and pump pressures, into the slopes `e`."""
-    for i in range(at.AXES):
-        lever = s[LEVERS + i]
-        ch, cr = g * e[i, C_HEAD], g * e[i, C_ROD]
-        hh, hr = 1.0 - ch * e[i, HEAD_BY_HEAD], -ch * e[i, ACROSS]
-        rh, rr = -cr * e[i, ACROSS], 1.0 - cr * e[i, ROD_BY_ROD]
-        # Never below 1: all slopes of the flows are <= 0, so Cramer's rule needs no pivot.
-        det = 1.0 / (hh * rr - hr * rh)
-        t_hh, t_hr, t_rh, t_rr = rr * det, -hr * det, -rh * det, hh * det
-        e[i, T_HH], e[i, T_HR], e[i, T_RH], e[i, T_RR] = t_hh, t_hr, t_rh, t_rr
-        by_w_head, by_w_rod = -ch * axes[i, at.HEAD_AREA] * lever, cr * axes[i, at.ROD_AREA] * lever
-        e[i, H_BY_W] = t_hh * by_w_head + t_hr * by_w_rod
-        e[i, R_BY_W] = t_rh * by_w_head + t_rr * by_w_rod
-        for m in range(2):
-            head, rod = ch * e[i, HEAD_BY_1 + m], cr * e[i, ROD_BY_1 + m]
-            e[i, H_BY_1 + m] = t_hh * head + t_hr * rod
-            e[i, R_BY_1 + m] = t_rh * head + t_rr * rod
-        left = 1.0 / (1.0 - g * e[i, Z_BY_Z])
-        e[i, Z_LEFT] = left
-        e[i, Z_BY_W] = g * e[i, Z_BY_V] * lever * left
-
-
-@inlined
-def factorise(g: float, axes: Array, long: bool, work: tuple[Array, ...]) -> None:
-    """Factor what is left of I - g J, 5x5, into `work[LU]`; no pivoting, its diagonal dominates.
-
-    `long` says whether lines lie between valves and chambers.
-    """
-    s, lu, e, contact = work[FROZEN_W], work[LU], work[SLOPE], work[CONTACT]
-    # The pumps feel what the sections see: the chambers, or the lines' ends at the valve.
-    seen = H_BY_W
-    if long:
-        line_step.eliminate_lines(g, axes, s, e)
-        seen = PORT_H_BY_W
-    else:
-        eliminate(g, axes, s, e)
-    # Rows of the joint rates stay multiplied by M: no inverse of the mass matrix is needed.
-    lu[0, 0], lu[0, 1], lu[0, 2] = s[MASS], s[MASS + 1], s[MASS + 2]
-    lu[1, 0], lu[1, 1], lu[1, 2] = s[MASS + 1], s[MASS + 3], s[MASS + 4]
-    lu[2, 0], lu[2, 1], lu[2, 2] = s[MASS + 2], s[MASS + 4], s[MASS + 5]
-    if contact[terramechanics.ON] > 0.0:
-        for i in range(3):
-            for j in range(3):
-                lu[i, j] += g * contact[terramechanics.DAMPING + 3 * i + j]
-    gc_1, gc_2 = g * e[PUMP_ROW, C_PUMP_1], g * e[PUMP_ROW, C_PUMP_1 + 1]
-    l33, l34 = 1.0 + gc_1 * e[PUMP_ROW, LOST_1], 0.0
-    l44, l43 = 1.0 + gc_2 * e[PUMP_ROW, LOST_1 + 1], 0.0
-    for i in range(at.AXES):
-        head_area, rod_area, lever = axes[i, at.HEAD_AREA], axes[i, at.ROD_AREA], s[LEVERS + i]
-        arm = g * lever
-        force_by_w = head_area * e[i, H_BY_W] - rod_area * e[i, R_BY_W]
-        lu[i, i] -= arm * (force_by_w - e[i, F_BY_Z] * e[i, Z_BY_W] - e[i, F_BY_V] * lever)
-        h_1, h_2, r_1, r_2 = e[i, HEAD_BY_1], e[i, HEAD_BY_2], e[i, ROD_BY_1], e[i, ROD_BY_2]
-        lu[i, 3] = -arm * (head_area * e[i, H_BY_1] - rod_area * e[i, R_BY_1])
-        lu[i, 4] = -arm * (head_area * e[i, H_BY_2] - rod_area * e[i, R_BY_2])
-        h_by_w, h_by_1, h_by_2 = e[i, seen], e[i, seen + 1], e[i, seen + 2]
-        r_by_w, r_by_1, r_by_2 = e[i, seen + 3], e[i, seen + 4], e[i, seen + 5]
-        lu[3, i] = -gc_1 * (h_1 * h_by_w + r_1 * r_by_w)
-        lu[4, i] = -gc_2 * (h_2 * h_by_w + r_2 * r_by_w)
-        l33 += gc_1 * (h_1 + r_1 - h_1 * h_by_1 - r_1 * r_by_1)
-        l34 -= gc_1 * (h_1 * h_by_2 + r_1 * r_by_2)
-        l43 -= gc_2 * (h_2 * h_by_1 + r_2 * r_by_1)
-        l44 += gc_2 * (h_2 + r_2 - h_2 * h_by_2 - r_2 * r_by_2)
-    lu[3, 3], lu[3, 4], lu[4, 3], lu[4, 4] = l33, l34, l43, l44
-    for k in range(5):
-        inverse = 1.0 / lu[k, k]
-        # The reciprocal pivot is kept, since `solve` runs twice for each factorisation.
-        lu[k, k] = inverse
-        for i in range(k + 1, 5):
-            lu[i, k] *= inverse
-            for j in range(k + 1, 5):
-                lu[i, j] -= lu[i, k] * lu[k, j]
-
-
-@inlined
-def solve(g: float, axes: Array, long: bool, work: tuple[Array, ...], out: Array) -> None:
-    """Solve (I - g J) k = work[RHS] (rows of the joint rates multiplied by M); k goes to `out`, laid out as a state.
-
-    `long` says whether lines lie between valves and chambers.
-    """
-    s, lu, e, r = work[FROZEN_W], work[LU], work[SLOPE], work[RHS]
-    b3, b4 = r[at.PUMP], r[at.PUMP + 1]
-    gc_1, gc_2 = g * e[PUMP_ROW, C_PUMP_1], g * e[PUMP_ROW, C_PUMP_1 + 1]
-    for i in range(at.AXES):
-        if long:
-            head, rod = line_step.known_lines(i, g, r, e)
-            seen_head, seen_rod = e[i, PORT_HEAD_K], e[i, PORT_ROD_K]
-        else:
-            head = e[i, T_HH] * r[at.HEAD + i] + e[i, T_HR] * r[at.ROD + i]
-            rod = e[i, T_RH] * r[at.HEAD + i] + e[i, T_RR] * r[at.ROD + i]
-            seen_head, seen_rod = head, rod
-        z = r[at.BRISTLE + i] * e[i, Z_LEFT]
-        e[i, HEAD_K], e[i, ROD_K], e[i, BRISTLE_K] = head, rod, z
-        force = axes[i, at.HEAD_AREA] * head - axes[i, at.ROD_AREA] * rod - e[i, F_BY_Z] * z
-        r[at.RATE + i] += g * s[LEVERS + i] * force
-        b3 += gc_1 * (e[i, HEAD_BY_1] * seen_head + e[i, ROD_BY_1] * seen_rod)
-        b4 += gc_2 * (e[i, HEAD_BY_2] * seen_head + e[i, ROD_BY_2] * seen_rod)
-    b0, b1, b2 = r[at.RATE], r[at.RATE + 1], r[at.RATE + 2]
-    b1 -= lu[1, 0] * b0
-    b2 -= lu[2, 0] * b0 + lu[2, 1] * b1
-    b3 -= lu[3, 0] * b0 + lu[3, 1] * b1 + lu[3, 2] * b2
-    b4 -= lu[4, 0] * b0 + lu[4, 1] * b1 + lu[4, 2] * b2 + lu[4, 3] * b3
-    b4 *= lu[4, 4]
-    b3 = (b3 - lu[3, 4] * b4) * lu[3, 3]
-    b2 = (b2 - lu[2, 3] * b3 - lu[2, 4] * b4) * lu[2, 2]
-    b1 = (b1 - lu[1, 2] * b2 - lu[1, 3] * b3 - lu[1, 4] * b4) * lu[1, 1]
-    b0 = (b0 - lu[0, 1] * b1 - lu[0, 2] * b2 - lu[0, 3] * b3 - lu[0, 4] * b4) * lu[0, 0]
-    out[at.RATE], out[at.RATE + 1], out[at.RATE + 2], out[at.PUMP], out[at.PUMP + 1] = b0, b1, b2, b3, b4
-    for i in range(at.AXES):
-        k = out[at.RATE + i]
-        out[at.HEAD + i] = e[i, HEAD_K] + e[i, H_BY_W] * k + e[i, H_BY_1] * b3 + e[i, H_BY_2] * b4
-        out[at.ROD + i] = e[i, ROD_K] + e[i, R_BY_W] * k + e[i, R_BY_1] * b3 + e[i, R_BY_2] * b4
-        out[at.BRISTLE + i] = e[i, BRISTLE_K] + e[i, Z_BY_W] * k
-        if long:
-            line_step.fill_lines(i, r, e, out)
-
-
-@inlined
-def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Array, ...]) -> None:
+def rosenbrock(
+    state: Array, h: float, axes: Array, plant: Array, work: tuple[Array, ...], motors: Motors | None
+) -> None:
     """ROS2 on w: (I - gJ) k1 = F(w), (I - gJ) k2 = F(w + h k1) - 2 k1, w += 1.5 h k1 + 0.5 h k2, g = gamma h."""
     s, rhs, f, k1, k2, stage = work[FROZEN_W], work[RHS], work[RATES], work[K1], work[K2], work[STAGE]
     g, long = GAMMA * h, plant[at.LINES] > 0.0
-    rates(state, axes, plant, work, True)
-    factorise(g, axes, long, work)
+    rates(state, axes, plant, work, True, motors)
+    factorise(g, axes, long, work, motors)
+    if motors is not None:
+        places.first_stage(motors)
     for n in range(at.RATE, at.DISPLACEMENT):
         rhs[n] = f[n]
     if long:
         for n in range(at.PORT_HEAD, at.STATES):
             rhs[n] = f[n]
-    solve(g, axes, long, work, k1)
+    solve(g, axes, long, work, k1, motors)
     for n in range(at.RATE, at.DISPLACEMENT):
         stage[n] = state[n] + h * k1[n]
     # Displacements have exact half steps of their own and are constant for ROS2.
@@ -295,7 +194,11 @@ def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Ar
     if long:
         for n in range(at.PORT_HEAD, at.STATES):
             stage[n] = state[n] + h * k1[n]
-    rates(stage, axes, plant, work, False)
+    if motors is not None:
+        places.to_stage(motors, h)
+    rates(stage, axes, plant, work, False, motors)
+    if motors is not None:
+        places.second_stage(motors)
     for n in range(at.HEAD, at.DISPLACEMENT):
         rhs[n] = f[n] - 2.0 * k1[n]
     # The left-hand side of these rows holds M instead of I, so 2 k1 is multiplied by M as well.
@@ -306,7 +209,9 @@ def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Ar
     if long:
         for n in range(at.PORT_HEAD, at.STATES):
             rhs[n] = f[n] - 2.0 * k1[n]
-    solve(g, axes, long, work, k2)
+    solve(g, axes, long, work, k2, motors)
+    if motors is not None:
+        places.finish(motors, h)
     for n in range(at.RATE, at.DISPLACEMENT):
         state[n] += h * (1.5 * k1[n] + 0.5 * k2[n])
     if long:
@@ -345,6 +250,8 @@ def step(
     clock: tuple[float, float, Array],
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     near_soil: bool,
+    motors: Motors | None = None,
+    fine: bool = False,
 ) -> int:
     """Advance plant and spools by one step with the spool demands held; returns the number of clamped pressures.
 
@@ -355,34 +262,49 @@ def step(
         clock: step length (s), displacement share and filters of half a step.
         setup: axes, plant, work, and the arrays of the ground.
         near_soil: whether the bucket may touch the ground within this step.
+        motors: swing and travel, where they move.
+        fine: whether the step is a fine one of theirs.
     """
     h, share, filters = clock
     axes, plant, work, ground = setup
     # Half steps before and after ROS2 in mirrored order: Strang splitting has order 2 only if it is symmetric.
     valve.pilot_half_step(demand, filters, axes, valves)
     valve.spool_half_step(filters, valves)
-    pump.displacement_step(state, valves, axes, plant, share)
+    if motors is not None:
+        places.pilot_half_step(motors, fine, axes[0, at.HYSTERESIS])
+        places.spool_half_step(motors, fine)
+        places.advance(motors, 0.5 * h)
+    pump.displacement_step(state, valves, axes, plant, share, motors)
     for i in range(at.AXES):
         state[at.PSI + i] += 0.5 * h * state[at.RATE + i]
     # Mid-step: geometry frozen at either end would lower the order to one.
     freeze_geometry(state, axes, plant, work[STROKES_W], work[FROZEN_W])
     valve.open_spools(valves, work[STROKES_W], axes, work[OPENED])
-    bypass = pump.bypass_conductances(valves, axes, plant)
+    if motors is not None:
+        places.open_sections(motors)
+        places.freeze_inertia(motors, work[FROZEN_W][ANGLES:], axes)
+    bypass = pump.bypass_conductances(valves, axes, plant, motors)
     work[FROZEN_W][BYPASS], work[FROZEN_W][BYPASS + 1] = bypass
     # Contact of the step before must not act on a bucket that has left the ground.
     work[CONTACT][terramechanics.ON] = 0.0
     if near_soil:
         terramechanics.engage(state, work[FROZEN_W][ANGLES:], axes, ground, work[CONTACT])
-    rosenbrock(state, h, axes, plant, work)
+    rosenbrock(state, h, axes, plant, work, motors)
     if near_soil:
         terrain.settle(state, h, work[CONTACT], ground)
     for i in range(at.AXES):
         state[at.PSI + i] += 0.5 * h * state[at.RATE + i]
-    pump.displacement_step(state, valves, axes, plant, share)
+    pump.displacement_step(state, valves, axes, plant, share, motors)
     valve.spool_half_step(filters, valves)
     valve.pilot_half_step(demand, filters, axes, valves)
     # Last: within a step the stages may pass below vacuum, and a clamp there would break the order.
-    return clamp_pressures(state, plant[at.LINES] > 0.0)
+    lifted = clamp_pressures(state, plant[at.LINES] > 0.0)
+    if motors is not None:
+        places.advance(motors, 0.5 * h)
+        places.spool_half_step(motors, fine)
+        places.pilot_half_step(motors, fine, axes[0, at.HYSTERESIS])
+        lifted += places.settle(motors, h)
+    return lifted
 
 
 def new_work() -> tuple[Array, ...]:

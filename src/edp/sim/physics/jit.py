@@ -72,5 +72,6 @@ class WarmUp:
 
 
 rehearsal = WarmUp("complete")
+motor_rehearsal = WarmUp("motors")
 episode_rehearsal = WarmUp("episodes")
-"""Apart, and after the first: who only simulates shall not wait for it."""
+"""Both apart, and after the first: who needs neither shall not wait for them."""

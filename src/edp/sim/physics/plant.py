@@ -13,7 +13,11 @@ from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import dynamics, engine, integrator, lines, linkage, soil, terrain, terramechanics, thermal, valve
+from edp.sim.physics import motors as places
+from edp.sim.physics.commands import shape_commands
 from edp.sim.physics.jit import compiled, inlined
+from edp.sim.physics.motor_circuit import MotorCircuit
+from edp.sim.physics.motors import Motors
 from edp.sim.sensors import logbook
 
 Array = NDArray[np.float64]
@@ -23,8 +27,6 @@ FINE = 4
 RESTING_PRESSURE = 10e5
 """Pa, of pump lines and of the less loaded chamber at the start: no chamber begins in vacuum."""
 Clock = tuple[int, float, float, Array]
-LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
-"""Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
 
 
 @compiled
@@ -52,6 +54,7 @@ def run_sample(
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     row: Array,
     held_commands: Array,
+    motors: Motors | None = None,
 ) -> int:
     """From one logged instant, whose log is `row`, to the next; returns the number of clamped pressures.
 
@@ -62,7 +65,7 @@ def run_sample(
     # Steps in a sample times their length: fine and coarse clocks give the same.
     time_s = clocks[0][0] * clocks[0][1]
     # Once a sample: the oil's temperature changes over minutes.
-    thermal.warm(row, axes, plant, time_s)
+    thermal.warm(row, axes, plant, time_s, motors)
     # Once a sample, too: governor and inertia make tens of milliseconds.
     engine.turn(row, plant, time_s)
     near, fine = False, near_end(row, axes)
@@ -77,7 +80,12 @@ def run_sample(
             # whole samples of delay, plus the part of a sample that is left, at mid-step
             when = newest + (n + 0.5) / steps - delays[j]
             held_commands[j] = demands[max(int(np.floor(when)), 0), j]
-        clamps += integrator.step(state, valves, held_commands, (step_s, share, filters), setup, near)
+        clock = (step_s, share, filters)
+        if motors is None:
+            clamps += integrator.step(state, valves, held_commands, clock, setup, near)
+        else:
+            places.hold_commands(motors, newest + (n + 0.5) / steps)
+            clamps += integrator.step(state, valves, held_commands, clock, setup, near, motors, fine)
     return clamps
 
 
@@ -90,64 +98,24 @@ def run_samples(
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     log: Array,
     held_commands: Array,
+    motors: Motors | None = None,
 ) -> int:
     """Run one sample per row of `log`; returns the number of clamped pressures.
 
     `demands` holds past demands first: its last rows belong to `log`. `times` are delays in samples, and clocks: the
     number of steps in a sample and the clock of one step, for coarse and for fine steps. `held_commands` is scratch,
-    one value per spool.
+    one value per spool. `motors` move, where given, and log into an array of their own.
     """
     first = demands.shape[0] - log.shape[0]
     axes, plant, _, ground = setup
     clamps = 0
     for k in range(log.shape[0]):
         # Logged before the steps: row k is the instant at which lever k is applied.
-        logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k])
-        clamps += run_sample(state, valves, demands, first + k, times, setup, log[k], held_commands)
+        logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k], motors)
+        if motors is not None:
+            places.write_log(motors, k, first + k)
+        clamps += run_sample(state, valves, demands, first + k, times, setup, log[k], held_commands, motors)
     return clamps
-
-
-@compiled
-def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
-    """Lever positions of one sample, shape (3,), from targets: 2nd-order low-pass of limited rate; state in `hand`."""
-    omega = 2.0 * np.pi * LEVER_BANDWIDTH_HZ
-    for i in range(at.AXES):
-        # Critically damped: an operator's hand does not ring.
-        pull = omega * omega * (target[i] - hand[i, 0]) - 2.0 * omega * hand[i, 1]
-        hand[i, 1] = min(max(hand[i, 1] + step_s * pull, -LEVER_RATE), LEVER_RATE)
-        hand[i, 0] += step_s * hand[i, 1]
-        out[i] = hand[i, 0]
-
-
-@compiled
-def shape_commands(
-    levers: Array,
-    hand: Array,
-    step_s: float,
-    past: Array,
-    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
-    demands: Array,
-    held_commands: Array,
-) -> None:
-    """Spool demands of `levers`, shape (samples, 3), behind the `past` ones into `demands`; `past` is then brought up.
-
-    A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held_commands` is
-    scratch.
-    """
-    axes, plant, _, _ = setup
-    count = past.shape[0]
-    for k in range(count):
-        for j in range(at.SPOOLS):
-            demands[k, j] = past[k, j]
-    for k in range(levers.shape[0]):
-        lever = levers[k]
-        if step_s > 0.0:
-            lever = held_commands[: at.AXES]
-            smooth_lever(levers[k], hand, step_s, lever)
-        valve.shape_demand(lever, axes, plant, demands[count + k])
-    for k in range(count):
-        for j in range(at.SPOOLS):
-            past[k, j] = demands[demands.shape[0] - count + k, j]
 
 
 def steps_per_sample(rate_hz: float, step_s: float) -> int:
@@ -176,9 +144,10 @@ class Plant:
         step_s: integration step; a whole number of them must fill a sample.
         ground: what the bucket digs in; None in free air.
         spare_s: dead time that may be added while it runs, s.
+        moves: whether swing and travel move, too; without them both stand still and take no oil.
 
     Raises:
-        ConfigError: the step does not divide the sample time.
+        ConfigError: the step does not divide the sample time, or the machine has no motors that could move.
     """
 
     def __init__(
@@ -189,6 +158,7 @@ class Plant:
         step_s: float = 1e-3,
         ground: soil.Ground | None = None,
         spare_s: float = 0.0,
+        moves: bool = False,
     ) -> None:
         steps = steps_per_sample(rate_hz, step_s)
         self.machine = machine
@@ -206,6 +176,11 @@ class Plant:
         self.delays = valve.dead_times(machine) * rate_hz
         # One sample more than the longest dead time: a delay between samples reads the older one.
         self._past = int(np.ceil(self.delays.max() + spare_s * rate_hz)) + 1
+        self.motors: MotorCircuit | None = None
+        if moves:
+            self.motors = MotorCircuit(machine, rate_hz, (0.5 * step_s, 0.5 * step_s / FINE))
+            self._past = max(self._past, int(np.ceil(self.motors.delays.max())) + 1)
+            self.motors.past = np.zeros((self._past, at.MOTORS))
         self._demands = np.zeros((self._past, at.SPOOLS))
         coarse, fine = ((n * steps, *integrator.clock_of(machine, step_s / n)) for n in (1, FINE))
         self.clocks = coarse, fine
@@ -241,13 +216,15 @@ class Plant:
         """Every array that changes as time goes on, live: what to copy, and to write back to, for an exact restart."""
         changing = (self.state, self.valves, self.hand, self._demands, self.axes, self.plant, self._counts)
         # Tables and course are read only while the plant runs.
-        return (*changing, self._ground[0], *self._ground[3:])
+        motors = () if self.motors is None else self.motors.memory
+        return (*changing, self._ground[0], *self._ground[3:], *motors)
 
     @property
     def finite(self) -> bool:
         """Whether every state is a finite number; what once is not stays so."""
         # One sum instead of a test of each value: NaN and infinity survive every addition.
-        return math.isfinite(sum(self.state.tolist()))
+        turning = 0.0 if self.motors is None else float(self.motors.state.sum())
+        return math.isfinite(sum(self.state.tolist()) + turning)
 
     @property
     def clamps(self) -> int:
@@ -258,7 +235,10 @@ class Plant:
         """Run one sample per row of lever positions, shape (samples, 3), in [-1, 1]; returns the log.
 
         The log has shape (samples, columns of `edp.sim.machine.layout`); row k is the state at the instant at which
-        lever k is applied.
+        lever k is applied. Where swing and travel move, levers may have three columns more: swing, left, right track.
+
+        Raises:
+            ConfigError: levers of another shape.
         """
         return self._advance(levers, 0.0)
 
@@ -303,18 +283,36 @@ class Plant:
         """Run with levers that the hand smooths at steps of `hand_s`; 0 for levers as they are."""
         setup = (self.axes, self.plant, self.work, self._ground)
         demands = np.empty((len(levers) + self._past, at.SPOOLS))
-        levers = np.ascontiguousarray(levers, dtype=float)
-        shape_commands(levers, self.hand, hand_s, self._demands, setup, demands, self._held)
-        return self._moved(demands)
+        levers = np.asarray(levers, dtype=float)
+        widths = (at.AXES,) if self.motors is None else (at.AXES, at.AXES + at.MOTORS)
+        if levers.ndim != 2 or levers.shape[1] not in widths:
+            raise ConfigError(
+                f"levers of shape {levers.shape}; give (samples, {' or '.join(map(str, widths))}): boom, arm, bucket"
+                + ("" if self.motors is None else ", and swing, left and right track")
+            )
+        front = np.ascontiguousarray(levers[:, : at.AXES])
+        shape_commands(front, self.hand, hand_s, self._demands, setup, demands, self._held)
+        if self.motors is None:
+            return self._moved(demands)
+        others = np.zeros((len(levers), at.MOTORS))
+        others[:, : levers.shape[1] - at.AXES] = levers[:, at.AXES :]
+        return self._moved(demands, self.motors.demands_of(others, hand_s))
 
-    def _moved(self, demands: Array) -> Array:
-        """Run along demands, behind the past ones."""
+    def _moved(self, demands: Array, motor_demands: Array | None = None) -> Array:
+        """Run along demands, behind the past ones; swing and travel without any stand still."""
         setup = (self.axes, self.plant, self.work, self._ground)
         samples = len(demands) - self._past
         log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
         times = (self.delays, self.clocks)
-        self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
-        return log
+        if self.motors is None:
+            self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
+            return log
+        if motor_demands is None:
+            motor_demands = self.motors.demands_of(np.zeros((samples, at.MOTORS)), 0.0)
+        turned = np.empty((samples, at.MOTOR_COLUMNS))
+        motors = self.motors.arrays(motor_demands, turned)
+        self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held, motors)
+        return np.hstack((log, turned))
 
 
 def resting_state(strokes: Array, axes: Array, plant: Array) -> Array:

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.physics import lines
+from edp.sim.physics import motors as places
 from edp.sim.physics.jit import inlined
+from edp.sim.physics.motors import Motors
 
 Array = NDArray[np.float64]
 DROOP = 0.3
@@ -30,28 +32,44 @@ DROOP = 0.3
 @inlined
 def pump_of(spool: int, axes: Array) -> float:
     """Number of the pump that feeds a spool: the first ones are those of the axes, then come those of conflux."""
-    return axes[spool, at.PRIMARY_PUMP] if spool < at.AXES else axes[spool - at.AXES, at.CONFLUX_PUMP]
+    pump: float = axes[spool, at.PRIMARY_PUMP] if spool < at.AXES else axes[spool - at.AXES, at.CONFLUX_PUMP]
+    return pump
 
 
 @inlined
-def demand(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
+def wish(gain: float, pilot: float) -> float:
+    """Displacement that a pilot asks for, as a share of full."""
+    # Demand begins at 10 % of the pilot, below usual dead bands of the spools (12 to 14 %), and is full at 85 %.
+    return min(gain * max(abs(pilot) - 0.1, 0.0) * (1.0 / 0.75), 1.0)
+
+
+@inlined
+def demand(valves: Array, axes: Array, plant: Array, motors: Motors | None = None) -> tuple[float, float]:
     """Displacement asked for by the pilots, as a share of full, for both pumps."""
     first = second = plant[at.MIN_DISPLACEMENT]
     for j in range(at.SPOOLS):
         i = j % at.AXES
         pilot = valves[j, at.PILOT]
         gain = axes[i, at.DEMAND_EXTEND] if pilot >= 0.0 else axes[i, at.DEMAND_RETRACT]
-        # Demand begins at 10 % of the pilot, below usual dead bands of the spools (12 to 14 %), and is full at 85 %.
-        asked = min(gain * max(abs(pilot) - 0.1, 0.0) * (1.0 / 0.75), 1.0)
+        asked = wish(gain, pilot)
         if pump_of(j, axes) == 0.0:
             first = max(first, asked)
         else:
             second = max(second, asked)
+    if motors is not None:
+        for i in range(at.MOTORS):
+            asked = wish(motors[places.NUMBERS][i, at.MOTOR_DEMAND], motors[places.VALVES][i, at.PILOT])
+            if motors[places.NUMBERS][i, at.MOTOR_PUMP] == 0.0:
+                first = max(first, asked)
+            else:
+                second = max(second, asked)
     return first, second
 
 
 @inlined
-def sensed_loads(state: Array, valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
+def sensed_loads(
+    state: Array, valves: Array, axes: Array, plant: Array, motors: Motors | None = None
+) -> tuple[float, float]:
     """Highest pressure (Pa) of the chambers that either pump's spools are open to; that of the tank if none is."""
     first = second = plant[at.TANK]
     port = lines.at_valve(plant)
@@ -70,16 +88,20 @@ def sensed_loads(state: Array, valves: Array, axes: Array, plant: Array) -> tupl
             first = max(first, load)
         else:
             second = max(second, load)
+    if motors is not None:
+        places.open_sections(motors)
+        first = max(first, places.highest_load(0, motors[places.STATE], motors))
+        second = max(second, places.highest_load(1, motors[places.STATE], motors))
     return first, second
 
 
 @inlined
-def asked(state: Array, valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
+def asked(state: Array, valves: Array, axes: Array, plant: Array, motors: Motors | None = None) -> tuple[float, float]:
     """Displacement asked for, as a share of full, for both pumps: by the pilots or by the loads."""
     margin, least = plant[at.LOAD_MARGIN], plant[at.MIN_DISPLACEMENT]
     if margin <= 0.0:
-        return demand(valves, axes, plant)
-    first, second = sensed_loads(state, valves, axes, plant)
+        return demand(valves, axes, plant, motors)
+    first, second = sensed_loads(state, valves, axes, plant, motors)
     per_band = 1.0 / (DROOP * margin)
     first = (min(first + margin, plant[at.PUMP_RELIEF]) - state[at.PUMP]) * per_band
     second = (min(second + margin, plant[at.PUMP_RELIEF]) - state[at.PUMP + 1]) * per_band
@@ -87,9 +109,11 @@ def asked(state: Array, valves: Array, axes: Array, plant: Array) -> tuple[float
 
 
 @inlined
-def displacement_step(state: Array, valves: Array, axes: Array, plant: Array, share: float) -> None:
+def displacement_step(
+    state: Array, valves: Array, axes: Array, plant: Array, share: float, motors: Motors | None = None
+) -> None:
     """Move both displacements towards demand under the power limit; `share` = exp(-step / time constant)."""
-    first, second = asked(state, valves, axes, plant)
+    first, second = asked(state, valves, axes, plant, motors)
     # A line below tank pressure takes no power from the other pump's share.
     power = plant[at.MAX_FLOW] * (first * max(state[at.PUMP], 0.0) + second * max(state[at.PUMP + 1], 0.0))
     # At least 1 W: idle pumps do not divide by zero.
@@ -100,7 +124,7 @@ def displacement_step(state: Array, valves: Array, axes: Array, plant: Array, sh
 
 
 @inlined
-def bypass_conductances(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
+def bypass_conductances(valves: Array, axes: Array, plant: Array, motors: Motors | None = None) -> tuple[float, float]:
     """Open centre of both pumps: closes as any spool of a pump moves, product of (1 - |s| / s_closed)^2.
 
     With load sensing it is a bleed orifice that stays.
@@ -115,6 +139,13 @@ def bypass_conductances(valves: Array, axes: Array, plant: Array) -> tuple[float
             first *= left * left
         else:
             second *= left * left
+    if motors is not None:
+        for i in range(at.MOTORS):
+            left = max(1.0 - abs(motors[places.VALVES][i, at.SPOOL]) * per_closed, 0.0)
+            if motors[places.NUMBERS][i, at.MOTOR_PUMP] == 0.0:
+                first *= left * left
+            else:
+                second *= left * left
     return first, second
 
 

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
+from edp.sim.physics import motors as places
 from edp.sim.physics.jit import compiled
+from edp.sim.physics.motors import Motors
 
 Array = NDArray[np.float64]
 
@@ -24,13 +26,14 @@ def set_temperature(celsius: float, plant: Array) -> None:
 
 
 @compiled
-def losses(row: Array, axes: Array, plant: Array) -> float:
-    """Hydraulic power (W) that stays in the oil: what the pumps' shafts give less what the pistons take.
+def losses(row: Array, axes: Array, plant: Array, motors: Motors | None = None) -> float:
+    """Hydraulic power (W) that stays in the oil: what the pumps' shafts give less what pistons and motors take.
 
     Args:
         row: one logged sample.
         axes: parameters of the cylinders.
         plant: parameters of the plant.
+        motors: swing and travel at the same instant, where they move.
     """
     power = 0.0
     for m in range(2):
@@ -39,12 +42,14 @@ def losses(row: Array, axes: Array, plant: Array) -> float:
     for i in range(at.AXES):
         force = axes[i, at.HEAD_AREA] * row[at.HEAD + i] - axes[i, at.ROD_AREA] * row[at.ROD + i]
         power -= force * row[at.LOG_VELOCITY + i]
+    if motors is not None:
+        power -= places.power(motors)
     return power
 
 
 @compiled
-def warm(row: Array, axes: Array, plant: Array, time_s: float) -> None:
+def warm(row: Array, axes: Array, plant: Array, time_s: float, motors: Motors | None = None) -> None:
     """Heat and cool the oil over `time_s`, and let its properties follow."""
     celsius = plant[at.OIL_TEMPERATURE]
-    heat = losses(row, axes, plant) - plant[at.COOLING] * (celsius - plant[at.AMBIENT])
+    heat = losses(row, axes, plant, motors) - plant[at.COOLING] * (celsius - plant[at.AMBIENT])
     set_temperature(celsius + heat * time_s / plant[at.HEAT_CAPACITY], plant)

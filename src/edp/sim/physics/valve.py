@@ -75,13 +75,19 @@ def dead_times(machine: Machine) -> Array:
 
 
 @inlined
+def relax(valves: Array, j: int, column: int, target: float, filters: Array, stage: int) -> None:
+    """Move a value of spool `j`, its rate behind it, towards its target; `stage` 0 is the pilot, 1 the spool."""
+    error, rate = valves[j, column] - target, valves[j, column + 1]
+    valves[j, column] = target + filters[j, stage, 0] * error + filters[j, stage, 1] * rate
+    valves[j, column + 1] = filters[j, stage, 2] * error + filters[j, stage, 3] * rate
+
+
+@inlined
 def pilot_half_step(demand: Array, filters: Array, axes: Array, valves: Array) -> None:
     """Advance the pilots by half a step, then move the play operator's output."""
     for j in range(at.SPOOLS):
-        error, rate = valves[j, at.PILOT] - demand[j], valves[j, at.PILOT_RATE]
-        pilot = demand[j] + filters[j, 0, 0] * error + filters[j, 0, 1] * rate
-        valves[j, at.PILOT] = pilot
-        valves[j, at.PILOT_RATE] = filters[j, 0, 2] * error + filters[j, 0, 3] * rate
+        relax(valves, j, at.PILOT, demand[j], filters, 0)
+        pilot = valves[j, at.PILOT]
         hysteresis = axes[j, at.HYSTERESIS] if j < at.AXES else axes[j - at.AXES, at.CONFLUX_HYSTERESIS]
         valves[j, at.PLAY] = max(pilot - hysteresis, min(pilot + hysteresis, valves[j, at.PLAY]))
 
@@ -90,10 +96,7 @@ def pilot_half_step(demand: Array, filters: Array, axes: Array, valves: Array) -
 def spool_half_step(filters: Array, valves: Array) -> None:
     """Advance the spools by half a step towards the play operator's output."""
     for j in range(at.SPOOLS):
-        play = valves[j, at.PLAY]
-        error, rate = valves[j, at.SPOOL] - play, valves[j, at.SPOOL_RATE]
-        valves[j, at.SPOOL] = play + filters[j, 1, 0] * error + filters[j, 1, 1] * rate
-        valves[j, at.SPOOL_RATE] = filters[j, 1, 2] * error + filters[j, 1, 3] * rate
+        relax(valves, j, at.SPOOL, valves[j, at.PLAY], filters, 1)
 
 
 @inlined

@@ -9,13 +9,23 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.physics import lines, linkage, pump
+from edp.sim.physics import motors as places
 from edp.sim.physics.jit import compiled
+from edp.sim.physics.motors import Motors
 
 Array = NDArray[np.float64]
 
 
 @compiled
-def write_events(state: Array, valves: Array, axes: Array, plant: Array, memory: Array, row: Array) -> None:
+def write_events(
+    state: Array,
+    valves: Array,
+    axes: Array,
+    plant: Array,
+    memory: Array,
+    row: Array,
+    motors: Motors | None = None,
+) -> None:
     """Flags 0 or 1: relief, cavitation, regeneration, power limit, soil contact."""
     relief = cavitation = regeneration = limited = 0.0
     port = lines.at_valve(plant)
@@ -32,7 +42,9 @@ def write_events(state: Array, valves: Array, axes: Array, plant: Array, memory:
     for m in range(2):
         if state[at.PUMP + m] > plant[at.PUMP_RELIEF]:
             relief = 1.0
-    first, second = pump.asked(state, valves, axes, plant)
+    if motors is not None and places.relieved(motors):
+        relief = 1.0
+    first, second = pump.asked(state, valves, axes, plant, motors)
     # Demand, not displacement: the limit acts where more power is asked for than there is.
     power = plant[at.MAX_FLOW] * (first * state[at.PUMP] + second * state[at.PUMP + 1])
     if power > plant[at.POWER_LIMIT]:
@@ -59,7 +71,14 @@ def write_tip(state: Array, axes: Array, row: Array) -> None:
 
 @compiled
 def write_log(
-    state: Array, valves: Array, demand: Array, axes: Array, plant: Array, ground: tuple[Array, ...], row: Array
+    state: Array,
+    valves: Array,
+    demand: Array,
+    axes: Array,
+    plant: Array,
+    ground: tuple[Array, ...],
+    row: Array,
+    motors: Motors | None = None,
 ) -> None:
     """One sample: plant state, demands, strokes (m from closed), velocities (m/s), then what else is true."""
     heights, memory = ground[3], ground[4]
@@ -79,7 +98,7 @@ def write_log(
     row[at.LOG_FORCE], row[at.LOG_FORCE + 1] = memory[at.FORCE_X], memory[at.FORCE_Y]
     row[at.LOG_PAYLOAD] = memory[at.PAYLOAD]
     row[at.LOG_OIL] = plant[at.OIL_TEMPERATURE]
-    write_events(state, valves, axes, plant, memory, row)
+    write_events(state, valves, axes, plant, memory, row, motors)
     for k in range(row.shape[0] - at.LOG_GROUND):
         point = (k * (heights.shape[0] - 1)) // (at.GROUND_POINTS - 1)
         row[at.LOG_GROUND + k] = heights[point] - memory[at.MEMORY + point]

@@ -67,7 +67,10 @@ def shown_signals(
 
 
 def truth_columns(width: int) -> dict[str, int]:
-    """Columns of a log with so many by the names of `EXTRA_CHANNELS` and, in soil, of `GROUND_CHANNELS`."""
+    """Columns of a log with so many by the names of `EXTRA_CHANNELS`.
+
+    Behind them those of `GROUND_CHANNELS` in soil, then of `MOTOR_CHANNELS` where swing and travel move.
+    """
     columns: dict[str, int] = {}
     for m in range(2):
         columns[f"PumpPressure_{m + 1}"] = at.PUMP + m
@@ -82,13 +85,29 @@ def truth_columns(width: int) -> dict[str, int]:
     events = ("Relief", "Cavitation", "Regeneration", "PowerLimit", "SoilContact")
     for n, name in enumerate((*one_each, *(f"Event_{event}" for event in events))):
         columns[name] = at.LOG_TIP + n
-    for k in range(width - at.LOG_GROUND):
+    points = at.GROUND_POINTS if width - at.LOG_GROUND >= at.GROUND_POINTS else 0
+    for k in range(points):
         columns[f"Ground_{k:02d}"] = at.LOG_GROUND + k
+    if width > at.LOG_GROUND + points:
+        columns |= _motor_columns(at.LOG_GROUND + points)
     return columns
 
 
+def _motor_columns(first: int) -> dict[str, int]:
+    columns = {"SwingAngle": at.LOG_SWING, "SwingVel": at.LOG_MOTOR_SPEED}
+    for i, part in enumerate(("Swing{}", "Track{}_1", "Track{}_2")):
+        columns[part.format("Demand")] = at.LOG_MOTOR_DEMAND + i
+        columns[part.format("Spool")] = at.LOG_MOTOR_SPOOL + i
+    for port, column in enumerate((at.LOG_MOTOR_A, at.LOG_MOTOR_B), start=1):
+        columns[f"SwingPressure_{port}"] = column
+        for n in range(2):
+            columns[f"TrackPressure_{2 * n + port}"] = column + 1 + n
+    columns |= {f"TrackVel_{n}": at.LOG_MOTOR_SPEED + n for n in (1, 2)}
+    return {name: first + column for name, column in columns.items()}
+
+
 def truth_signals(log: Array) -> dict[str, Array]:
-    """Noise-free further signals by the names of `EXTRA_CHANNELS` and, in soil, of `GROUND_CHANNELS`."""
+    """Noise-free further signals by the names of `truth_columns`."""
     signals = {name: log[:, column] for name, column in truth_columns(log.shape[1]).items()}
     signals[OIL] = signals[OIL] + KELVIN
     return signals

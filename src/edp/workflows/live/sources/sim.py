@@ -53,6 +53,8 @@ class SimSource(LiveSource):
         material = chosen.get("material") or ""
         if self._kind.works_ground and not material:
             raise ConfigError(f"--excitation {name} works the ground, of which there is none here; choose another one")
+        if self._kind.swings:
+            raise ConfigError(f"--excitation {name} swings and travels, which nothing here does; choose another one")
         self._env = ExcavatorEnv(
             EnvironmentSpec(
                 machine=machine,

@@ -1,0 +1,33 @@
+"""Three levers of the front, swing and travel at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edp.sim.excitation.base import EXCITATIONS, MOTORS, Array, AxisStream
+from edp.sim.excitation.combined import Combined
+from edp.sim.machine.machine import Machine
+from edp.sim.view import View
+
+
+class MotorStream(AxisStream):
+    """A lever of swing or travel: held longer than those of the front, since more mass moves."""
+
+    HOLD_S = (0.6, 3.0)
+
+
+@EXCITATIONS.register("six_levers")
+class SixLevers(Combined):
+    """Six independent levers: `combined`, and beside it swing, left and right track."""
+
+    swings = True
+    MID_STROKE = 0.5
+    """Swing and tracks have no ends that they would lean away from."""
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
+        super().__init__(rng, rate_hz, machine)
+        self._streams += [MotorStream(rng, rate_hz) for _ in range(MOTORS)]
+
+    def block(self, view: View) -> Array:
+        """Levers up to the next change of any of them."""
+        return self.until_a_change([*view.strokes, *[self.MID_STROKE] * MOTORS])

@@ -1,0 +1,81 @@
+"""From lever targets to demands of the spools: the operator's hand, then what the machine makes of its levers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.physics import motors as places
+from edp.sim.physics import valve
+from edp.sim.physics.jit import compiled
+
+Array = NDArray[np.float64]
+LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
+"""Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
+
+
+@compiled
+def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
+    """Lever positions of one sample, shape (3,), from targets: 2nd-order low-pass of limited rate; state in `hand`."""
+    omega = 2.0 * np.pi * LEVER_BANDWIDTH_HZ
+    for i in range(at.AXES):
+        # Critically damped: an operator's hand does not ring.
+        pull = omega * omega * (target[i] - hand[i, 0]) - 2.0 * omega * hand[i, 1]
+        hand[i, 1] = min(max(hand[i, 1] + step_s * pull, -LEVER_RATE), LEVER_RATE)
+        hand[i, 0] += step_s * hand[i, 1]
+        out[i] = hand[i, 0]
+
+
+@compiled
+def shape_commands(
+    levers: Array,
+    hand: Array,
+    step_s: float,
+    past: Array,
+    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
+    demands: Array,
+    held_commands: Array,
+) -> None:
+    """Spool demands of `levers`, shape (samples, 3), behind the `past` ones into `demands`; `past` is then brought up.
+
+    A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held_commands` is
+    scratch.
+    """
+    axes, plant, _, _ = setup
+    count = past.shape[0]
+    for k in range(count):
+        for j in range(at.SPOOLS):
+            demands[k, j] = past[k, j]
+    for k in range(levers.shape[0]):
+        lever = levers[k]
+        if step_s > 0.0:
+            lever = held_commands[: at.AXES]
+            smooth_lever(levers[k], hand, step_s, lever)
+        valve.shape_demand(lever, axes, plant, demands[count + k])
+    for k in range(count):
+        for j in range(at.SPOOLS):
+            past[k, j] = demands[demands.shape[0] - count + k, j]
+
+
+@compiled
+def shape_motor_commands(
+    levers: Array, hand: Array, step_s: float, past: Array, zone: float, demands: Array, shaped: Array
+) -> None:
+    """Demands of the motors of `levers`, shape (samples, 3), behind the past ones; as `shape_commands` for cylinders.
+
+    `zone` is the dead zone of the levers, `shaped` scratch of shape (3,).
+    """
+    count = past.shape[0]
+    for k in range(count):
+        for i in range(at.MOTORS):
+            demands[k, i] = past[k, i]
+    for k in range(levers.shape[0]):
+        lever = levers[k]
+        if step_s > 0.0:
+            lever = shaped[: at.MOTORS]
+            smooth_lever(levers[k], hand, step_s, lever)
+        places.shape_demand(lever, zone, demands[count + k])
+    for k in range(count):
+        for i in range(at.MOTORS):
+            past[k, i] = demands[demands.shape[0] - count + k, i]
