@@ -11,6 +11,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
+from edp.errors import ConfigError
 
 if TYPE_CHECKING:
     from edp.evaluation.footprint import Footprint
@@ -53,6 +54,8 @@ def distil(
     from edp.workflows.compression import DISTIL_SETTINGS, DistilRequest, DistilSpec
     from edp.workflows.compression import distil as make
 
+    if units is None and config is None and not any(change.startswith("distil") for change in changes):
+        raise ConfigError("the width of the student is missing; give it with --units, such as --units 64")
     layers: list[Change] = [*changes] if units is None else [*changes, {"distil": {"units": units}}]
     spec, others = command_settings("distil", DistilSpec, config, layers, TRAINING_TABLES, DISTIL_SETTINGS)
     request = DistilRequest(

@@ -252,3 +252,9 @@ def test_parity_holds_every_form_against_pytorch(edp, trained, logs):
     assert {row["verdict"] for row in found["rows"]} <= {"same", "not run"}
     shown = edp("parity", trained, "--form", "torch_ticks", "--data", logs, "--ticks", 60).out
     assert "60 ticks against PyTorch" in shown
+
+
+def test_distil_says_how_to_give_the_width_of_the_student(edp, tmp_path):
+    refused = edp("distil", tmp_path, "--out", tmp_path / "small")
+    assert refused.code == 1
+    assert "the width of the student is missing; give it with --units, such as --units 64" in refused.err

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from edp.errors import StorageError
-from edp.workflows.fleet.registry import ENTRIES, find_entry, lineage, list_registry, read_entry
+from edp.workflows.fleet.registry import ENTRIES, _data_of, find_entry, lineage, list_registry, read_entry
 
 GOOD, OTHER = "a" * 32, "b" * 32
 ENTRY = {
@@ -63,3 +63,12 @@ def test_a_circle_of_bases_ends(registry):
     write(registry, OTHER, id=OTHER, name="other", base=GOOD)
     steps = lineage(registry, find_entry(registry, "net"))
     assert [step if isinstance(step, str) else step.id for step in steps] == [OTHER, GOOD]
+
+
+def test_a_recording_that_is_divided_by_time_is_counted_once():
+    parts = {
+        "train": {"recordings": 2, "hours": 0.5, "names": ["a[0:60]", "b[0:60]"]},
+        "test": {"recordings": 2, "hours": 0.25, "names": ["a[70:100]", "b[70:100]"]},
+    }
+    assert _data_of({"data": parts})["recordings"] == 2
+    assert _data_of({"data": {part: {**held, "names": []} for part, held in parts.items()}})["recordings"] == 4

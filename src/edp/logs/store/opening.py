@@ -97,7 +97,10 @@ def _status(folder: Path, file: RowsFile) -> os.stat_result:
     try:
         status = path.lstat()
     except OSError as error:
-        raise DataError(f"'{path}', a file of the store, cannot be read: {error.strerror or error}") from error
+        raise DataError(
+            f"'{path}', a file of the store, cannot be read: {error.strerror or error}; copy the store again, or give "
+            "the same `edp store build` again, which reads its logs anew"
+        ) from error
     if path.is_symlink() or not path.is_file():
         raise DataError(f"'{path}' must be a regular file of the store; it is a link, a folder or a device")
     return status

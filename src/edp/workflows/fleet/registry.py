@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ ENTRIES, FILES, LOCK = "entries", "files", ".lock"
 SCHEMA = 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 IDENTIFIER = re.compile(r"[0-9a-f]{32}")
+PART = re.compile(r"\[\d+:\d+\]$")
+"""Ticks of a recording behind its name, where a part holds some of it."""
 SCORES = "scores.json"
 NETWORK, FLEET_KIND = "network", "fleet"
 
@@ -192,9 +194,16 @@ def _data_of(provenance: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "source": str(data.get("source", "")),
         "digest": str(data.get("digest", "")),
-        "recordings": sum(int(part.get("recordings", 0)) for part in parts),
+        "recordings": _recordings(parts),
         "hours": round(sum(float(part.get("hours", 0.0)) for part in parts), 4),
     }
+
+
+def _recordings(parts: Sequence[Mapping[str, Any]]) -> int:
+    """How many recordings are divided into these parts; one that is cut by time is in all of them."""
+    listed = [part["names"] for part in parts if isinstance(part.get("names"), list)]
+    names = [PART.sub("", str(name)) for own in listed for name in own]
+    return len(set(names)) or sum(int(part.get("recordings", 0)) for part in parts)
 
 
 def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
