@@ -133,7 +133,8 @@ def predictive(
     """Figures of part nmpc, or with a twin of its `own` of part grey, and its verdicts."""
     twin = own or models.twin()
     # On unjudged lines a plan of 0.6 s was better with the network, and no better with the grey box.
-    spec = CONTROLLERS["nmpc"]() if own else CONTROLLERS["nmpc"](blocks=nmpc_of.PLAN)
+    options = {"attitude_m": nmpc_of.ATTITUDE_M} if own else {"blocks": nmpc_of.PLAN}
+    spec = CONTROLLERS["nmpc"](**options)
     ahead = models_of.ahead_errors(models, twin, spec.load if own else 0.0)
     rows = nmpc_of.loops(models, size, seed, spec, own)
     times = nmpc_of.solve_times(twin, spec, min(2, size.lines))
@@ -149,8 +150,9 @@ def predictive(
 def grey_other(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
     """C14: predictive control on a grey box of minutes of its logs."""
     name, run = nmpc_of.OTHER_NAME, models.other_grey(models.size.other[0], _grey_fit(quick))
+    spec = CONTROLLERS["nmpc"](attitude_m=nmpc_of.ATTITUDE_M)
     named = (name, nmpc_of.variants(models.folder)[name])
-    rows = {name: nmpc_of.on_variant(models.folder, named, size, seed, CONTROLLERS["nmpc"](), run)}
+    rows = {name: nmpc_of.on_variant(models.folder, named, size, seed, spec, run)}
     return {"loops": rows, "size": asdict(size)}, nmpc_of.loop_verdicts(rows, quick)
 
 

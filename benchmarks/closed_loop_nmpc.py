@@ -35,7 +35,9 @@ DRAWS = (0, 100, 200)
 """First seeds of three draws of lines, each with noise of its own; tunings use seeds from 1,000,000 on."""
 LEAST_MM = 1e-3
 PLAN = (2, 3, 4, 8, 14, 29)
-"""Blocks of the judged plan, 0.6 s in place of the 0.4 s of the default: better on unjudged lines, slower."""
+"""Blocks of the judged plan on a network, 0.6 s, 0.4 s by default: better on unjudged lines, slower."""
+ATTITUDE_M = 2.0
+"""Weight of the attitude on a grey box, 1 m by default: on unjudged lines less error of the attitude, the same path."""
 
 
 @dataclass(frozen=True)
