@@ -43,9 +43,9 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
         channels: of the twin.
         inputs: commands ``(tick, command)``, SI units.
     """
-    found: dict[str, dict[str, float]] = {}
+    beyond: dict[str, dict[str, float]] = {}
     if not isinstance(ranges, Mapping) or not inputs:
-        return found
+        return beyond
     values = np.concatenate([np.asarray(rows, dtype=np.float64) for rows in inputs])
     for column, channel in enumerate(channels.commands):
         ends = _ends(ranges.get(channel.name))
@@ -55,10 +55,10 @@ def commands_beyond(ranges: Any, channels: TwinChannels, inputs: Sequence[NDArra
         margin, own = MARGIN * (high - low), values[:, column]
         share = float(((own < low - margin) | (own > high + margin)).mean())
         if share > 0.0:
-            found[channel.name] = {
+            beyond[channel.name] = {
                 "share": share, "low": low, "high": high, "least": float(own.min()), "largest": float(own.max()),
             }  # fmt: skip
-    return found
+    return beyond
 
 
 def _ends(value: Any) -> tuple[float, float] | None:
@@ -70,13 +70,13 @@ def _ends(value: Any) -> tuple[float, float] | None:
     return float(value[0]), float(value[1])
 
 
-def beyond_sentence(found: Mapping[str, Mapping[str, float]]) -> str:
+def beyond_sentence(beyond: Mapping[str, Mapping[str, float]]) -> str:
     """What a person must know before they trust errors and intervals there; empty where nothing is beyond."""
-    if not found:
+    if not beyond:
         return ""
     listed = ", ".join(
         f"{name} ({row['share']:.2g} of the ticks, {row['least']:.3g} to {row['largest']:.3g}; learned from "
         f"{row['low']:.3g} to {row['high']:.3g})"
-        for name, row in sorted(found.items(), key=lambda pair: -pair[1]["share"])
+        for name, row in sorted(beyond.items(), key=lambda pair: -pair[1]["share"])
     )
     return f"commands beyond all that taught the twin: {listed}; intervals promise nothing there"
