@@ -272,10 +272,21 @@ def test_a_plan_that_ends_before_the_machine_has_answered_is_refused(env, models
             check(known, 3, 2)
 
 
+def test_the_attitude_counts_more_with_a_twin_that_is_told_of_forces(env, models, valves):
+    plant, grey = interface_of(env), ControlModels(valves, sample_grey_box().twin)
+
+    def weight(known, **options):
+        return CONTROLLERS["nmpc"](**options).build(plant, LoopLimits(), known).spec.attitude_m
+
+    assert (weight(models), weight(grey)) == (1.0, 2.0)
+    assert weight(models, attitude_m=0.0) == weight(grey, attitude_m=0.0) == 0.0
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
         ({"blocks": ()}, "blocks"),
+        ({"attitude_m": -1.0}, "attitude_m"),
         ({"blocks": (0, 3)}, "blocks"),
         ({"blocks": (1,) * 31}, "blocks"),
         ({"change": 0.0}, "change"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,6 +29,7 @@ from edp.control.nmpc.tip import TipTable
 from edp.control.plant import STROKES, PlantInterface
 from edp.control.reference import TipReference
 from edp.errors import ConfigError
+from edp.networks.twin import Twin
 from edp.settings.bounds import above, check_bounds, check_count, integer, span
 
 Array = NDArray[np.float64]
@@ -43,6 +44,9 @@ SOFT = 8
 """DAQP's mark of a constraint that may be violated at a price."""
 LEAST_ANSWER, GOOD_ANSWER = 0.1, 0.5
 """Shares of a speed that must be there where a plan ends, and that better are: short of them it sees no effect."""
+ATTITUDE_M, LOADED_ATTITUDE_M = 1.0, 2.0
+"""Of most twins, and of those that are told of forces: on lines that were not judged 2 held the attitude in loam better
+on grey boxes of M22 and C14, and made both errors of a poor network larger (docs/findings.md)."""
 FAST_TIP_M_S = 0.02
 """Reference speed above which a tip error has a direction along the path and one across."""
 
@@ -55,7 +59,8 @@ class PredictiveControl:
     Attributes:
         blocks: ticks of the blocks of the horizon.
         along: weight of the tip error along the path, beside 1 across it.
-        attitude_m: length of arm (m) by which an error of the attitude in rad counts like one of the tip.
+        attitude_m: length of arm (m) by which an error of the attitude in rad counts like one of the tip; None: 2 with
+            a twin that is told of forces against the cylinders, as a grey box is, else 1 (`attitude_with`).
         change: weight of changes of the asked speeds, from block to block and from tick to tick.
         feedforward: weight of the asked speeds' distance from those of the reference: where the model says that a
             speed has no effect, as into an end stop, the plan goes there.
@@ -76,7 +81,7 @@ class PredictiveControl:
 
     blocks: tuple[int, ...] = (2, 3, 4, 6, 10, 15)
     along: float = 0.5
-    attitude_m: float = 1.0
+    attitude_m: float | None = None
     change: float = 0.2
     feedforward: float = 0.01
     trust_m_s: float = 0.1
@@ -92,7 +97,6 @@ class PredictiveControl:
             self,
             blocks=integer(1, MOST_BLOCK_TICKS),
             along=above(0.0, 1e3),
-            attitude_m=span(0.0, 1e3),
             change=above(0.0, 1e6),
             feedforward=span(0.0, 1e6),
             trust_m_s=above(0.0, 100.0),
@@ -100,6 +104,14 @@ class PredictiveControl:
             smoothing=span(0.0, 1.0),
             load=span(0.0, 1.0),
         )
+        if self.attitude_m is not None:
+            check_bounds("controller 'nmpc'", self, attitude_m=span(0.0, 1e3))
+
+    def attitude_with(self, twin: Twin) -> float:
+        """`attitude_m` with this twin."""
+        if self.attitude_m is not None:
+            return self.attitude_m
+        return LOADED_ATTITUDE_M if twin.runner().resistance is not None else ATTITUDE_M
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
         """The controller, with the twin and the valve map of the plant.
@@ -108,10 +120,12 @@ class PredictiveControl:
             ConfigError: one of them is missing or does not fit, or DAQP is not installed.
         """
         window = max(1, round(self.window_s * plant.rate_hz))
-        model = TwinModel(models.needed_twin("nmpc"), plant, window, self.smoothing, self.load)
+        twin = models.needed_twin("nmpc")
+        model = TwinModel(twin, plant, window, self.smoothing, self.load)
         valves = models.needed_map("nmpc")
         fallback = PiController(ProportionalIntegral(), plant, limits, valves) if self.fallback else None
-        return NmpcController(self, limits, model, SpeedToLever(valves, limits), fallback)
+        spec = replace(self, attitude_m=self.attitude_with(twin))
+        return NmpcController(spec, limits, model, SpeedToLever(valves, limits), fallback)
 
 
 class NmpcController(Controller):
@@ -333,6 +347,8 @@ def _directions(reference: TipReference, spec: PredictiveControl) -> Array:
     rows[:, 0, 0] = rows[:, 1, 1] = 1.0
     rows[moving, 0, 0], rows[moving, 0, 1] = -unit[moving, 1], unit[moving, 0]
     rows[moving, 1, :2] = np.sqrt(spec.along) * unit[moving]
+    if spec.attitude_m is None:
+        raise AssertionError("build() gives a plan its length of arm")
     rows[:, 2, 2] = spec.attitude_m
     return rows
 

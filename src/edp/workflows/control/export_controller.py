@@ -138,7 +138,7 @@ def _plan(
     names, most = reads
     channels = twin.twin.channels
     answers = [channel.name for channel in channels.answers]
-    inverse = SpeedToLever(valves, limits)
+    inverse, attitude_m = SpeedToLever(valves, limits), spec.attitude_with(twin.twin)
     plan = PlanParts(
         plant=plant_bundle(twin),
         blocks=spec.blocks,
@@ -153,7 +153,7 @@ def _plan(
         fastest=inverse.fastest,
         step_m_s=STEP_M_S,
         window=max(1, round(spec.window_s * plant.rate_hz)),
-        weights=(spec.along, spec.attitude_m, spec.change, spec.feedforward, spec.trust_m_s, spec.smoothing),
+        weights=(spec.along, attitude_m, spec.change, spec.feedforward, spec.trust_m_s, spec.smoothing),
         margin=limits.stroke_margin,
         pressure_pa=limits.pressure_pa,
         fallback=spec.fallback,
