@@ -363,12 +363,8 @@ def _scores(
     data, settings = logs
     twin, judge = fitted.twin, settings.judge
     runs = MeasuredRuns.of(twin, data.test, judge.seconds, judge.starts)
-    front = FrontChannels.of(
-        twin,
-        fitted.elements,
-        (*parts.primary, *parts.conflux),
-        full_commands(twin.channels, fitted.elements, machines[0]),
-    )
+    full = full_commands(twin.channels, fitted.elements, machines[0])
+    front = FrontChannels.of(twin, fitted.elements, (*parts.primary, *parts.conflux), full)
     floor: TwinSpec = replace(TWINS["static"](), prefix_ticks=twin.prefix_ticks)
     static = floor.start(twin.channels, twin.scales, data.train, settings.training.seed)
     answers = {
