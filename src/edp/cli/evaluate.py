@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -55,13 +56,7 @@ def evaluate(
     if minutes is not None and not workforce.alone:
         raise ConfigError("--minutes bounds what one process does; leave it out with --workers and --cluster")
     if holds_twin(run):
-        if not workforce.alone:
-            raise ConfigError(f"'{run}' holds a twin, which one process judges; leave --workers and --cluster out")
-        if baselines is not None or channel_importance or minutes is not None:
-            raise ConfigError(
-                f"'{run}' holds a twin, which has no --baselines, --minutes or --channel-importance; leave them out: "
-                "its floors are those of its settings, judge.floors"
-            )
+        refuse_for_a_twin(run, workforce.alone, baselines is None and not channel_importance and minutes is None)
         evaluate_twin_run(run, source, predictor, as_json)
         return
     if predictor is not None:
@@ -80,18 +75,10 @@ def evaluate(
     importances = run_importance(run, source, as_json) if channel_importance else None
 
     def show() -> None:
-        if beaten is not None:
-            out.print(beaten.sentence(), style="bold red")
-        if lost:
-            out.print(lost, style="bold red")
-        score_table(scores)
-        by_situation_table(scores)
-        for line in (promise, beyond, judged):
-            if line:
-                out.print(line)
-        if scores.get("left_out"):
-            left = ", ".join(map(str, scores["left_out"]))
-            out.print(f"left out after --minutes {minutes:g}: {left}; give the command without it to judge them, too")
+        for sentence in ("" if beaten is None else beaten.sentence(), lost):
+            if sentence:
+                out.print(sentence, style="bold red")
+        show_scores(scores, (promise, beyond, judged), minutes)
         out.print(f"scores in {folder / 'scores.json'}")
         if importances is not None:
             importance_table(importances)
@@ -104,6 +91,38 @@ def evaluate(
     emit(as_json, facts | importance_json, show)
     if beaten is not None:
         raise typer.Exit(BEATEN)
+
+
+def refuse_for_a_twin(run: Path, alone: bool, plain: bool) -> None:
+    """Refuse what a twin's evaluation does not have: more than one process, and options of networks' evaluations.
+
+    Args:
+        run: folder of the twin.
+        alone: whether one process works.
+        plain: whether none of these options is given.
+
+    Raises:
+        ConfigError: one of both is not so.
+    """
+    if not alone:
+        raise ConfigError(f"'{run}' holds a twin, which one process judges; leave --workers and --cluster out")
+    if not plain:
+        raise ConfigError(
+            f"'{run}' holds a twin, which has no --baselines, --minutes or --channel-importance; leave them out: "
+            "its floors are those of its settings, judge.floors"
+        )
+
+
+def show_scores(scores: Mapping[str, Any], sentences: Sequence[str], minutes: float | None) -> None:
+    """Print the tables of an evaluation, what is to be said of it, and what the time was too short for."""
+    score_table(scores)
+    by_situation_table(scores)
+    for sentence in sentences:
+        if sentence:
+            out.print(sentence)
+    if scores.get("left_out"):
+        left = ", ".join(map(str, scores["left_out"]))
+        out.print(f"left out after --minutes {minutes:g}: {left}; give the command without it to judge them, too")
 
 
 def baseline_names(text: str) -> list[str]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import WorkersOption
+
+if TYPE_CHECKING:
+    from edp.workflows.monitor import FittedMonitor
 
 # Scripts can tell alarms by the exit code.
 ALARMS = 5
@@ -94,15 +97,7 @@ def fit(
     }
 
     def show() -> None:
-        for name in fitted.doubtful:
-            out.print(f"'{name}' was left out: it lies far from all other healthy sessions; look into it")
-        out.print(f"{len(monitor.residual_names)} residuals of {len(monitor.channels)} channels are watched")
-        out.print(monitor.limit.sentence())
-        if fitted.one_machine:
-            out.print(
-                "its balances of flow know this machine's valves to 1 %: it belongs to this one machine and raises "
-                "alarms on others of its series; for those, fit with --set chain.tolerance=0.01, which finds less"
-            )
+        show_fitted(fitted)
         spent = f"{duration(fitted.seconds)} of processor time"
         if workers != 1:
             spent = f"{duration(facts['wall_s'])} by {facts['workers']} processes"
@@ -110,6 +105,20 @@ def fit(
         out.print(f"next: edp monitor run {folder} LOGS")
 
     emit(as_json, facts, show)
+
+
+def show_fitted(fitted: FittedMonitor) -> None:
+    """Print what a monitor watches, what it promises, and for which machines."""
+    monitor = fitted.monitor
+    for name in fitted.doubtful:
+        out.print(f"'{name}' was left out: it lies far from all other healthy sessions; look into it")
+    out.print(f"{len(monitor.residual_names)} residuals of {len(monitor.channels)} channels are watched")
+    out.print(monitor.limit.sentence())
+    if fitted.one_machine:
+        out.print(
+            "its balances of flow know this machine's valves to 1 %: it belongs to this one machine and raises "
+            "alarms on others of its series; for those, fit with --set chain.tolerance=0.01, which finds less"
+        )
 
 
 @app.command("run")

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from edp.training.free_run import FreeRunProgress
+    from edp.workflows.twin import TrainedTwin
 
 
 def twin(
@@ -44,10 +45,8 @@ def twin(
     Example: `edp twin data/m22 --out runs/twin`
     """
     from edp.config.twin import load_twin_experiment, with_budget
-    from edp.evaluation.beyond import beyond_sentence
     from edp.evaluation.guard import twin_beaten_by
     from edp.report.twin.candidates import choice_sentence, read_candidates
-    from edp.report.twin.ground import ground_line
     from edp.workflows.twin import train_twin
 
     experiment = load_twin_experiment(config, changes)
@@ -69,25 +68,34 @@ def twin(
     def show() -> None:
         if beaten is not None:
             out.print(beaten.sentence(), style="bold red")
-        if trained.bundle.ground is not None:
-            out.print(ground_line(trained.bundle.provenance))
         if candidates:
             candidate_table(candidates)
             out.print(f"chosen: {choice_sentence(candidates)}")
-        if note := beyond_sentence(trained.scores.get("twin", {}).get("beyond", {})):
-            out.print(note, style="bold")
-        score_table(trained.scores)
+        show_trained(trained)
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
         if (folder / "datasheet.txt").is_file():
             out.print(f"numbers of the machine with units and intervals in {folder / 'datasheet.txt'}")
-        network = trained.bundle.provenance.get("residual")
-        if network and not network["helps"]:
-            out.print("the network does not help on the validation part: this twin is its grey box alone")
         out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
 
     emit(as_json, facts, show)
     if beaten is not None:
         raise typer.Exit(BEATEN)
+
+
+def show_trained(trained: TrainedTwin) -> None:
+    """Print what a trained twin has learned of ground and network, and how far its free runs are off."""
+    from edp.evaluation.beyond import beyond_sentence
+    from edp.report.twin.ground import ground_line
+
+    provenance = trained.bundle.provenance
+    if trained.bundle.ground is not None:
+        out.print(ground_line(provenance))
+    if note := beyond_sentence(trained.scores.get("twin", {}).get("beyond", {})):
+        out.print(note, style="bold")
+    score_table(trained.scores)
+    network = provenance.get("residual")
+    if network and not network["helps"]:
+        out.print("the network does not help on the validation part: this twin is its grey box alone")
 
 
 def rollout(

@@ -20,7 +20,7 @@ class PlantProposal:
     """What of the logs a plant model would read and answer with.
 
     Attributes:
-        parts: channels that `edp twin` must be assignments, by part; a part that it finds by itself is not among them.
+        parts: channels to name to `edp twin`, by part; a part that it finds by itself is not among them.
         why_not: a sentence: why the logs cannot train one, and what to record or to name; empty where they can.
     """
 

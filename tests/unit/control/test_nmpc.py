@@ -153,7 +153,7 @@ def test_the_compiled_normal_equations_are_those_of_the_weighted_tip_errors(env,
         tips, jacobians = TipTable(plant.geometry).poses(strokes[0])
         error = tips - reference.tip[rows]
         error[:, 2] = (error[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        weights = module._directions(reference, controller.spec)[rows]
+        weights = module._directions(reference, controller.spec.along, controller.attitude_m)[rows]
         slopes = (strokes[1:] - strokes[0]) / steps[:, None, None]
         derivatives = np.einsum("tij,tjk,vtk->tiv", weights, jacobians, slopes).reshape(-1, 6)
         weighted = np.einsum("tij,tj->ti", weights, error).ravel()
@@ -276,7 +276,7 @@ def test_the_attitude_counts_more_with_a_twin_that_is_told_of_forces(env, models
     plant, grey = interface_of(env), ControlModels(valves, sample_grey_box().twin)
 
     def weight(known, **options):
-        return CONTROLLERS["nmpc"](**options).build(plant, LoopLimits(), known).spec.attitude_m
+        return CONTROLLERS["nmpc"](**options).build(plant, LoopLimits(), known).attitude_m
 
     assert (weight(models), weight(grey)) == (1.0, 2.0)
     assert weight(models, attitude_m=0.0) == weight(grey, attitude_m=0.0) == 0.0

@@ -53,12 +53,26 @@ def test_each_log_is_a_cycle_by_default():
     logs = [log(seed).rows(0, TICKS + seed) for seed in range(3)]
     source = CyclesSpec().fit(material(*logs))
     assert len(source.template) == TICKS
+    # What is longer than its cycle is not compared with the begin of another one.
+    kept = Cycles.of_parts(source.parts())
+    rows = log(5).rows(0, TICKS + 3).select(source.inputs)[None]
+    begin, state = kept.run(rows[:, :30], kept.initial_state(1))
+    end, _ = kept.run(rows[:, 30:], state)
+    assert np.isfinite(begin).all()
+    assert np.isfinite(end[:, : TICKS - 30]).all()
+    assert np.isnan(end[:, TICKS - 30 :]).all()
+
+
+@pytest.mark.parametrize("period_s", [0.01, 4.05])
+def test_a_cycle_that_is_no_whole_number_of_ticks_is_refused(period_s):
+    with pytest.raises(DataError, match=r"ticks of 10 Hz; a whole number"):
+        CyclesSpec(period_s=period_s).fit(material(log(0), log(1)))
 
 
 def test_too_few_cycles_and_too_long_ones_are_refused():
     with pytest.raises(DataError, match=r"0 cycles of 60 s .* 3 at least must hold"):
         CyclesSpec(period_s=60.0).fit(material(log(0)))
-    with pytest.raises(DataError, match=r"1000000 ticks|at most 1000000"):
+    with pytest.raises(DataError, match=r"1 to 1000000 must hold"):
         CyclesSpec(period_s=1e6).fit(material(log(0)))
 
 
@@ -72,6 +86,8 @@ def test_parts_of_a_file_that_cannot_be_are_refused(source):
     ):
         with pytest.raises(ValueError, match=why):
             Cycles.of_parts(SourceParts(parts.plain, parts.arrays | {name: values}))
+    with pytest.raises(ValueError, match="repeats"):
+        Cycles.of_parts(SourceParts({**parts.plain, "repeats": 1}, parts.arrays))
     none = {"template": np.zeros((0, 2)), "width": np.zeros((0, 2))}
     with pytest.raises(ValueError, match="0 ticks"):
         Cycles.of_parts(SourceParts(parts.plain, parts.arrays | none))

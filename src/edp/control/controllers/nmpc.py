@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -120,16 +120,18 @@ class PredictiveControl:
             ConfigError: one of them is missing or does not fit, or DAQP is not installed.
         """
         window = max(1, round(self.window_s * plant.rate_hz))
-        twin = models.needed_twin("nmpc")
-        model = TwinModel(twin, plant, window, self.smoothing, self.load)
+        model = TwinModel(models.needed_twin("nmpc"), plant, window, self.smoothing, self.load)
         valves = models.needed_map("nmpc")
         fallback = PiController(ProportionalIntegral(), plant, limits, valves) if self.fallback else None
-        spec = replace(self, attitude_m=self.attitude_with(twin))
-        return NmpcController(spec, limits, model, SpeedToLever(valves, limits), fallback)
+        return NmpcController(self, limits, model, SpeedToLever(valves, limits), fallback)
 
 
 class NmpcController(Controller):
-    """See `PredictiveControl`."""
+    """See `PredictiveControl`.
+
+    Attributes:
+        attitude_m: length of arm by which the attitude counts with this twin, m.
+    """
 
     def __init__(
         self,
@@ -142,6 +144,7 @@ class NmpcController(Controller):
         # Ports of the twin that nothing measures run free, so that the plan goes on without any one channel.
         super().__init__(model.plant, limits, model.reads, spared=model.reads)
         self.spec, self.model, self._valves, self._fallback = spec, model, valves, fallback
+        self.attitude_m = spec.attitude_with(model.twin)
         self._daqp = _daqp()
         self._moves, self._table = Moves(spec.blocks), TipTable(model.plant.geometry)
         self._stroke_columns = np.array([self.reads.index(name) for name in STROKES])
@@ -190,7 +193,7 @@ class NmpcController(Controller):
         self.model.begin(measured)
         # Behind its last row a reference stays, for as long as a horizon.
         rows = reference.rows(0, reference.ticks + self._moves.ticks)
-        self._directions = np.ascontiguousarray(_directions(reference, self.spec)[rows])
+        self._directions = np.ascontiguousarray(_directions(reference, self.spec.along, self.attitude_m)[rows])
         self._tips = np.ascontiguousarray(reference.tip[rows])
         self._ahead = _speeds_ahead(reference, self._moves)
         self._speeds[:], self._latest[:], self._row, self._tick = 0.0, 0.0, None, -1
@@ -337,7 +340,7 @@ def _speeds_ahead(reference: TipReference, moves: Moves) -> Array:
     return np.asarray(moved * reference.rate_hz / (ends - begins)[..., None]).reshape(len(now), moves.count)
 
 
-def _directions(reference: TipReference, spec: PredictiveControl) -> Array:
+def _directions(reference: TipReference, along: float, attitude_m: float) -> Array:
     """Rows that turn tip errors (x, y, attitude) to weighted ones across and along the path, shape (ticks, 3, 3)."""
     velocity = np.gradient(reference.tip[:, :2], 1.0 / reference.rate_hz, axis=0)
     speed = np.hypot(*velocity.T)
@@ -346,10 +349,8 @@ def _directions(reference: TipReference, spec: PredictiveControl) -> Array:
     rows = np.zeros((reference.ticks, 3, 3))
     rows[:, 0, 0] = rows[:, 1, 1] = 1.0
     rows[moving, 0, 0], rows[moving, 0, 1] = -unit[moving, 1], unit[moving, 0]
-    rows[moving, 1, :2] = np.sqrt(spec.along) * unit[moving]
-    if spec.attitude_m is None:
-        raise AssertionError("build() gives a plan its length of arm")
-    rows[:, 2, 2] = spec.attitude_m
+    rows[moving, 1, :2] = np.sqrt(along) * unit[moving]
+    rows[:, 2, 2] = attitude_m
     return rows
 
 

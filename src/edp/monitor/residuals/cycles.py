@@ -33,6 +33,8 @@ LEAST_CYCLES = 3
 """Fewer tell no scatter."""
 MOST_TICKS = 1_000_000
 """Of a cycle."""
+UNEVEN = 0.01
+"""Of a tick by which a cycle may miss a whole number of them: after a hundred cycles it is late by one."""
 NARROWEST = 1e-3
 """Least scatter at a place of the cycle, over how widely the channel varies in all."""
 
@@ -40,16 +42,19 @@ NARROWEST = 1e-3
 class Cycles(ResidualSource):
     """Measured less the mean of healthy cycles at the same tick of the cycle, over the scatter of those there.
 
-    A stream begins at the start of a cycle, and each cycle follows the one before without a gap.
+    A stream begins at the start of a cycle. Where cycles repeat, each follows the one before without a gap; else the
+    stream is one cycle, and what comes behind it is not judged.
 
     Args:
         inputs: channels, SI units.
         template: mean of healthy cycles, shape (ticks, inputs).
         width: their scatter, above zero, shape (ticks, inputs).
         middle: mean of each input on healthy sessions.
+        repeats: whether a cycle follows the one before.
     """
 
-    def __init__(self, inputs: Sequence[str], template: Rows, width: Rows, middle: Rows) -> None:
+    def __init__(self, inputs: Sequence[str], template: Rows, width: Rows, middle: Rows, repeats: bool = True) -> None:
+        self.repeats = repeats
         self.inputs, self.middle = tuple(inputs), np.asarray(middle, np.float32)
         self.template, self.width = np.asarray(template, np.float32), np.asarray(width, np.float32)
         self.names = tuple(PREFIX + name for name in self.inputs)
@@ -60,19 +65,27 @@ class Cycles(ResidualSource):
         return 0
 
     def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
-        at = (own + np.arange(rows.shape[1])) % len(self.template)
+        ticks = len(self.template)
+        tick_index = own + np.arange(rows.shape[1])
+        at = tick_index % ticks
         residuals = (rows - self.template[at]) / self.width[at]
-        return residuals, (own + rows.shape[1]) % len(self.template)
+        if not self.repeats:
+            residuals[:, tick_index >= ticks] = np.nan
+        after = own + rows.shape[1]
+        return residuals, after % ticks if self.repeats else min(after, ticks)
 
     def parts(self) -> SourceParts:
         """See `ResidualSource.parts`."""
         arrays = {"template": self.template, "width": self.width, "middle": self.middle}
-        return SourceParts({"inputs": list(self.inputs)}, arrays)
+        return SourceParts({"inputs": list(self.inputs), "repeats": self.repeats}, arrays)
 
     @classmethod
     def of_parts(cls, parts: SourceParts) -> Cycles:
         """See `ResidualSource.of_parts`."""
         inputs, middle = middle_of(parts)
+        repeats = parts.plain["repeats"]
+        if type(repeats) is not bool:
+            raise ValueError("it does not say whether its cycle repeats")
         template, width = (np.asarray(parts.arrays[name], np.float32) for name in ("template", "width"))
         if template.ndim != 2 or template.shape != width.shape or template.shape[1] != len(inputs):
             raise ValueError("arrays of a cycle have other shapes than its header says")
@@ -80,7 +93,7 @@ class Cycles(ResidualSource):
             raise ValueError(f"a cycle has {len(template)} ticks; 1 to {MOST_TICKS} must hold")
         if not (np.isfinite(template).all() and np.isfinite(width).all() and (width > 0.0).all()):
             raise ValueError("a number of a cycle is not finite, or a width is not above zero")
-        return cls(inputs, template, width, middle)
+        return cls(inputs, template, width, middle, repeats)
 
 
 @RESIDUALS.register("cycles")
@@ -89,8 +102,8 @@ class CyclesSpec(ResidualSpec):
     """Each channel at its place in a cycle that the machine repeats.
 
     Attributes:
-        period_s: of a cycle, s; logs begin with one, and hold one after the other. 0: each log is one cycle, as long as
-            the shortest one.
+        period_s: of a cycle, s, a whole number of ticks; logs begin with one, and hold one after the other. 0: each log
+            is one cycle, as long as the shortest one; what comes behind that is not judged.
 
     Raises:
         ConfigError: a value is out of its bounds.
@@ -106,7 +119,7 @@ class CyclesSpec(ResidualSpec):
         """See `ResidualSpec.fit`.
 
         Raises:
-            DataError: too few cycles, or one that is too long.
+            DataError: too few cycles, or one that is too long or no whole number of ticks.
         """
         material.note("cycles")
         constant = constant_channels(material)
@@ -119,14 +132,18 @@ class CyclesSpec(ResidualSpec):
         pooled = np.sqrt(np.square(scatter).mean(axis=0))
         least = NARROWEST * cycles.std(axis=(0, 1))
         width = np.maximum(np.sqrt(0.5 * (np.square(scatter) + np.square(pooled))), least)
-        return Cycles(inputs, template, width, mean_inputs(material, inputs))
+        return Cycles(inputs, template, width, mean_inputs(material, inputs), bool(self.period_s))
 
     def _cycles(self, material: FitMaterial, inputs: Sequence[str]) -> Array:
         """All whole cycles of the healthy logs, shape (cycles, ticks, inputs)."""
         logs = (*material.train, *material.validation)
-        ticks = round(self.period_s * material.rate_hz) or min(log.samples for log in logs)
-        if ticks > MOST_TICKS:
-            raise DataError(f"cycles: period_s = {self.period_s:g} is {ticks} ticks; at most {MOST_TICKS} must hold")
+        exact = self.period_s * material.rate_hz if self.period_s else float(min(log.samples for log in logs))
+        ticks = round(exact)
+        if not 1 <= ticks <= MOST_TICKS or abs(exact - ticks) > UNEVEN:
+            raise DataError(
+                f"cycles: period_s = {self.period_s:g} is {exact:.9g} ticks of {material.rate_hz:g} Hz; a whole number "
+                f"of 1 to {MOST_TICKS} must hold, since each cycle begins at a tick"
+            )
         whole = [log.samples // ticks if self.period_s else 1 for log in logs]
         if sum(whole) < LEAST_CYCLES:
             raise DataError(

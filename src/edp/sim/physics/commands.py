@@ -28,6 +28,23 @@ def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
 
 
 @compiled
+def put_first(past: Array, demands: Array) -> None:
+    """Past demands into the first rows of `demands`."""
+    for k in range(past.shape[0]):
+        for j in range(past.shape[1]):
+            demands[k, j] = past[k, j]
+
+
+@compiled
+def keep_last(demands: Array, past: Array) -> None:
+    """The last rows of `demands`, which are the past of the next ones."""
+    first = demands.shape[0] - past.shape[0]
+    for k in range(past.shape[0]):
+        for j in range(past.shape[1]):
+            past[k, j] = demands[first + k, j]
+
+
+@compiled
 def shape_commands(
     levers: Array,
     hand: Array,
@@ -43,19 +60,14 @@ def shape_commands(
     scratch.
     """
     axes, plant, _, _ = setup
-    count = past.shape[0]
-    for k in range(count):
-        for j in range(at.SPOOLS):
-            demands[k, j] = past[k, j]
+    put_first(past, demands)
     for k in range(levers.shape[0]):
         lever = levers[k]
         if step_s > 0.0:
             lever = held_commands[: at.AXES]
             smooth_lever(levers[k], hand, step_s, lever)
-        valve.shape_demand(lever, axes, plant, demands[count + k])
-    for k in range(count):
-        for j in range(at.SPOOLS):
-            past[k, j] = demands[demands.shape[0] - count + k, j]
+        valve.shape_demand(lever, axes, plant, demands[past.shape[0] + k])
+    keep_last(demands, past)
 
 
 @compiled
@@ -66,16 +78,11 @@ def shape_motor_commands(
 
     `zone` is the dead zone of the levers, `shaped` scratch of shape (3,).
     """
-    count = past.shape[0]
-    for k in range(count):
-        for i in range(at.MOTORS):
-            demands[k, i] = past[k, i]
+    put_first(past, demands)
     for k in range(levers.shape[0]):
         lever = levers[k]
         if step_s > 0.0:
             lever = shaped[: at.MOTORS]
             smooth_lever(levers[k], hand, step_s, lever)
-        places.shape_demand(lever, zone, demands[count + k])
-    for k in range(count):
-        for i in range(at.MOTORS):
-            past[k, i] = demands[demands.shape[0] - count + k, i]
+        places.shape_demand(lever, zone, demands[past.shape[0] + k])
+    keep_last(demands, past)

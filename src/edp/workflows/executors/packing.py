@@ -6,6 +6,7 @@ make nothing else.
 
 from __future__ import annotations
 
+import functools
 import json
 import types
 import typing
@@ -24,8 +25,6 @@ from edp.errors import DataError
 T = TypeVar("T")
 TREE, KIND, VALUE = "tree", "of", "is"
 MOST_DEPTH = 40
-_classes: dict[type, Mapping[str, type]] = {}
-"""What `classes_in` found."""
 
 
 def packed(value: Any) -> bytes:
@@ -107,10 +106,10 @@ def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str,
     return classes[kind](**{name: _together(part, tensors, classes, depth + 1) for name, part in value.items()})
 
 
+# Asked for with every unit of work, and the same in each.
+@functools.cache
 def classes_in(kind: type) -> Mapping[str, type]:
-    """A dataclass and all that the types of its fields name, by name; asked for once a unit, found once a process."""
-    if kind in _classes:
-        return _classes[kind]
+    """A dataclass and all that the types of its fields name, by name."""
     classes: dict[str, type] = {}
     waiting: list[Any] = [kind]
     while waiting:
@@ -120,4 +119,4 @@ def classes_in(kind: type) -> Mapping[str, type]:
             waiting += list(typing.get_type_hints(one).values())
         elif isinstance(one, types.UnionType) or typing.get_origin(one) is not None:
             waiting += list(typing.get_args(one))
-    return _classes.setdefault(kind, types.MappingProxyType(classes))
+    return types.MappingProxyType(classes)
