@@ -128,7 +128,7 @@ class FreeRuns:
             ends = slice(len(self.channels.velocities), 2 * len(self.channels.velocities))
             return (self.high - self.low)[ends].astype(np.float64)
         fastest = self.high[: len(self.channels.velocities)].astype(np.float64)
-        return np.maximum(np.ptp(self._integral(self.truth), axis=(0, 1)), fastest * AT_FULL_SPEED_S)
+        return np.asarray(np.maximum(np.ptp(self._integral(self.truth), axis=(0, 1)), fastest * AT_FULL_SPEED_S))
 
     def diverged(self) -> NDArray[np.bool_]:
         """Runs that left the machine ``(run,)``: a stroke off by more than `ASTRAY` of its range, or no number."""
