@@ -86,7 +86,22 @@ _ERRORS = frozenset(["error", "err", "deviation", "abweichung", "regelabweichung
 _COUNTERS = frozenset(
     ("cycle", "zyklus", "index", "idx", "sample", "row", "zeile", "nr", "no", "number", "count", "counter")
 )
-_TIMES = frozenset("time zeit t timestamp zeitstempel uhrzeit tout sec seconds second sekunde elapsed".split())
+_TIMES = frozenset(
+    [
+        "time",
+        "zeit",
+        "t",
+        "timestamp",
+        "zeitstempel",
+        "uhrzeit",
+        "tout",
+        "sec",
+        "seconds",
+        "second",
+        "sekunde",
+        "elapsed",
+    ]
+)
 _SAMPLE_TIMES = frozenset(
     ("ts", "dt", "sampletime", "sample_time", "samplingtime", "tastzeit", "abtastzeit", "t_s", "dt_s", "dt_ms", "dt_us")
 )
