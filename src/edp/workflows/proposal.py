@@ -185,8 +185,8 @@ def _recordings(
     columns = map_table(proposal.signal_map)
     named = zip(group.paths, experiments.entries, experiments.names())
     return [
-        (place, {"path": listed_path(path), "name": name, "map": {"variable": variable} | columns})
-        for place, (path, variable), name in named
+        (pseudo_path, {"path": listed_path(path), "name": name, "map": {"variable": variable} | columns})
+        for pseudo_path, (path, variable), name in named
     ]
 
 

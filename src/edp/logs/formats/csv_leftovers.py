@@ -89,18 +89,18 @@ def _end_of_table(path: Path, size: int, mark: bytes, skip: int, width: int) -> 
         start = stream.seek(max(size - _TAIL_BYTES, 0))
         tail = stream.read()
     lines = tail.splitlines(keepends=True)[0 if start == 0 else 1 :]
-    last = max((place for place, line in enumerate(lines) if line.strip()), default=0)
+    last = max((index for index, line in enumerate(lines) if line.strip()), default=0)
     cut = len(lines)
     if lines and _CONTROL.search(lines[last]):
         # Power went while this line was written.
         cut = last
     # Words right below the first line are no end of a table but a text that is none.
     first = skip + _LEAST_ROWS if start == 0 else 0
-    for place in range(max(len(lines) - MOST_LAST_LINES, first), cut):
-        cells = [cell for cell in lines[place].split(mark) if cell.strip()]
+    for index in range(max(len(lines) - MOST_LAST_LINES, first), cut):
+        cells = [cell for cell in lines[index].split(mark) if cell.strip()]
         words = cells and not any(_NUMBER.fullmatch(cell) for cell in cells)
-        if words and len(lines[place].split(mark)) < width:
-            cut = place
+        if words and len(lines[index].split(mark)) < width:
+            cut = index
             break
     return size - sum(map(len, lines[cut:]))
 

@@ -219,7 +219,7 @@ def _of_own_pace(path: Path, part: Path, note: str, signal_map: SignalMap) -> Lo
     except DataError:
         return None
     signals = [s for s in timed.signals.values() if s.time_s is not None and s.samples > 2]
-    told = tuple(timed.meta.get(EXPERIMENTS, ()))
+    experiments = tuple(timed.meta.get(EXPERIMENTS, ()))
     if timed.rate_hz is not None or len({s.samples for s in signals}) < 2:
         return None
     texts = tuple(s.name for s in signals if not _is_numeric(s))
@@ -251,7 +251,9 @@ def _of_own_pace(path: Path, part: Path, note: str, signal_map: SignalMap) -> Lo
         "come after the first columns": len(alike) - len(numbers),
     }
     counted = {reason: count for reason, count in left_out.items() if count > 0}
-    return LogLook(path, tuple(columns), texts, len(stamps), None, signal_map.time, step, False, counted, note, told)
+    return LogLook(
+        path, tuple(columns), texts, len(stamps), None, signal_map.time, step, False, counted, note, experiments
+    )
 
 
 def _clocks_of(signals: Sequence[RawSignal]) -> dict[str, Clock]:

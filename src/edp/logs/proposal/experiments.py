@@ -60,15 +60,15 @@ def part_experiments(group: LogGroup) -> Experiments | None:
             f"'{group.looks[0].path}' and its like hold {len(entries):,} experiments; at most {MOST_EXPERIMENTS:,} "
             "become recordings: give fewer files"
         )
-    looks = [replace(look_at_log(path, name), path=_place(path, name)) for path, name in some_of(entries)]
+    looks = [replace(look_at_log(path, name), path=_pseudo_path(path, name)) for path, name in some_of(entries)]
     alike = [look for look in looks if fits(looks[0], frozenset(look.names))]
     others = {look.path for look in looks if look not in alike}
-    taken = tuple(entry for entry in entries if _place(*entry) not in others)
+    alike_entries = tuple(entry for entry in entries if _pseudo_path(*entry) not in others)
     ordered = tuple(sorted(alike, key=lambda look: -look.rows))
-    group = LogGroup(ordered, tuple(_place(*entry) for entry in taken))
-    return Experiments(group, taken, tuple(path.name for path in others))
+    group = LogGroup(ordered, tuple(_pseudo_path(*entry) for entry in alike_entries))
+    return Experiments(group, alike_entries, tuple(path.name for path in others))
 
 
-def _place(path: Path, name: str) -> Path:
+def _pseudo_path(path: Path, name: str) -> Path:
     """A path that stands for an experiment: no file has it."""
     return path.with_name(f"{path.name} {name.replace('/', '_')}")

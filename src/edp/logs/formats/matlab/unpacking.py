@@ -41,9 +41,9 @@ def unpack(path: Path, variable: str | None = None) -> MatVariables:
     info = variables.pop(INFO, None)
     names = list(variables)
     if variable is not None:
-        one = None if variable in variables else pick_experiment(variables, variable)
-        names += [] if one is None else [variable]
-        variables = one or {name: value for name, value in variables.items() if name == variable}
+        picked = None if variable in variables else pick_experiment(variables, variable)
+        names += [] if picked is None else [variable]
+        variables = picked or {name: value for name, value in variables.items() if name == variable}
     mat_variables = collect(variables)
     mat_variables.names = names
     mat_variables.experiment_names = experiment_names(variables)
