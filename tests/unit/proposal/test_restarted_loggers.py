@@ -142,3 +142,52 @@ def test_small_steps_back_are_sorted_and_restarts_are_cut(tmp_path):
     assert propose(save(tmp_path / "a.csv", [NAMES, *table])).repairs == ("falling=sort",)
     with pytest.raises(Exception, match="falling = 'cute' is not one of refuse, sort, cut"):
         Repair(falling="cute")
+
+
+def excavator(rows_count: int = 3000) -> dict[str, np.ndarray]:
+    """Columns as loggers of excavators name them: stamps of messages, flags, rows numbered, the step between rows."""
+    rng = np.random.default_rng(3)
+    lever = np.repeat(rng.choice([0.0, -0.5, 1.0], rows_count // 60 + 1), 60)[:rows_count]
+    speed = np.convolve(lever, np.full(30, 1 / 30))[:rows_count]
+    stamps = np.cumsum(0.02 + 1e-3 * rng.standard_normal(rows_count))
+    stale = (rng.random(rows_count) < 0.02).astype(float)
+    return {
+        "sample_index": np.arange(rows_count),
+        "elapsed_s": stamps,
+        "dt_s": np.append(0.02, np.diff(stamps)),
+        "boom_cmd": lever,
+        "boom_gyro_dps": 20 * speed + 0.1 * rng.standard_normal(rows_count),
+        "pressure_ts": stamps[np.arange(rows_count) // 5 * 5],
+        "pressure_stale": stale,
+    }
+
+
+def test_stamps_of_messages_flags_and_steps_between_rows_are_no_channels(tmp_path):
+    columns = excavator()
+    table = [",".join(f"{value:.6f}" for value in row) for row in np.stack(list(columns.values()), axis=1)]
+    proposal = propose(save(tmp_path / "a.csv", [",".join(columns), *table]))
+    assert proposal.proposal.clock.column == "elapsed_s"
+    assert proposal.proposal.clock.rate_hz == pytest.approx(50, rel=0.02)
+    roles = {guess.column: guess.role for guess in proposal.proposal.columns}
+    assert {roles["pressure_ts"], roles["dt_s"]} == {"time"}
+    assert (roles["pressure_stale"], roles["boom_cmd"]) == ("label", "command")
+    assert proposal.targets == ("boom_gyro_dps",)
+    units = {guess.column: guess.kind.unit for guess in proposal.proposal.columns}
+    assert units["boom_gyro_dps"] == "deg/s"
+
+
+def test_rows_numbered_by_name_are_no_clock_where_the_next_column_is_one(tmp_path):
+    columns = excavator()
+    columns["clock"] = columns.pop("elapsed_s")
+    ordered = {name: columns[name] for name in ("sample_index", "clock", "boom_cmd", "boom_gyro_dps")}
+    table = [",".join(f"{value:.6f}" for value in row) for row in np.stack(list(ordered.values()), axis=1)]
+    assert propose(save(tmp_path / "a.csv", [",".join(ordered), *table])).proposal.clock.column == "clock"
+
+
+@pytest.mark.parametrize("name", ["supply_ts", "valid", "online"])
+def test_such_names_are_not_believed_of_columns_that_move_otherwise(tmp_path, name):
+    columns = excavator()
+    columns[name] = 5 + columns["boom_gyro_dps"] ** 2 + np.random.default_rng(0).standard_normal(3000)
+    table = [",".join(f"{value:.6f}" for value in row) for row in np.stack(list(columns.values()), axis=1)]
+    proposal = propose(save(tmp_path / "a.csv", [",".join(columns), *table]))
+    assert {guess.column: guess.role for guess in proposal.proposal.columns}[name] == "measured"

@@ -14,6 +14,8 @@ _TAIL_BYTES = 1 << 16
 """End of a file in which its last lines are looked for."""
 MOST_LAST_LINES = 10
 """Lines that may stand behind the table."""
+_LEAST_ROWS = 2
+"""Rows that a table has at least where lines stand behind it."""
 _ONE_BYTE_LINE_ENDS = ("utf-8", "utf-8-sig", "latin-1", "cp1252", "ascii")
 """Encodings in which a line ends with the byte that ends it in ASCII."""
 MARK = "\x1c"
@@ -57,7 +59,7 @@ def leftovers_of(path: Path, encoding: str, delimiter: str, skip: int, width: in
     if encoding not in _ONE_BYTE_LINE_ENDS:
         return Leftovers(frozenset(), None, size, None)
     mark = delimiter.encode()
-    end = _end_of_table(path, size, mark, width)
+    end = _end_of_table(path, size, mark, skip, width)
     names: set[bytes] = set()
     first = end_line = None
     number = position = 0
@@ -81,22 +83,24 @@ def _is_names(line: bytes, mark: bytes, width: int) -> bool:
     return len(cells) == width and not any(_NUMBER.fullmatch(cell) for cell in cells)
 
 
-def _end_of_table(path: Path, size: int, mark: bytes, width: int) -> int:
+def _end_of_table(path: Path, size: int, mark: bytes, skip: int, width: int) -> int:
     """Bytes before the last lines: from one of words in too few cells on, or a last one with control characters."""
     with path.open("rb") as stream:
         start = stream.seek(max(size - _TAIL_BYTES, 0))
         tail = stream.read()
     lines = tail.splitlines(keepends=True)[0 if start == 0 else 1 :]
-    last = max((place for place, line in enumerate(lines) if line.strip()), default=0)
+    last = max((index for index, line in enumerate(lines) if line.strip()), default=0)
     cut = len(lines)
     if lines and _CONTROL.search(lines[last]):
         # Power went while this line was written.
         cut = last
-    for place in range(max(len(lines) - MOST_LAST_LINES, 1), cut):
-        cells = [cell for cell in lines[place].split(mark) if cell.strip()]
+    # Words right below the first line are no end of a table but a text that is none.
+    first = skip + _LEAST_ROWS if start == 0 else 0
+    for index in range(max(len(lines) - MOST_LAST_LINES, first), cut):
+        cells = [cell for cell in lines[index].split(mark) if cell.strip()]
         words = cells and not any(_NUMBER.fullmatch(cell) for cell in cells)
-        if words and len(lines[place].split(mark)) < width:
-            cut = place
+        if words and len(lines[index].split(mark)) < width:
+            cut = index
             break
     return size - sum(map(len, lines[cut:]))
 

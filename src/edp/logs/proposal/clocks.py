@@ -10,7 +10,7 @@ from edp.errors import DataError
 from edp.logs.formats.base import time_factor
 from edp.logs.proposal.behaviour import Behaviour
 from edp.logs.proposal.columns import LogColumn, LogLook
-from edp.logs.proposal.names import is_sample_time_name, is_time_name
+from edp.logs.proposal.names import is_counter_name, is_sample_time_name, is_time_name
 from edp.logs.timebase import judge
 from edp.signals import TIME_UNITS, SignalMap
 
@@ -83,7 +83,8 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
         behaviour = behaviours[column.name]
         # A name that says nothing of time is doubted more than no name at all.
         nameless = look.headerless or column is not look.columns[0]
-        if nameless and behaviour.counts and (second := _behind(column, look, behaviours)) is not None:
+        numbered = nameless or is_counter_name(column.name)
+        if numbered and behaviour.counts and (second := _behind(column, look, behaviours)) is not None:
             return second
         paced = behaviour.even or behaviour.lossy or (nameless and behaviour.steady)
         if column in rising and behaviour.climbs and paced:
