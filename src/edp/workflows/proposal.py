@@ -16,10 +16,9 @@ import numpy as np
 
 from edp.data.even_split import blocks_where_time_is_uneven, rests_where_it_tests
 from edp.data.splits import ByTime
-from edp.errors import ConfigError, DataError, StorageError
+from edp.errors import ConfigError, StorageError
 from edp.logs.proposal.columns import LogLook, refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
-from edp.logs.proposal.names import is_error_name
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
 from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
@@ -43,22 +42,10 @@ from edp.workflows.proposal_files import (
     toml_text,
 )
 from edp.workflows.proposal_plant import propose_plant
+from edp.workflows.proposal_targets import choose_targets
 
-MOST_TARGETS = 4
-"""Outputs at most: each is a model of its own in the time that a first run takes."""
 _LEAST_RECORDINGS = 5
 """Recordings from which whole ones test; of fewer a single one would decide the score."""
-_TARGETS = (
-    (Kind.VELOCITY,),
-    (Kind.ANGULAR_VELOCITY,),
-    (Kind.POSITION,),
-    (Kind.ANGLE,),
-    (Kind.FORCE,),
-    (Kind.PRESSURE,),
-    (Kind.FLOW,),
-    (Kind.TEMPERATURE,),
-)
-"""What is predicted: the first of these kinds that is measured, or else all that is measured."""
 _PAIR = re.compile(r"(.+?)[_ .]?(est|val|train|test|id|training|validation|identification)", re.IGNORECASE)
 _TRAINS = ("est", "train", "id", "training", "identification")
 
@@ -163,7 +150,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         return _of_pairs(source, group, others, broken, proposal, pairs)
     proposal, timing = _timed(group, proposal)
     notes = [*_notes(group, others, broken, proposal), *timing.notes, *_of_copies(copies)]
-    targets, more = _targets(proposal)
+    targets, more = choose_targets(proposal)
     chosen = {guess.column for guess in proposal.columns if guess.channel in targets}
     notes += [*more, *pace_notes(proposal.look, proposal.clock, chosen), *beside_notes(source, paths)]
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
@@ -244,43 +231,6 @@ def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool =
     for path, text in zip(paths, proposal.files.values()):
         write_bytes(path, text.encode())
     return paths
-
-
-def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
-    """What to predict, and what to say of it.
-
-    Raises:
-        DataError: nothing moves.
-    """
-    measured = proposal.of_role("measured")
-    notes = []
-    if not measured:
-        measured = proposal.of_role("command", "reference")
-        if not measured:
-            texts = len(proposal.look.texts)
-            unread = f", and {texts} that hold text" if texts else ""
-            raise DataError(
-                f"'{proposal.look.path}': no column moves (constants, counters and labels only{unread}); there is "
-                "nothing to predict: record while the machine works, and give each column a name of its own"
-            )
-        notes.append("no column looks measured: check task.targets")
-    # A deviation follows from two other columns; where nothing else moves it is what there is.
-    measured = tuple(guess for guess in measured if not is_error_name(guess.column)) or measured
-    # A change of another column is a velocity, whatever its unit.
-    changes = [guess for guess in measured if guess.relation is not None and guess.relation.how == "change"]
-    # Where one of a row of axes shows it, its brothers are velocities, too.
-    families = {_stem(guess.column) for guess in changes}
-    changes = [guess for guess in measured if guess in changes or _stem(guess.column) in families]
-    by_kind = [[g for g in measured if g.kind.kind in kinds] for kinds in _TARGETS]
-    chosen = next((guesses for guesses in [by_kind[0], by_kind[1], changes, *by_kind[2:]] if guesses), list(measured))
-    if len(chosen) > MOST_TARGETS:
-        notes.append(f"{len(chosen)} columns could be predicted; the first {MOST_TARGETS} are (task.targets)")
-    return tuple(guess.channel for guess in chosen[:MOST_TARGETS]), notes
-
-
-def _stem(name: str) -> str:
-    """A name without the number of an axis; of names that end with none the name itself."""
-    return name.rstrip("0123456789") or name
 
 
 _FEW_ROWS = 700
@@ -385,7 +335,7 @@ def _of_pairs(
             recordings.append({"path": listed_path(path), "name": f"{name}_{ending}", "map": table})
     renamed_columns = tuple(replace(guess, channel=stem) for stem, guess in pairs[train].items())
     renamed_proposal = replace(proposal, columns=renamed_columns)
-    targets, notes = _targets(renamed_proposal)
+    targets, notes = choose_targets(renamed_proposal)
     repairs = _timed(group, proposal)[1].shared
     channels = [guess.channel for guess in renamed_proposal.of_role("reference", "command", "measured")]
     tests = [str(one["name"]) for one in recordings if str(one["name"]).endswith(f"_{test}")]

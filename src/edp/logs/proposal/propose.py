@@ -271,7 +271,9 @@ def _role(
     if word in ("reference", "command", "measured"):
         # A single letter is a habit, not a word.
         by_letter = all(len(part) == 1 or part.isdigit() for part in words_of(name)[:1])
-        return word, 0.7 if by_letter else 0.85, "its name"
+        # y1 of a joystick is no output: what holds its value between steps of its own was moved by hand.
+        if not (by_letter and word == "measured" and behaviour.steps):
+            return word, 0.7 if by_letter else 0.85, "its name"
     if column.unit == "us":
         return "command", 0.75, "the width of a pulse"
     if kind.kind in _COMMANDS and kind.confidence >= BOUND:
