@@ -69,8 +69,8 @@ class FollowerParts:
         tuned, scales = correction.tuned, self.twin.scales
         signs = np.where(np.arange(len(tuned.labels)) % 2, -WORN, WORN)
         worn = self.twin.with_numbers(self.twin.numbers * np.exp(tuned.moves @ signs))
-        held = np.repeat(rng.normal(size=(GOLDEN_TICKS // 20, len(scales.command_offset))), 20, axis=0)
-        commands = (scales.command_offset + scales.command_width * held).astype(np.float32)
+        levels = np.repeat(rng.normal(size=(GOLDEN_TICKS // 20, len(scales.command_offset))), 20, axis=0)
+        commands = (scales.command_offset + scales.command_width * levels).astype(np.float32)
         start = np.clip(scales.answer_offset, scales.low, scales.high).astype(np.float32)[None]
         answers, _ = worn.rollout(commands[None, :-1], worn.initial_state(commands[:1], start))
         measured = np.concatenate([start, answers[0]])
@@ -79,9 +79,9 @@ class FollowerParts:
         for tick in range(GOLDEN_TICKS):
             correction.step(commands[tick], measured[tick], predictions[tick])
             for h, k in enumerate(self.horizons):
-                said = tuned.forecast(k)
-                if said is not None:
-                    forecasts[tick, h] = said
+                forecast = tuned.forecast(k)
+                if forecast is not None:
+                    forecasts[tick, h] = forecast
         inputs = np.concatenate([commands, measured, predictions.reshape(GOLDEN_TICKS, -1)], axis=1)
         factors = np.array(list(tuned.factors.values()), np.float32)
         return GoldenTicks(inputs, forecasts.reshape(GOLDEN_TICKS, -1), factors, tuned.learned)

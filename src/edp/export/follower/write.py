@@ -194,9 +194,9 @@ class FollowerFiles:
         )
         rows = ",\n".join(f"    {{{', '.join(map(_number_or_nan, row))}}}" for row in golden.forecasts)
         size = f"[GOLDEN_TICKS][{golden.forecasts.shape[1]}]"
-        said = f"static const float golden_forecasts{size} = {{\n{rows}\n}};\n"
-        known = golden_rows("golden_inputs", "float", golden.inputs)
-        return Code(head + known + said + golden_rows("golden_factors", "float", golden.factors[None]))
+        forecasts = f"static const float golden_forecasts{size} = {{\n{rows}\n}};\n"
+        inputs = golden_rows("golden_inputs", "float", golden.inputs)
+        return Code(head + inputs + forecasts + golden_rows("golden_factors", "float", golden.factors[None]))
 
 
 def _number_or_nan(value: float) -> str:
