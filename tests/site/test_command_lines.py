@@ -45,6 +45,9 @@ LEFT_OUT = {
     "edp twin logs/loam --start runs/grey --set ground=drag --out runs/grey_loam": (
         "learns the resistance of the ground; tests/unit/twin/test_ground_run.py"
     ),
+    "edp export runs/first_adapted --to follower --twin runs/grey --out firmware/follower": (
+        "needs a grey box of the network's velocities; tests/unit/test_adaptation.py runs it on one"
+    ),
 }
 """Lines that need what no test has, or fits that take minutes and that other tests run shortened, and why."""
 SHELL_LEFT_OUT = {
