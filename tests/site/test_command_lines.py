@@ -64,7 +64,7 @@ SHELL_LEFT_OUT = {
 """First words of lines of other programs that are not run, and why; targets of make: tests/unit/test_code_blocks.py."""
 LIVE_S = 240.0
 """After which a session that says no address, or does not end, is killed: its code is then no success."""
-MOST_LEFT_OUT = 10
+MOST_LEFT_OUT = 11
 QUICK = re.compile(
     r"(init|inspect|evaluate|report|compare|adapt|replay|footprint|runs|registry|rollout|forecast|store|monitor r)"
 )
