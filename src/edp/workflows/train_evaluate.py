@@ -22,6 +22,7 @@ from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, first_scored, judge, score_network
 from edp.evaluation.scores_file import earlier_scores
+from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
 from edp.recording import Recording
@@ -239,7 +240,7 @@ def evaluate(
 
     Args:
         run: run folder.
-        source: other recordings; all of them are judged.
+        source: other recordings; all of them are judged. Logs without a map are read with that of the run.
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
         minutes: after which no further baseline is begun; a later call judges it.
@@ -253,7 +254,7 @@ def evaluate(
     bundle, experiment, provenance, data = trained_run(folder)
     target, judged = folder, [data.digest]
     if source is not None:
-        recordings = source.read()
+        recordings = read_as_before(source, provenance["data"]["reader"]).read()
         data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
         # Content by name and digest: the same file changed is another judgement.
         judged += [part for recording in recordings for part in (recording.name, recording.digest)]
@@ -325,10 +326,11 @@ def channel_importance(
     """
     folder = Path(run)
     _check_run_writable(folder)
-    bundle, _, _, data = trained_run(folder)
+    bundle, _, provenance, data = trained_run(folder)
     target = folder
     if source is not None:
-        data = replace(data, test=[bundle.task.series(recording) for recording in source.read()])
+        recordings = read_as_before(source, provenance["data"]["reader"]).read()
+        data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
         target = make_folder(folder / f"on_{source.path.stem}")
     if spec is None:
         groups = collinear([part.inputs for part in data.train])
