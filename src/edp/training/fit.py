@@ -26,7 +26,7 @@ from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
 from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, by_gradient, check_training, thread_count
-from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, TrainingStrategy
+from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, StreamStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
 
 
@@ -271,11 +271,14 @@ class Loop:
         if isinstance(self.strategy, EpisodicStrategy):
             loss = self.strategy.episode(self.net, self.objective, (x, future, valid))
         else:
+            taught = batch.teacher_targets
+            teacher_targets = None if taught is None else torch.from_numpy(taught).to(self.device)
+            if teacher_targets is not None and isinstance(self.strategy, StreamStrategy):
+                self.strategy.tell(self.net, teacher_targets, reset)
             answer, features, hidden, state = self.net.forward_features(x, state)
-            if self.strategy is None or batch.teacher_targets is None:
+            if self.strategy is None or teacher_targets is None:
                 loss = self.objective.evaluate(answer, future, features, valid)
             else:
-                teacher_targets = torch.from_numpy(batch.teacher_targets).to(self.device)
                 done = self.progress.updates / (self.updates * self.spec.epochs)
                 batch_context = BatchContext(answer, future, features, hidden, valid, teacher_targets, done)
                 loss = self.strategy.loss(self.objective, batch_context)
