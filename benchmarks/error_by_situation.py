@@ -1,6 +1,6 @@
 """Where is the error of the best networks, and what would remove it?
 
-Machine M22, default mix, in free air or, with ``--soil``, in it and three soils. Networks of the preset ``quick`` with
+Machine M22, default mix, in free air or, with ``--soil``, in it and three soils. Networks of one preset with
 equal updates read what is measured, then besides it one group of what only the simulator knows (an oracle): pump
 displacements, spool positions, noise-free pressures, oil temperature, strokes where these are not measured. Their
 errors, and those of the forecasts of a grey box where ``--forecasts`` names the folder of ``twin_forecast.py --work``,
@@ -45,6 +45,8 @@ ORACLES: Mapping[str, tuple[str, ...]] = {
     "true pressures": tuple(f"True{name}" for name in TABLE_A1 if name.startswith("CylPressures")),
     "oil temperature": ("OilTemperature",),
 }
+ALL = "all of these"
+"""Every channel of the oracles at once: one long training that says whether any of them is worth something."""
 CONFLUX = (("BmUpConf", "BmDwnConf"), ("AmInConf", "AmOutConf"), ("BktInConf", "BktOutConf"))
 EVENTS = {
     "relief open": "Event_Relief",
@@ -64,11 +66,18 @@ def main() -> None:
     made.add_argument("--each", type=float, default=3.0, help="minutes of one recording")
     made.add_argument("--soil", action="store_true", help="let grading and digs work soils, too")
     made.add_argument("--updates", type=int, default=1200)
+    made.add_argument("--preset", choices=("quick", "standard"), default="quick", help="of the networks")
+    made.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="changes of the preset")
+    made.add_argument(
+        "--oracles", nargs="*", choices=(*ORACLES, ALL), default=list(ORACLES), help="first the plain one"
+    )
     made.add_argument("--forecasts", type=Path, default=None, help="folder that twin_forecast.py --work left")
     made.add_argument("--work", type=Path, default=None, help="folder that keeps the data")
     arguments = made.parse_args()
     if arguments.quick:
         arguments.minutes, arguments.updates = 3.5, 20
+    if len(arguments.oracles) < 2 or arguments.oracles[0] != "nothing more":
+        made.error("--oracles: 'nothing more' first, and at least one beside it, to be compared with it")
     in_folder(arguments.work, lambda work: run(arguments, work))
 
 
@@ -76,7 +85,9 @@ def run(arguments: Any, work: Path) -> None:
     """Networks, situations, tables."""
     recordings = data_of(arguments, work)
     rows, knowledge, errors = {}, {}, {}
-    for name, channels in ORACLES.items():
+    hidden = {**ORACLES, ALL: tuple(channel for channels in ORACLES.values() for channel in channels)}
+    for name in arguments.oracles:
+        channels = hidden[name]
         data, errors[name] = trained(recordings, channels, arguments)
         if channels:
             knowledge[name] = known_by_history(recordings, data, channels)
@@ -88,7 +99,7 @@ def run(arguments: Any, work: Path) -> None:
     for name, by_recording in errors.items():
         rows[name] = divided(by_recording, situations)
     show(rows, knowledge)
-    plain, best = rows["nothing more"]["all"]["mae"], min(rows[name]["all"]["mae"] for name in ORACLES)
+    plain, best = rows["nothing more"]["all"]["mae"], min(rows[name]["all"]["mae"] for name in arguments.oracles)
     asked = [
         verdict("error at k = 10 with the best oracle against none", best, plain, "<= 0.9", "mm/s", arguments.quick)
     ]
@@ -138,7 +149,9 @@ def trained(
     """Train on all measured channels and an oracle's; absolute errors ``(tick, axis)`` of each held-out recording."""
     features = f"task.features={{name='f', channels={[*MEASURED, *oracle]}}}"
     settings = load_experiment(
-        None, "quick", (features, f"task.horizons=[{HORIZON}]", f"training.seed={arguments.seed}")
+        None,
+        arguments.preset,
+        (features, f"task.horizons=[{HORIZON}]", f"training.seed={arguments.seed}", *arguments.set),
     )
     first = recordings[0]
     task = settings.task.resolve(first.rate_hz, first.channel_names, None)

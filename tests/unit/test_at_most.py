@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from edp.cli import app
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
+from edp.evaluation.judged_data import judged_data
 from edp.logs import write_recording
 from edp.logs.drawn import drawn_recordings
 from edp.logs.source import DataSource
@@ -16,7 +17,7 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.inspecting import inspect_with
-from edp.workflows.train_evaluate import judged_data, train, trained_run
+from edp.workflows.train_evaluate import train, trained_run
 
 CHANNELS = (Channel("v", Kind.VELOCITY), Channel("u", Kind.RATIO))
 HZ = 2.0

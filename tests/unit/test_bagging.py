@@ -9,12 +9,13 @@ import torch
 from scipy.optimize import nnls
 from sklearn.linear_model import Ridge
 
+import edp.training.bagging.table
 from edp.config.experiment import build
 from edp.data.features import FeatureSet
 from edp.data.fold_ridge import LEAST_GAIN, PENALTIES, fold_ridge
-from edp.data.folds import blocked_folds
+from edp.data.folds import blocked_folds, recording_folds
 from edp.data.prepared import prepare
-from edp.data.splits import ByTime
+from edp.data.splits import ByRecording, ByTime
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
 from edp.ir.reference import Reference
@@ -354,6 +355,56 @@ def test_folds_leave_out_pieces_as_long_as_what_tests():
     logs = [recording(600, seed, f"log{seed}") for seed in range(4)]
     assert pieces_of(*logs) == 4
     assert pieces_of(*logs, rows=800) == 4
+
+
+def by_recording(*recordings, test):
+    """Prepared data of which whole recordings test."""
+    task = Task(FeatureSet("two", ("u", "y")), ("y",), (1, 4), TargetMode.DELTA, RATE)
+    return prepare(list(recordings), task, ByRecording(validation=("log1",), test=test), 10)
+
+
+def test_where_whole_recordings_test_folds_leave_whole_ones_out():
+    logs = [recording(ticks, seed, f"log{seed}") for seed, ticks in enumerate((300, 200, 250, 220, 180, 210))]
+    data = by_recording(*logs, test=("log5",))
+    table = table_of(build_model(data.task, MODEL, data.scaler(), 0), data, BaggingSpec(folds=3))
+    lengths = np.diff([*(first for first, _ in table.starts), len(table.columns)])
+    ends = np.cumsum(lengths)
+    owners = [set(table.folds.owner[end - length : end]) for end, length in zip(ends, lengths, strict=True)]
+    assert [len(own) for own in owners] == [1] * 5
+    assert set().union(*owners) == {0, 1, 2}
+    for fold in range(3):
+        # Nothing lies beside a whole recording: all others train.
+        assert len(table.folds.left_out(fold)) + len(table.folds.training[fold]) == len(table.columns)
+    # Two recordings, or one that has nearly all rows, would leave nothing to learn from.
+    assert recording_folds([100, 100], ["a", "b"], 5) is None
+    assert recording_folds([1000, 100, 100], ["a", "b", "c"], 5) is None
+    found = recording_folds([50, 100, 50, 100], ["a", "b", "a", "c"], 5)
+    assert found is not None
+    assert found.count == 3
+    assert set(found.left_out(found.owner[0])) == {*range(50), *range(150, 200)}
+
+
+def test_an_axis_that_rested_in_training_moves_no_prediction_far(monkeypatch):
+    """An encoder at rest shows a few steps of noise: a line through them would answer the axis in motion at random."""
+    log = recording()
+    # By chance the steps go with the machine.
+    steps = 1e-3 * np.clip(np.round(log.values[:, 0]), -1, 1)
+    channels = (*CHANNELS, Channel("angle", Kind.GENERIC))
+    log = replace(log, values=np.column_stack([log.values, steps]).astype(np.float32), channels=channels)
+    task = Task(FeatureSet("three", ("u", "y", "angle")), ("y",), (1, 4), TargetMode.DELTA, RATE)
+    data = prepare([log], task, ByTime(), 10)
+    part = data.test[0]
+    moving = part.inputs.copy()
+    moving[:, 2] = np.sin(np.arange(len(moving)) / 20)
+
+    def moved_by() -> float:
+        net = fit_bagged(data, committee(bounded=True), spec(steps=20)).fitted.predictor
+        rest, motion = (stream_predictions(net, [replace(part, inputs=x)])[0] for x in (part.inputs, moving))
+        return float(np.abs(motion - rest).max())
+
+    held = moved_by()
+    monkeypatch.setattr(edp.training.bagging.table, "FEW_LEVELS", 0)
+    assert held < 0.5 * moved_by()
 
 
 def test_long_recordings_are_thinned_out_evenly():

@@ -24,7 +24,7 @@ MOST_EXPECTED = 12
 """Outputs of which the terminal says what to expect; the report has all."""
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
-    list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort.")
+    list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
 ]
 
 

@@ -12,6 +12,9 @@ from edp.errors import DataError
 
 FEWEST_ROWS = 20
 """Rows that a fold must have; fewer say nothing about an error."""
+FEWEST_RECORDINGS, LEAST_TRAINING = 3, 0.3
+"""Recordings from which on folds can leave out whole ones, and the share of the rows that each fold keeps for training
+then: of two recordings, or where one has nearly all rows, a fold would learn next to nothing of the machine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,3 +86,33 @@ def blocked_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int = 1)
                 "longer than the largest horizon and the longest lag, or shorten these"
             )
     return Folds(owner, tuple(training))
+
+
+def recording_folds(lengths: Sequence[int], recordings: Sequence[str], folds: int) -> Folds | None:
+    """Folds that leave out whole recordings, as many of them as there are recordings at most.
+
+    Each fold takes recordings until it has its share of the rows, the longest first.
+
+    Args:
+        lengths: rows of each stretch, laid end to end.
+        recordings: of which recording each stretch is.
+        folds: number of folds at most.
+
+    Returns:
+        None where there are fewer than `FEWEST_RECORDINGS`, or one fold would train on less than `LEAST_TRAINING`.
+    """
+    names = list(dict.fromkeys(recordings))
+    if len(names) < FEWEST_RECORDINGS:
+        return None
+    rows = dict.fromkeys(names, 0)
+    for name, length in zip(recordings, lengths, strict=True):
+        rows[name] += length
+    count = min(folds, len(names))
+    filled, fold_of = [0] * count, {}
+    for name in sorted(names, key=lambda name: -rows[name]):
+        fold_of[name] = filled.index(min(filled))
+        filled[fold_of[name]] += rows[name]
+    if max(filled) > (1.0 - LEAST_TRAINING) * sum(filled) or min(filled) < FEWEST_ROWS:
+        return None
+    owner = np.repeat([fold_of[name] for name in recordings], lengths)
+    return Folds(owner, tuple(np.flatnonzero(owner != fold) for fold in range(count)))

@@ -17,6 +17,7 @@ class Series:
         targets: float32 ``(time, target)``; row t is the target channel *at* t (a horizon k asks for row t + k).
         teacher_targets: float32 ``(time, column)``, teacher predictions of tick t; None without a teacher.
         machine: which machine it was recorded on; empty where that is not known.
+        recording: the recording that it is cut from; empty where that is not known.
     """
 
     name: str
@@ -24,6 +25,7 @@ class Series:
     targets: FloatArray
     teacher_targets: FloatArray | None = None
     machine: str = ""
+    recording: str = ""
 
     @property
     def samples(self) -> int:

@@ -185,7 +185,7 @@ class Task:
                     f"{start + row}; repair the log or allow a repair (--repair nan=hold)"
                 )
         machine = str(recording.meta.get(MACHINE, "")).lower()
-        return Series(name or recording.name, inputs, targets, machine=machine)
+        return Series(name or recording.name, inputs, targets, machine=machine, recording=recording.name)
 
 
 def first_not_finite(values: FloatArray) -> tuple[int, int] | None:

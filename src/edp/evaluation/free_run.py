@@ -22,6 +22,8 @@ MOST_SECONDS = 86_400.0
 """Of a free run: a day."""
 ASTRAY = 0.5
 """Share of a stroke's range; a run whose stroke is further off than that counts as diverged."""
+AT_FULL_SPEED_S = 1.0
+"""Motion at the largest speed that counts as a range where no stroke is measured."""
 SHORTER = (2, 4, 8)
 """Parts of the longest free run that calibrate intervals as well, where stretches are shorter than what is asked."""
 LANES = 64
@@ -118,11 +120,15 @@ class FreeRuns:
         return np.asarray(np.cumsum(steps, axis=1))
 
     def _range(self) -> NDArray[np.float64]:
-        """Range of each stroke ``(velocity,)``; without strokes that of the true integrals."""
+        """Range of each stroke ``(velocity,)``; without strokes that of the true integrals, or a second at full speed.
+
+        What rests during all runs has no range, and any error would be one astray.
+        """
         if self.channels.strokes:
             ends = slice(len(self.channels.velocities), 2 * len(self.channels.velocities))
             return (self.high - self.low)[ends].astype(np.float64)
-        return np.asarray(np.ptp(self._integral(self.truth), axis=(0, 1)))
+        fastest = self.high[: len(self.channels.velocities)].astype(np.float64)
+        return np.asarray(np.maximum(np.ptp(self._integral(self.truth), axis=(0, 1)), fastest * AT_FULL_SPEED_S))
 
     def diverged(self) -> NDArray[np.bool_]:
         """Runs that left the machine ``(run,)``: a stroke off by more than `ASTRAY` of its range, or no number."""

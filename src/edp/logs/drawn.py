@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from edp.errors import ConfigError
+from edp.logs.quality.checks import Finding
 from edp.recording import Recording
 from edp.stats.stretches import MOST_ROWS, spread_stretches
 
@@ -62,3 +63,12 @@ def drawn_recordings(recordings: Sequence[Recording], hours: float) -> list[Reco
     """Recordings of at most so many hours, about: evenly spread stretches of `STRETCH_S` where there are more."""
     most = max(1, round(3600.0 * hours * recordings[0].rate_hz))
     return spread_recordings(recordings, STRETCH_S, most)
+
+
+def findings_of_part(recordings: Sequence[Recording], of_hours: float) -> tuple[Finding, ...]:
+    """What an inspection of these recordings says where they are not all of so many hours."""
+    hours = sum(recording.samples / recording.rate_hz for recording in recordings) / 3600.0
+    drawn = Drawn(hours, of_hours, len(recordings))
+    if drawn.hours == drawn.of_hours:
+        return ()
+    return (Finding("note", None, f"looked at {drawn.what}", drawn.stretches, "", "leave --at-most out for all"),)

@@ -19,7 +19,7 @@ _CHOICES = {
     "nan": ("refuse", "hold", "keep"),
     "gaps": ("refuse", "hold", "cut", "keep"),
     "duplicates": ("refuse", "last"),
-    "falling": ("refuse", "sort"),
+    "falling": ("refuse", "sort", "cut"),
 }
 
 
@@ -31,7 +31,8 @@ class Repair:
         nan: missing or infinite values: ``hold`` the last good value, or ``keep`` them as NaN.
         gaps: gaps in time: ``hold`` the last sample, ``cut`` to the longest stretch without one, or ``keep`` NaN.
         duplicates: equal time stamps: keep the ``last`` row of each.
-        falling: time stamps that go back: ``sort`` rows by time.
+        falling: time stamps that go back: ``sort`` rows by time, or ``cut`` to the longest stretch without one, for a
+            clock that begins anew.
     """
 
     nan: str = "refuse"
@@ -63,11 +64,12 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
             raise DataError(
                 f"{where}: time goes back in {len(clock.falling)} row(s), first in row {clock.falling[0]} "
                 f'(t = {stamps[clock.falling[0]]:g} s); repair the file or set repair falling = "sort" '
-                "(--repair falling=sort)"
+                '(--repair falling=sort), or "cut" where the clock begins anew there (--repair falling=cut)'
             )
-        repairs.append({"repair": "falling = sort", "count": len(clock.falling), "row": int(clock.falling[0])})
+        fact = {"repair": f"falling = {repair.falling}", "count": len(clock.falling), "row": int(clock.falling[0])}
+        repairs.append(fact)
         # Stable: rows of equal stamps keep their order, so that `last` means the last in the file.
-        order = np.argsort(stamps, kind="stable")
+        order = np.argsort(stamps, kind="stable") if repair.falling == "sort" else _longest_rise(clock)
         stamps = stamps[order]
         clock = judge(stamps, where)
     if len(clock.duplicates):
@@ -82,6 +84,13 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
         order = np.flatnonzero(last) if order is None else order[last]
         clock = judge(stamps[last], where)
     return clock, order, repairs
+
+
+def _longest_rise(clock: Clock) -> Rows:
+    """The rows of the longest stretch in which time does not go back, shape ``(rows,)``."""
+    edges = np.concatenate(([0], clock.falling, [len(clock.stamps)]))
+    best = int(np.argmax(np.diff(edges)))
+    return np.arange(edges[best], edges[best + 1])
 
 
 def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, Any]]]:

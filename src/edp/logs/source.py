@@ -13,7 +13,7 @@ import numpy as np
 from edp.errors import ConfigError, DataError
 from edp.logs.buckets import BucketReader, RemoteFile, bucket_address
 from edp.logs.detect import known_suffixes
-from edp.logs.drawn import Drawn, checked_hours, drawn_recordings
+from edp.logs.drawn import checked_hours, drawn_recordings, findings_of_part
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into, unreadable
@@ -140,9 +140,9 @@ class DataSource:
         """
         if self.stored:
             self.check_store_options()
-            return self._drawn(read_store(self.store_folder()))
-        self._refuse_bucket()
-        self._refuse_sample()
+            stored = read_store(self.store_folder())
+            return stored if self.at_most_h is None else drawn_recordings(stored, self.at_most_h)
+        self._refuse_bucket_and_sample()
         if self.path.suffix != ".toml":
             return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
         recordings = [log.read() for log in self.logs()]
@@ -160,8 +160,7 @@ class DataSource:
         """
         if self.stored:
             return self._inspect_store(on_log)
-        self._refuse_bucket()
-        self._refuse_sample()
+        self._refuse_bucket_and_sample()
         logs = self.logs()
         reports, sketches, sketched = [], Sketches(), []
         broken: list[DataError] = []
@@ -219,33 +218,22 @@ class DataSource:
             sketches.add(sketch(recording))
         return compare(reports, sketches, self.drawn_findings(recordings))
 
-    def _drawn(self, recordings: list[Recording]) -> list[Recording]:
-        return recordings if self.at_most_h is None else drawn_recordings(recordings, self.at_most_h)
-
     def drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
         """What an inspection says where these recordings are only a part of the store."""
-        if self.at_most_h is None:
-            return ()
-        hours = sum(recording.samples / recording.rate_hz for recording in recordings) / 3600.0
-        drawn = Drawn(hours, read_index(self.store_folder()).hours(), len(recordings))
-        if drawn.hours == drawn.of_hours:
-            return ()
-        return (Finding("note", None, f"looked at {drawn.what}", drawn.stretches, "", "leave --at-most out for all"),)
+        whole = self.at_most_h is None
+        return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
 
-    def _refuse_sample(self) -> None:
-        """How long logs are is known once they are read: a part of them is drawn from a store."""
-        if self.at_most_h is not None:
-            raise ConfigError(
-                f"--at-most {self.at_most_h:g} came with '{self.path}', which is no store; read the logs once with "
-                "`edp store build LOGS --out STORE`, and give this command the store"
-            )
-
-    def _refuse_bucket(self) -> None:
-        """Logs in buckets are read once: each command would copy them again."""
+    def _refuse_bucket_and_sample(self) -> None:
+        """Each command would copy logs in buckets again, and how long logs are is known once they are read."""
         if self.address:
             raise ConfigError(
                 f"'{self.address}' holds logs and no store; read them once with `edp store build {self.address} --out "
                 "store`, and give this command the store"
+            )
+        if self.at_most_h is not None:
+            raise ConfigError(
+                f"--at-most {self.at_most_h:g} came with '{self.path}', which is no store; read the logs once with "
+                "`edp store build LOGS --out STORE`, and give this command the store"
             )
 
     def check_store_options(self) -> None:

@@ -12,20 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from edp.data.even_split import blocks_where_time_is_uneven, rests_where_it_tests
-from edp.data.splits import ByTime
-from edp.errors import ConfigError, DataError, StorageError
-from edp.logs.proposal.columns import LogLook, refuse_frames
+from edp.errors import ConfigError, StorageError
+from edp.logs.proposal.experiments import Experiments, part_experiments
+from edp.logs.proposal.frames import refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
-from edp.logs.proposal.names import is_error_name
 from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
 from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
-from edp.recording import Recording
-from edp.signals import Channel, Kind
+from edp.signals import Kind
 from edp.storage import make_folder, write_bytes
 from edp.workflows.proposal_files import (
     DATA,
@@ -34,7 +29,6 @@ from edp.workflows.proposal_files import (
     SETTINGS,
     check_files,
     data_set_text,
-    horizons_for,
     listed_path,
     map_table,
     named_paths,
@@ -43,22 +37,9 @@ from edp.workflows.proposal_files import (
     toml_text,
 )
 from edp.workflows.proposal_plant import propose_plant
+from edp.workflows.proposal_split import choose_split
+from edp.workflows.proposal_targets import choose_targets
 
-MOST_TARGETS = 4
-"""Outputs at most: each is a model of its own in the time that a first run takes."""
-_LEAST_RECORDINGS = 5
-"""Recordings from which whole ones test; of fewer a single one would decide the score."""
-_TARGETS = (
-    (Kind.VELOCITY,),
-    (Kind.ANGULAR_VELOCITY,),
-    (Kind.POSITION,),
-    (Kind.ANGLE,),
-    (Kind.FORCE,),
-    (Kind.PRESSURE,),
-    (Kind.FLOW,),
-    (Kind.TEMPERATURE,),
-)
-"""What is predicted: the first of these kinds that is measured, or else all that is measured."""
 _PAIR = re.compile(r"(.+?)[_ .]?(est|val|train|test|id|training|validation|identification)", re.IGNORECASE)
 _TRAINS = ("est", "train", "id", "training", "identification")
 
@@ -155,7 +136,8 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         raise ConfigError(f"'{source}' is a data-set file; give the log or the folder of logs that it is to describe")
     paths, copies = _without_copies(find_recordings(source))
     groups, broken = group_logs(paths, on_log)
-    group, others = groups[0], tuple(groups[1:])
+    experiments, others = part_experiments(groups[0]), tuple(groups[1:])
+    group = groups[0] if experiments is None else experiments.group
     refuse_frames(group.looks[0])
     proposal = propose_map(group.looks[0], group.common, group.looks[1:])
     pairs = _side_by_side(proposal)
@@ -163,30 +145,59 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         return _of_pairs(source, group, others, broken, proposal, pairs)
     proposal, timing = _timed(group, proposal)
     notes = [*_notes(group, others, broken, proposal), *timing.notes, *_of_copies(copies)]
-    targets, more = _targets(proposal)
+    targets, more = choose_targets(proposal)
     chosen = {guess.column for guess in proposal.columns if guess.channel in targets}
     notes += [*more, *pace_notes(proposal.look, proposal.clock, chosen), *beside_notes(source, paths)]
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
     if len(channels) > MOST_FEATURES:
         notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")
         channels = list(dict.fromkeys([*channels[:MOST_FEATURES], *targets]))
-    split, why = _split(group, proposal, targets)
+    split, why = choose_split(group, proposal, targets)
+    if experiments is not None:
+        tests = experiments.tests()
+        split, why = ({"kind": "recordings", "test": tests}, []) if tests else (split, why)
+        why = [*why, *_of_experiments(experiments, tests)]
     notes += why
     files = {
         MAP: toml_text(map_table(proposal.signal_map), remarks_of(source, proposal)),
         SETTINGS: settings_text(proposal, channels, targets, split),
     }
     repairs, apart = timing.shared, timing.apart
-    if others or broken or apart or copies:
-        recordings = [
-            {"path": listed_path(one), "name": name} | ({"repair": repair_table(apart[one])} if one in apart else {})
-            for one, name in named_paths(group.paths)
-        ]
-        files[DATA] = data_set_text(recordings, MAP, repair_table(repairs) if apart else {})
+    if experiments is not None or others or broken or apart or copies:
+        listed = _recordings(group, proposal, experiments)
+        recordings = [entry | ({"repair": repair_table(apart[one])} if one in apart else {}) for one, entry in listed]
+        shared_map = MAP if experiments is None else None
+        files[DATA] = data_set_text(recordings, shared_map, repair_table(repairs) if apart else {})
+    if experiments is not None:
+        del files[MAP]
     check_files(files)
     repairs = () if apart else repairs
     inputs = _untold_inputs(proposal)
     return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
+
+
+def _recordings(
+    group: LogGroup, proposal: MapProposal, experiments: Experiments | None
+) -> list[tuple[Path, dict[str, Any]]]:
+    """The logs of a group as entries of a data set; an experiment has a map that names its variable."""
+    if experiments is None:
+        return [(path, {"path": listed_path(path), "name": name}) for path, name in named_paths(group.paths)]
+    columns = map_table(proposal.signal_map)
+    named = zip(group.paths, experiments.entries, experiments.names())
+    return [
+        (pseudo_path, {"path": listed_path(path), "name": name, "map": {"variable": variable} | columns})
+        for pseudo_path, (path, variable), name in named
+    ]
+
+
+def _of_experiments(experiments: Experiments, tests: Sequence[str]) -> list[str]:
+    """What to say of experiments that stand beside each other."""
+    parted = f", of which {len(tests)} test by their name" if tests else ""
+    other = f"other columns: {', '.join(experiments.others[:3])}; give such logs on their own"
+    return [
+        f"{len(experiments.entries)} experiments stand beside each other: a recording each{parted}",
+        *([other] if experiments.others else []),
+    ]
 
 
 def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, Path]]]:
@@ -246,43 +257,6 @@ def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool =
     return paths
 
 
-def _targets(proposal: MapProposal) -> tuple[tuple[str, ...], list[str]]:
-    """What to predict, and what to say of it.
-
-    Raises:
-        DataError: nothing moves.
-    """
-    measured = proposal.of_role("measured")
-    notes = []
-    if not measured:
-        measured = proposal.of_role("command", "reference")
-        if not measured:
-            texts = len(proposal.look.texts)
-            unread = f", and {texts} that hold text" if texts else ""
-            raise DataError(
-                f"'{proposal.look.path}': no column moves (constants, counters and labels only{unread}); there is "
-                "nothing to predict: record while the machine works, and give each column a name of its own"
-            )
-        notes.append("no column looks measured: check task.targets")
-    # A deviation follows from two other columns; where nothing else moves it is what there is.
-    measured = tuple(guess for guess in measured if not is_error_name(guess.column)) or measured
-    # A change of another column is a velocity, whatever its unit.
-    changes = [guess for guess in measured if guess.relation is not None and guess.relation.how == "change"]
-    # Where one of a row of axes shows it, its brothers are velocities, too.
-    families = {_stem(guess.column) for guess in changes}
-    changes = [guess for guess in measured if guess in changes or _stem(guess.column) in families]
-    by_kind = [[g for g in measured if g.kind.kind in kinds] for kinds in _TARGETS]
-    chosen = next((guesses for guesses in [by_kind[0], by_kind[1], changes, *by_kind[2:]] if guesses), list(measured))
-    if len(chosen) > MOST_TARGETS:
-        notes.append(f"{len(chosen)} columns could be predicted; the first {MOST_TARGETS} are (task.targets)")
-    return tuple(guess.channel for guess in chosen[:MOST_TARGETS]), notes
-
-
-def _stem(name: str) -> str:
-    """A name without the number of an axis; of names that end with none the name itself."""
-    return name.rstrip("0123456789") or name
-
-
 _FEW_ROWS = 700
 """Rows of all logs below which training refuses to divide them, or learns next to nothing."""
 
@@ -311,38 +285,6 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     if len(broken) > 3:
         notes.append(f"{len(broken) - 3} more logs are not readable")
     return notes
-
-
-def _split(group: LogGroup, proposal: MapProposal, targets: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """Whole logs where there are many, else time; blocks where ends are unlike the rest; and why, for notes."""
-    if len(group.paths) >= _LEAST_RECORDINGS:
-        return {"kind": "names"}, []
-    rate = proposal.clock.wanted_hz or proposal.clock.rate_hz
-    names = list(dict.fromkeys(guess.column for guess in proposal.columns if guess.channel in targets))
-    if rate and names and len(group.looks) == len(group.paths):
-        step = max(1, round((proposal.clock.rate_hz or rate) / rate))
-        logs = [_targets_of(look, names, step, rate) for look in group.looks]
-        uneven = blocks_where_time_is_uneven(logs, names, horizons_for(rate), ByTime())
-        if uneven is not None:
-            blocks, why = uneven  # of a long log a part was looked at
-            longer = min(look.rows / step for look in group.looks) / min(log.samples for log in logs)
-            split = {"kind": "blocks", "block_s": round(blocks.block_s * max(1.0, longer), 2), "every": blocks.every}
-            return split, [f"{why}: blocks of time test in turn"]
-        if rests_where_it_tests(logs, names, horizons_for(rate), ByTime()):
-            return {"kind": "time"}, [
-                "the machine moves in so small a part of this that the end, which would test, is mostly rest, and so "
-                "are blocks of it: a test there says little; record more motion, or give a part that moves"
-            ]
-    return {"kind": "time"}, []
-
-
-def _targets_of(look: LogLook, names: Sequence[str], step: int, rate: float) -> Recording:
-    """Columns of what was looked at of a log; where pieces of it meet, a missing value keeps their changes apart."""
-    columns = {column.name: column for column in look.columns}
-    apart = np.full(1, np.nan)
-    values = [np.concatenate([x for piece in columns[name].pieces for x in (piece[::step], apart)]) for name in names]
-    channels = tuple(Channel(name, Kind.GENERIC) for name in names)
-    return Recording(look.path.name, channels, np.stack(values, axis=1).astype(np.float32), rate)
 
 
 def _side_by_side(proposal: MapProposal) -> dict[str, dict[str, ColumnGuess]]:
@@ -385,7 +327,7 @@ def _of_pairs(
             recordings.append({"path": listed_path(path), "name": f"{name}_{ending}", "map": table})
     renamed_columns = tuple(replace(guess, channel=stem) for stem, guess in pairs[train].items())
     renamed_proposal = replace(proposal, columns=renamed_columns)
-    targets, notes = _targets(renamed_proposal)
+    targets, notes = choose_targets(renamed_proposal)
     repairs = _timed(group, proposal)[1].shared
     channels = [guess.channel for guess in renamed_proposal.of_role("reference", "command", "measured")]
     tests = [str(one["name"]) for one in recordings if str(one["name"]).endswith(f"_{test}")]

@@ -15,15 +15,15 @@ from edp import __version__
 from edp.config.experiment import Experiment, experiment_toml, load_experiment, plain_tree
 from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
-from edp.data.spread_rows import spread_series
 from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, first_scored, judge, score_network
+from edp.evaluation.judged_data import judged_data
 from edp.evaluation.scores_file import earlier_scores
-from edp.logs.drawn import STRETCH_S, Drawn, checked_hours, drawn_recordings
+from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
 from edp.recording import Recording
@@ -242,7 +242,7 @@ def evaluate(
 
     Args:
         run: run folder.
-        source: other recordings.
+        source: other recordings. Logs without a map are read with that of the run.
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
         minutes: after which no further baseline is begun; a later call judges it.
@@ -255,7 +255,7 @@ def evaluate(
     folder = Path(run)
     _check_run_writable(folder)
     bundle, experiment, provenance, data = trained_run(folder)
-    target, judged, others = folder, [data.digest], None if source is None else source.read()
+    target, judged, others = folder, [data.digest], other_recordings(source, provenance)
     if source is not None:
         # Content by name and digest: the same file changed is another judgement.
         judged += [part for recording in others or () for part in (recording.name, recording.digest)]
@@ -286,35 +286,9 @@ def evaluate(
     return target
 
 
-def judged_data(
-    bundle: Bundle, data: Prepared, others: Sequence[Recording] | None, at_most_h: float | None
-) -> tuple[Prepared, Drawn | None]:
-    """The data of a run with what is judged as its test part, and how much of it was drawn; None where all is judged.
-
-    Args:
-        bundle: of the run.
-        data: of the run.
-        others: other recordings; None for the held-out ones.
-        at_most_h: evenly spread stretches of so many hours, about, where there are more; None for all.
-
-    Raises:
-        EdpError: recordings that do not go with the run, or no positive number of hours.
-    """
-    hour, length = 3600.0 * bundle.task.rate_hz, round(STRETCH_S * bundle.task.rate_hz)
-    lengths = [part.samples for part in (data.test if others is None else others)]
-    whole = sum(lengths)
-    most = whole if at_most_h is None else max(1, round(hour * checked_hours(at_most_h)))
-    if others is not None:
-        # Before they are made inputs and targets: of a store only what is judged is read.
-        chosen = others if at_most_h is None else drawn_recordings(others, at_most_h)
-        data = replace(data, test=[bundle.task.series(recording) for recording in chosen])
-    elif whole > most:
-        data = replace(data, test=spread_series(data.test, length, most, on_disk=True))
-    # What is left between two stretches at the end of a recording: the shortest one decides the history of baselines.
-    least = min(length, *lengths)
-    data = replace(data, test=[part for part in data.test if part.samples >= least])
-    ticks = sum(part.samples for part in data.test)
-    return data, None if ticks == whole else Drawn(ticks / hour, whole / hour, len(data.test))
+def other_recordings(source: DataSource | None, provenance: Mapping[str, Any]) -> list[Recording] | None:
+    """Other recordings, those without a map read with that of the run; None for the held-out ones."""
+    return None if source is None else read_as_before(source, provenance["data"]["reader"]).read()
 
 
 def _check_run_writable(folder: Path) -> None:
@@ -363,9 +337,9 @@ def channel_importance(
     """
     folder = Path(run)
     _check_run_writable(folder)
-    bundle, _, _, data = trained_run(folder)
+    bundle, _, provenance, data = trained_run(folder)
     target = folder
-    data, _ = judged_data(bundle, data, None if source is None else source.read(), at_most_h)
+    data, _ = judged_data(bundle, data, other_recordings(source, provenance), at_most_h)
     if source is not None:
         target = make_folder(folder / f"on_{source.path.stem}")
     if spec is None:

@@ -77,6 +77,18 @@ def test_a_run_astray_counts_as_diverged_and_so_does_one_without_a_number():
     assert nothing.diverged().tolist() == [True, False]
 
 
+def test_what_rests_in_all_runs_is_not_astray_by_a_small_error():
+    channels = TwinChannels(COMMAND, VELOCITIES, (), (), 2.0)
+    truth = np.zeros((1, 40, 2), np.float32)
+    truth[..., 0] = np.sin(np.arange(40))
+    answers = truth.copy()
+    answers[..., 1] += 1.0  # 20 m in 20 s, of 100 m in a second at full speed
+    low, high = ends(channels, 1)
+    assert not FreeRuns(channels, ("a",), answers, truth, truth[:, 0], low, high).diverged().any()
+    # Of 10 m in a second half is exceeded.
+    assert FreeRuns(channels, ("a",), answers, truth, truth[:, 0], low / 10, high / 10).diverged().all()
+
+
 def test_units_are_never_mixed():
     mixed = (Channel("v1", Kind.VELOCITY), Channel("w", Kind.ANGULAR_VELOCITY))
     strokes = (Channel("x1", Kind.POSITION), Channel("q", Kind.ANGLE))

@@ -43,6 +43,12 @@ def load_column(table: ColumnTable, name: str, samples: int) -> Column:
 
 TORN_LINE = "torn_line"
 """Fact of a text file: the number of its last line, which was never finished and is left out."""
+EXPERIMENTS = "experiments"
+"""Fact of a MAT file that was read whole: the names of experiments that stand beside each other in one variable."""
+NAMES_AGAIN = "names_again_line"
+"""Fact of a text file: the first line within its table that repeats the names above it; all such are left out."""
+BEHIND_TABLE = "behind_table_line"
+"""Fact of a text file: the first of the lines behind its table, which are left out."""
 
 
 @dataclass(frozen=True, eq=False)

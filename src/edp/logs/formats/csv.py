@@ -18,7 +18,6 @@ from edp.errors import DataError
 from edp.logs.formats.base import (
     FORMATS,
     MOST_COLUMNS,
-    TORN_LINE,
     Column,
     RawLog,
     RawSignal,
@@ -104,8 +103,7 @@ class CsvFormat:
             signals[name] = RawSignal(
                 name, load, table.rows, time, unit=layout.units[column_index], table=table, key=key
             )
-        meta = {} if table.torn_line is None else {TORN_LINE: table.torn_line}
-        return RawLog(path, signals, repeated=repeated, meta=meta)
+        return RawLog(path, signals, repeated=repeated, meta=table.facts)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write ``time_s`` and every channel as ``name [unit]``; numbers read back bit for bit."""
@@ -159,6 +157,9 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
             units = _units_above(rows[: table_place.header], _units_between(rows[table_place.header + 1 : used], units))
         body = rows[used:]
     skip += ends[used - 1] if used else 0
+    # A logger that was restarted writes its names anew.
+    names_again = [cell.strip() for cell in head]
+    body = [row for row in body if [cell.strip() for cell in row] != names_again]
     numeric = tuple(all(is_number(row[i], decimal) for row in body if i < len(row)) for i in range(len(names)))
     return TextLayout(names, units, numeric, delimiter, decimal, skip, encoding)
 

@@ -16,7 +16,8 @@ import pyarrow.csv as arrow_csv
 from numpy.typing import NDArray
 
 from edp.errors import DataError, brief
-from edp.logs.formats.base import PIECE_ROWS
+from edp.logs.formats.base import BEHIND_TABLE, NAMES_AGAIN, PIECE_ROWS, TORN_LINE
+from edp.logs.formats.csv_leftovers import MARK, Leftovers, TableText, leftovers_of
 from edp.storage.memory import free_bytes
 
 WHOLE_BYTES = 1 << 30
@@ -190,6 +191,7 @@ class CsvTable:
         self.rows = 0
         self.ragged: list[Any] = []
         self.torn_line: int | None = None
+        self.leftovers: Leftovers | None = None
         size = path.stat().st_size
         small = size <= WHOLE_BYTES and _WIDEST * size <= _WHOLE_SHARE * free_bytes()
         for tried in range(_TRIES):
@@ -204,14 +206,34 @@ class CsvTable:
                 column = re.search(r"CSV column #(\d+)", str(error))
                 if column is None or self.types[self.keys[int(column[1])]] == pa.string():
                     raise DataError(f"'{path}' cannot be read as CSV: {brief(error)}") from error
+                if self.pass_over():
+                    continue
                 # Text further down a column of numbers: keep it as text, so that only a map that needs it is refused.
                 self.types[self.keys[int(column[1])]] = pa.string()
                 if tried:
                     self.find_texts()
                 continue
+            if self.ragged and self.pass_over():
+                continue
             self.refuse_ragged()
             return
         raise DataError(f"'{path}' cannot be read as CSV: its columns hold numbers and text in turn")
+
+    @property
+    def facts(self) -> dict[str, int]:
+        """Numbers of the first lines that are left out, by what they are."""
+        left_out = {TORN_LINE: self.torn_line}
+        if self.leftovers is not None:
+            left_out |= {NAMES_AGAIN: self.leftovers.first, BEHIND_TABLE: self.leftovers.end_line}
+        return {fact: line for fact, line in left_out.items() if line is not None}
+
+    def pass_over(self) -> bool:
+        """Look once for lines that are no rows of the table; whether there are some that were read as rows so far."""
+        if self.leftovers is not None or self.layout.delimiter == " ":
+            return False
+        layout = self.layout
+        self.leftovers = leftovers_of(self.path, layout.encoding, layout.delimiter, layout.skip_rows, len(layout.names))
+        return bool(self.leftovers)
 
     def find_texts(self) -> None:
         """Find all columns that hold text further down in one go: a parse a column would take columns times rows."""
@@ -229,7 +251,8 @@ class CsvTable:
         """How pyarrow reads the wanted columns."""
 
         def note(row: Any) -> str:
-            self.ragged.append(row)
+            if not row.text.startswith(MARK):
+                self.ragged.append(row)
             return "skip"
 
         layout = self.layout
@@ -252,8 +275,10 @@ class CsvTable:
         return read, parse, convert
 
     def source(self) -> Any:
-        """The file, or its rows with one blank between cells where any number of blanks parts them."""
+        """The file, its table alone, or its rows with one blank between cells where any number of blanks parts them."""
         layout = self.layout
+        if self.leftovers:
+            return TableText(self.path, layout.skip_rows, layout.delimiter, len(layout.names), self.leftovers)
         return SqueezedText(self.path, layout.encoding, layout.skip_rows) if layout.delimiter == " " else self.path
 
     def stream(self, keys: Sequence[str]) -> Iterator[pa.RecordBatch]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
 from edp.logs.formats.base import (
+    EXPERIMENTS,
     FORMATS,
     TRUTH,
     Column,
@@ -70,9 +71,11 @@ class MatFormat:
             if signal_map.variable == TRUTH and edp_metadata.truth:
                 edp_metadata = replace(edp_metadata, channels=edp_metadata.truth, digest=edp_metadata.truth_digest)
         if mat_variables.experiments > 1:
+            first = mat_variables.experiment_names[0] if mat_variables.experiment_names else "data{1}"
             raise DataError(
-                f"'{path}' holds {mat_variables.experiments} experiments in one iddata, which are no single log; save "
-                "each to a file of its own (in MATLAB: one = getexp(data, 1); save('one.mat', 'one'))"
+                f"'{path}' holds {mat_variables.experiments} experiments in one iddata, which are no single log; read "
+                f'each as a recording of its own: variable = "{first}" in its map (edp init writes a data set of '
+                "them), or save it to a file (in MATLAB: one = getexp(data, 1); save('one.mat', 'one'))"
             )
         if not mat_variables.signals:
             raise DataError(
@@ -167,4 +170,7 @@ def _raw_log(path: Path, mat_variables: MatVariables, edp_metadata: EdpMetadata,
     repeated = {
         name: full for name, full in mat_variables.repeated.items() if name != time_name and set(full) <= set(signals)
     }
-    return RawLog(path, signals, mat_variables.scalars, repeated=repeated, **edp_metadata.for_log())
+    facts = edp_metadata.for_log()
+    if mat_variables.experiment_names:
+        facts["meta"] = {**facts.get("meta", {}), EXPERIMENTS: mat_variables.experiment_names}
+    return RawLog(path, signals, mat_variables.scalars, repeated=repeated, **facts)

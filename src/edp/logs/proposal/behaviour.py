@@ -33,6 +33,10 @@ _SPANS = (1, 4, 16)
 """Rows over which a change is compared with a velocity: noise hides it over one, motion over many."""
 
 
+_LEAST_STEPS, _MOST_LOST = 50, 5
+"""Steps from which a clock that loses rows is told, and the longest of its steps over the usual one."""
+
+
 @dataclass(frozen=True)
 class Behaviour:
     """What the numbers of one column say.
@@ -53,6 +57,8 @@ class Behaviour:
         spanned: share of rows between the first and the last one that hold a number.
         restarts: rows at which an even rise begins anew.
         coarse: many levels, but hardly a step of more than one: a slow signal that its sensor rounds.
+        falls: rows below the one before.
+        lossy: steps are one size or a few times it, as those of a clock whose logger loses rows.
     """
 
     filled: float
@@ -70,6 +76,8 @@ class Behaviour:
     coarse: bool = False
     steady: bool = False
     spanned: float = 1.0
+    falls: int = 0
+    lossy: bool = False
 
     @property
     def counts(self) -> bool:
@@ -134,7 +142,22 @@ def behaviour_of(column: LogColumn) -> Behaviour:
         coarse=levels > 4 and len(sizes) > 0 and float(np.mean(sizes <= 1.1 * least)) > 0.9,
         steady=step > 0 and float(paced.mean()) > 0.95,
         spanned=float(np.ptp(np.flatnonzero(np.isfinite(values))) + 1) / len(values),
+        falls=falls,
+        lossy=_loses_rows(moving),
     )
+
+
+def _loses_rows(moving: Column) -> bool:
+    """Whether most steps have one size and nearly all others are a few times it."""
+    if len(moving) < _LEAST_STEPS:
+        return False
+    step = float(np.median(moving))
+    if step <= 0:
+        return False
+    times = moving / step
+    whole = np.rint(times)
+    fitting = (np.abs(times - whole) <= 0.1) & (whole >= 1) & (whole <= _MOST_LOST)
+    return bool(np.mean(fitting) > 0.98 and np.mean(fitting & (whole == 1)) > 0.6)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from edp.errors import DataError
 from edp.logs.formats.base import time_factor
 from edp.logs.proposal.behaviour import Behaviour
 from edp.logs.proposal.columns import LogColumn, LogLook
-from edp.logs.proposal.names import is_sample_time_name, is_time_name
+from edp.logs.proposal.names import is_counter_name, is_sample_time_name, is_time_name
 from edp.logs.timebase import judge
 from edp.signals import TIME_UNITS, SignalMap
 
@@ -21,6 +21,8 @@ _PRINTED, _MANY_STAMPS = 0.995, 50
 _FASTEST_HZ = 200.0
 """Rates above are brought down to one of `_PLAIN_HZ`: a machine moves slower, and a tick more costs on a controller."""
 _PLAIN_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0)
+_MOST_RESTARTS = 5
+"""Falls of uneven stamps, each the restart of a logger."""
 _LEAST_ROWS = 1500
 """Rows that a log should keep: from some 700 nothing can be set apart for tests and validation."""
 
@@ -67,7 +69,11 @@ def clock_of(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
 
 def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
     """The column of stamps: that of the reader, one named so, or the first of an even rise at the front."""
-    rising = [c for c in look.columns if behaviours[c.name].rises and not behaviours[c.name].constant]
+    rising = [
+        c
+        for c in look.columns
+        if (behaviours[c.name].rises and not behaviours[c.name].constant) or _begins_anew(c, behaviours[c.name])
+    ]
     named = [c for c in rising if c.name == look.time] + [
         c for c in rising if is_time_name(c.name) and _ticks(behaviours[c.name])
     ]
@@ -77,11 +83,19 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
         behaviour = behaviours[column.name]
         # A name that says nothing of time is doubted more than no name at all.
         nameless = look.headerless or column is not look.columns[0]
-        if nameless and behaviour.counts and (second := _behind(column, look, behaviours)) is not None:
+        numbered = nameless or is_counter_name(column.name)
+        if numbered and behaviour.counts and (second := _behind(column, look, behaviours)) is not None:
             return second
-        if column in rising and behaviour.climbs and (behaviour.even or (nameless and behaviour.steady)):
+        paced = behaviour.even or behaviour.lossy or (nameless and behaviour.steady)
+        if column in rising and behaviour.climbs and paced:
             return column
     return None
+
+
+def _begins_anew(column: LogColumn, behaviour: Behaviour) -> bool:
+    """Whether stamps that are named so rise but for a few restarts; where they are even, rows count without them."""
+    few = 0 < behaviour.falls <= _MOST_RESTARTS
+    return few and not behaviour.even and (behaviour.steady or behaviour.lossy) and is_time_name(column.name)
 
 
 def _behind(column: LogColumn, look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:

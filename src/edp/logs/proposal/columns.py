@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.logs.detect import format_for, open_log
-from edp.logs.formats.base import Column, RawLog, RawSignal
+from edp.logs.formats.base import EXPERIMENTS, Column, RawLog, RawSignal
 from edp.logs.formats.csv import NAME_BY_PLACE
 from edp.logs.timebase import Clock, judge
 from edp.signals import Kind, SignalMap
@@ -43,8 +43,6 @@ _HELD_VALUES = 4 * _VALUES
 """Numbers held at the times of the fastest signal at most; of longer logs columns of one length are looked at."""
 _OF_THE_LOGGER = ("/rosout", "rosout", "/diagnostics", "/parameter_events", "/events/")
 """Beginnings of names of what programs of ROS report about themselves."""
-_IDENTIFIERS = frozenset(("id", "can_id", "canid", "arbitration_id", "identifier", "pgn", "spn"))
-_BYTES = frozenset(("data", "payload", "bytes", "data bytes", "databytes", "data_bytes"))
 _TIME_WORDS = ("time", "zeit", "stamp", "date", "datum", "uhr")
 
 
@@ -92,6 +90,7 @@ class LogLook:
         shared: every name occurs once.
         left_out: columns that were not looked at, by the reason.
         part: what share of the file was looked at, in words; empty for all of it.
+        experiments: names of those that stand beside each other in a variable of a MAT file.
     """
 
     path: Path
@@ -104,6 +103,7 @@ class LogLook:
     headerless: bool = False
     left_out: dict[str, int] = field(default_factory=dict)
     part: str = ""
+    experiments: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -111,15 +111,19 @@ class LogLook:
         return tuple(column.name for column in self.columns)
 
 
-def look_at_log(path: Path) -> LogLook:
+def look_at_log(path: Path, experiment: str | None = None) -> LogLook:
     """Read a bounded part of every column.
+
+    Args:
+        path: the log.
+        experiment: the one of several in a MAT file that is looked at.
 
     Raises:
         DataError: the file cannot be read, or holds no column of numbers.
     """
     with _bounded(path, TEXT_BYTES) as (part, note):
         try:
-            return _look(path, part, note)
+            return _look(path, part, note, experiment)
         except DataError as error:
             # The user knows the log, not the copy of its beginning.
             raise type(error)(str(error).replace(str(part), str(path))) from error
@@ -153,11 +157,12 @@ def _bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
         yield part, f"the first {end / 1e6:.0f} of {size / 1e6:,.0f} MB"
 
 
-def _look(path: Path, part: Path, note: str) -> LogLook:
+def _look(path: Path, part: Path, note: str, experiment: str | None) -> LogLook:
     # With a stated step no column is taken for time: all of them are looked at.
-    raw = _of_the_machine(open_log(part, SignalMap(others=True, sample_time_s=1.0)))
+    whole = SignalMap(others=True, variable=experiment)
+    raw = _of_the_machine(open_log(part, replace(whole, sample_time_s=1.0)))
     for time_name in (None, *islice((name for name in raw.signals if _is_time_word(name)), 1)):
-        paced = _of_own_pace(path, part, note, time_name)
+        paced = _of_own_pace(path, part, note, replace(whole, time=time_name))
         if paced is not None:
             return paced
     length = _usual_length(raw)
@@ -172,7 +177,7 @@ def _look(path: Path, part: Path, note: str) -> LogLook:
     first = min(_ROWS, max(_VALUES // len(numbers) // 2, 100))
     ranges = _ranges(length, first, min(_LATER_ROWS, first // 3))
     pieces = _pieces(numbers, ranges)
-    time, step_s, owners = _time_of(part, raw, texts)
+    time, step_s, owners = _time_of(part, raw, texts, whole)
     clocks = _clocks_of([signal for signal in numbers if signal.name in owners])
     columns = tuple(
         LogColumn(
@@ -193,6 +198,7 @@ def _look(path: Path, part: Path, note: str) -> LogLook:
         all(NAME_BY_PLACE.fullmatch(name) for name in raw.signals) and format_for(path).name == "csv",
         {reason: count for reason, count in left_out.items() if count},
         note,
+        tuple(raw.meta.get(EXPERIMENTS, ())),
     )
 
 
@@ -206,13 +212,14 @@ def _is_time_word(name: str) -> bool:
     return any(word in name.lower() for word in _TIME_WORDS)
 
 
-def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> LogLook | None:
+def _of_own_pace(path: Path, part: Path, note: str, signal_map: SignalMap) -> LogLook | None:
     """A log whose signals have times of their own and differ in rate, at the times of the fastest; None for others."""
     try:
-        timed = _of_the_machine(open_log(part, SignalMap(others=True, time=time_name)))
+        timed = _of_the_machine(open_log(part, signal_map))
     except DataError:
         return None
     signals = [s for s in timed.signals.values() if s.time_s is not None and s.samples > 2]
+    experiments = tuple(timed.meta.get(EXPERIMENTS, ()))
     if timed.rate_hz is not None or len({s.samples for s in signals}) < 2:
         return None
     texts = tuple(s.name for s in signals if not _is_numeric(s))
@@ -244,7 +251,9 @@ def _of_own_pace(path: Path, part: Path, note: str, time_name: str | None) -> Lo
         "come after the first columns": len(alike) - len(numbers),
     }
     counted = {reason: count for reason, count in left_out.items() if count > 0}
-    return LogLook(path, tuple(columns), texts, len(stamps), None, time_name, step, False, counted, note)
+    return LogLook(
+        path, tuple(columns), texts, len(stamps), None, signal_map.time, step, False, counted, note, experiments
+    )
 
 
 def _clocks_of(signals: Sequence[RawSignal]) -> dict[str, Clock]:
@@ -352,13 +361,15 @@ def _read_or_missing(signal: RawSignal, start: int, stop: int) -> Column:
         return np.full(stop - start, np.nan)
 
 
-def _time_of(part: Path, raw: RawLog, texts: Sequence[str]) -> tuple[str | None, float | None, set[str]]:
+def _time_of(
+    part: Path, raw: RawLog, texts: Sequence[str], whole: SignalMap
+) -> tuple[str | None, float | None, set[str]]:
     """The column that the reader takes for time, the step in seconds, and the columns with stamps of their own."""
     by_word = [name for name in texts if _is_time_word(name)]
     others = [name for name in texts if name not in by_word]
     for name in (None, *islice([*by_word, *others], _MOST_TEXTS)):
         try:
-            timed = open_log(part, SignalMap(others=True, time=name))
+            timed = open_log(part, replace(whole, time=name))
             signal = next((s for s in timed.signals.values() if s.time_s is not None), None)
             stamps = None if signal is None else signal.time_s
         except DataError:
@@ -373,23 +384,3 @@ def _time_of(part: Path, raw: RawLog, texts: Sequence[str]) -> tuple[str | None,
             return name or absent[0], step, set()
         return None, step, {s.name for s in timed.signals.values() if s.time_s is not None}
     return None, None, set()
-
-
-def holds_frames(look: LogLook) -> bool:
-    """Whether the columns are those of a trace of a bus: an identifier and bytes."""
-    names = {name.lower() for name in (*look.names, *look.texts)}
-    return not _IDENTIFIERS.isdisjoint(names) and bool(names & {*_BYTES, "d0", "d1", "data0"})
-
-
-def refuse_frames(look: LogLook) -> None:
-    """Refuse a trace of a bus, whose bytes stand as text beside their identifiers.
-
-    Raises:
-        DataError: it is one; its numbers are no signals.
-    """
-    texts = {name.lower() for name in look.texts}
-    if holds_frames(look) and not _BYTES.isdisjoint(texts):
-        raise DataError(
-            f"'{look.path}' holds raw frames of a bus ({', '.join(look.texts[:3])}), no signals: decode them with "
-            "their DBC file, as MDF 4 or CSV (in Python: asammdf or cantools)"
-        )

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from edp.errors import DataError
 from edp.logs.proposal.columns import LogLook, look_at_log, names_in_log
 
+_One = TypeVar("_One")
 MOST_LOGS = 12
 """Logs that are looked at of a group of files: the first ones, the last ones and some between."""
 _ALIKE = 0.7
@@ -57,7 +59,7 @@ def group_logs(
     Raises:
         DataError: none can be read.
     """
-    chosen = _some(paths)
+    chosen = some_of(paths)
     groups: list[list[LogLook]] = []
     broken: dict[Path, str] = {}
     for i, path in enumerate(chosen):
@@ -84,7 +86,7 @@ def group_logs(
         except DataError as error:
             broken[path] = str(error)
             continue
-        fitting_group = next((i for i, group in enumerate(groups) if _fits(group[0], names)), None)
+        fitting_group = next((i for i, group in enumerate(groups) if fits(group[0], names)), None)
         if fitting_group is None:
             broken[path] = f"'{path}' has other columns than the logs that were looked at"
         else:
@@ -100,13 +102,13 @@ def group_logs(
     return sorted(groups_of_logs, key=lambda group: -group.rows), broken
 
 
-def _some(paths: Sequence[Path]) -> list[Path]:
-    """Paths spread evenly over all of them."""
-    places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), MOST_LOGS)).round().astype(int))
-    return [paths[index] for index in places]
+def some_of(logs: Sequence[_One]) -> list[_One]:
+    """`MOST_LOGS` logs at most, spread evenly over all of them."""
+    places = np.unique(np.linspace(0, len(logs) - 1, min(len(logs), MOST_LOGS)).round().astype(int))
+    return [logs[index] for index in places]
 
 
-def _fits(look: LogLook, names: frozenset[str]) -> bool:
+def fits(look: LogLook, names: frozenset[str]) -> bool:
     """Whether a log with some columns, time and text among them, belongs to one that was looked at."""
     mine = {*look.names, *look.texts} | ({look.time} if look.time is not None else set())
     return len(mine & names) >= _ALIKE * len(mine | names)

@@ -48,6 +48,8 @@ _UNIT_ENDINGS: Mapping[str, str] = {
         "L/min": "lpm lmin",
         "V": "volt volts",
         "A": "ampere",
+        "deg/s": "dps degps",
+        "rad/s": "radps",
         "K": "kelvin",
         "degC": "degC celsius",
     }.items()
@@ -62,7 +64,8 @@ ROLE_WORDS: Mapping[str, str] = {
         "pedal",
         "measured": "ist istwert act actual meas measured mess messwert fb feedback y output "
         "sensor cell transducer encoder gauge bus supply battery",
-        "label": "flag status state mode id label condition fault error leak stable zustand fehler",
+        "label": "flag status state mode id label condition fault error leak stable zustand fehler stale valid online "
+        "alive",
     }.items()
     for word in words.split()
 }
@@ -84,9 +87,24 @@ _COUNTERS = frozenset(
     ("cycle", "zyklus", "index", "idx", "sample", "row", "zeile", "nr", "no", "number", "count", "counter")
 )
 _TIMES = frozenset(
-    ("time", "zeit", "t", "timestamp", "zeitstempel", "uhrzeit", "tout", "sec", "seconds", "second", "sekunde")
+    [
+        "time",
+        "zeit",
+        "t",
+        "timestamp",
+        "zeitstempel",
+        "uhrzeit",
+        "tout",
+        "sec",
+        "seconds",
+        "second",
+        "sekunde",
+        "elapsed",
+    ]
 )
-_SAMPLE_TIMES = frozenset(("ts", "dt", "sampletime", "sample_time", "samplingtime", "tastzeit", "abtastzeit", "t_s"))
+_SAMPLE_TIMES = frozenset(
+    ("ts", "dt", "sampletime", "sample_time", "samplingtime", "tastzeit", "abtastzeit", "t_s", "dt_s", "dt_ms", "dt_us")
+)
 _JOINTS = frozenset(("joint", "joints", "gelenk", "achse", "elbow", "shoulder", "wrist", "knee", "hip", "ankle"))
 _TAG = re.compile(r"([PTF])([SIT])(\d{1,3})")
 _TAGS: Mapping[str, Kind] = {"P": Kind.PRESSURE, "T": Kind.TEMPERATURE, "F": Kind.FLOW}
@@ -168,6 +186,7 @@ def role_by_word(name: str) -> str:
     return next((role for role in ("reference", "measured", "label", "command") if role in roles), "")
 
 
+_STAMP_ENDINGS = frozenset(("ts", "timestamp", "stamp", "zeitstempel"))
 _STAMP = re.compile(r"(?:^|[./])header[./]stamp(?:[./](?:n?secs?|nanosec))?$")
 
 
@@ -189,3 +208,9 @@ def is_sample_time_name(name: str) -> bool:
 def is_stamp_name(name: str) -> bool:
     """Whether a field of a message is the time at which it was sent: a stamp of ROS, whole or in its two parts."""
     return _STAMP.search(name) is not None
+
+
+def ends_as_stamp(name: str) -> bool:
+    """Whether a name of several words ends as that of the time at which something was measured: ``pressure_ts``."""
+    words = words_of(name)
+    return len(words) > 1 and words[-1] in _STAMP_ENDINGS

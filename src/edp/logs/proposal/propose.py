@@ -14,8 +14,10 @@ from edp.logs.proposal.clocks import ClockGuess, clock_of
 from edp.logs.proposal.columns import LogColumn, LogLook
 from edp.logs.proposal.kinds import BOUND, KindGuess, kind_of, kind_of_change, with_article
 from edp.logs.proposal.names import (
+    ends_as_stamp,
     is_counter_name,
     is_error_name,
+    is_sample_time_name,
     is_stamp_name,
     kind_by_word,
     role_by_word,
@@ -38,6 +40,8 @@ _LEAST_SWITCHES = 3
 """Changes at the rate of a label that a log is long enough for, before a command without them is one."""
 _PLAIN_NAME = re.compile(r"\w[\w .\-/()%]{0,63}")
 _MOST_CHANNELS = 200
+_MOST_FALLS = 5
+"""Restarts of a logger within a log, at which stamps of its messages fall."""
 _SWITCHED_HZ = {"command": 0.01, "": 0.05, "label": 1.0}
 """Changes a second below which a column of a few whole values is a label, by what its name says: a working machine
 opens valves more often than every 100 s."""
@@ -229,14 +233,20 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
     if behaviour.constant:
         value = _EMPTY if not behaviour.filled else f"always {behaviour.high:g}"
         return ColumnGuess(name, "", "constant", _NO_KIND, 0.95, value, "" if is_known(name) else "not taken")
-    if is_stamp_name(name):
+    # A logger that was restarted has stamps that fall now and then.
+    rising = behaviour.rises or behaviour.falls <= _MOST_FALLS
+    if is_stamp_name(name) or (ends_as_stamp(name) and rising):
         return ColumnGuess(name, "", "time", _NO_KIND, 0.9, "the stamp of a message", "not taken")
+    if is_sample_time_name(name) and behaviour.low >= 0:
+        return ColumnGuess(name, "", "time", _NO_KIND, 0.8, "the time between rows", "not taken")
     if behaviour.counts and behaviour.levels > 2:
         sure = 0.9 if is_counter_name(name) else 0.65
         return ColumnGuess(name, "", "counter", _NO_KIND, sure, "rises by one", "" if sure >= SURE else "a counter?")
     if behaviour.restarts and behaviour.even and behaviour.whole:
         return ColumnGuess(name, "", "counter", _NO_KIND, 0.7, "counts and begins anew", "a counter?")
     word = role_by_word(name)
+    if word == "label" and behaviour.levels == 2 and (behaviour.low, behaviour.high) == (0.0, 1.0):
+        return ColumnGuess(name, name, "label", kind, max(kind.confidence, BOUND), "a flag by its name", "a feature?")
     seldom = behaviour.changes * (rate_hz or 1.0) < _SWITCHED_HZ.get(word, 0.0)
     # In a log of a minute a valve that is tested opens once.
     brief = word == "command" and rows < _LEAST_SWITCHES * (rate_hz or 1.0) / _SWITCHED_HZ[word]
@@ -271,7 +281,9 @@ def _role(
     if word in ("reference", "command", "measured"):
         # A single letter is a habit, not a word.
         by_letter = all(len(part) == 1 or part.isdigit() for part in words_of(name)[:1])
-        return word, 0.7 if by_letter else 0.85, "its name"
+        # y1 of a joystick is no output: what holds its value between steps of its own was moved by hand.
+        if not (by_letter and word == "measured" and behaviour.steps):
+            return word, 0.7 if by_letter else 0.85, "its name"
     if column.unit == "us":
         return "command", 0.75, "the width of a pulse"
     if kind.kind in _COMMANDS and kind.confidence >= BOUND:

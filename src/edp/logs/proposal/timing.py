@@ -58,8 +58,11 @@ class Timing:
         cut = (
             f"{path.name[:40]}: a long break in time; its longest stretch is used ({', '.join(repairs)})"
             for path, repairs in self.apart.items()
+            if "gaps=cut" in repairs
         )
-        return (*rate, *cut)
+        anew = [path.name[:40] for path, repairs in self.repairs.items() if "falling=cut" in repairs]
+        restarted = [f"the clock begins anew in {', '.join(anew[:3])}: the longest part is used"] if anew else []
+        return (*rate, *cut, *restarted)
 
 
 def timing_of(looks: Sequence[LogLook], clock: ClockGuess, mapped: Sequence[str]) -> Timing:
@@ -110,9 +113,15 @@ def _clocks(look: LogLook, clock: ClockGuess) -> list[Clock]:
 def _repairs(clock: Clock) -> set[str]:
     if clock.uniform:
         return set()
-    repairs = {"falling=sort"} if len(clock.falling) else set()
+    repairs = {f"falling={_of_falls(clock)}"} if len(clock.falling) else set()
     repairs |= {"duplicates=last"} if len(clock.duplicates) else set()
     return repairs | ({f"gaps={_of_gaps(clock)}"} if len(clock.gaps) else set())
+
+
+def _of_falls(clock: Clock) -> str:
+    """``cut`` where a clock begins anew: sorted rows would be those of two sessions in turn; else ``sort``."""
+    back = np.diff(clock.stamps)[clock.falling - 1]
+    return "cut" if back.min() < -max(_LONG_S, _LONG_STEPS * clock.step_s) else "sort"
 
 
 def _of_gaps(clock: Clock) -> str:

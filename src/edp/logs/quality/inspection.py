@@ -12,7 +12,7 @@ import numpy as np
 from edp.errors import DataError, EdpError, closest
 from edp.logs.assemble import assemble
 from edp.logs.detect import open_log
-from edp.logs.formats.base import TORN_LINE, RawLog
+from edp.logs.formats.base import BEHIND_TABLE, NAMES_AGAIN, TORN_LINE, RawLog
 from edp.logs.formats.names import name_of_file
 from edp.logs.proposal.columns import look_at_log
 from edp.logs.proposal.propose import plain_map
@@ -26,6 +26,12 @@ from edp.recording import Recording
 from edp.signals import VOCABULARY, Kind, SignalMap
 
 # Everything is read, so that every defect can be found and counted.
+_LEFT_OUT = {
+    TORN_LINE: "the last line was never finished; it is left out",
+    NAMES_AGAIN: "the names stand again within the table: the logger was restarted; such lines are left out",
+    BEHIND_TABLE: "lines behind the table are left out",
+}
+"""What a text file has beside its rows, by the fact that tells its line."""
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
 _MOST_NAMES = 2000
 """Columns that are compared with the vocabulary: each costs half a millisecond."""
@@ -76,9 +82,9 @@ def look_into(
             "no map was given and no column has a name of the vocabulary: columns are taken for what edp init proposes"
         )
         findings.append(Finding("note", None, what, 1, "", "edp init writes a map to check"))
-    if TORN_LINE in raw.meta:
-        where = f"line {raw.meta[TORN_LINE]}"
-        findings.append(Finding("note", None, "the last line was never finished; it is left out", 1, where))
+    findings += [
+        Finding("note", None, what, 1, f"line {raw.meta[fact]}") for fact, what in _LEFT_OUT.items() if fact in raw.meta
+    ]
     if not signal_map.channels and not signal_map.others:
         findings += _near_misses(raw)
     findings += _unit_clashes(raw, signal_map)
@@ -87,7 +93,8 @@ def look_into(
     findings += more
     try:
         clocks = _clocks(raw, usable, signal_map)
-        recording, _ = assemble(raw, usable, signal_map, _LENIENT, name, rows)
+        lenient = _LENIENT if repair is None or repair.falling != "cut" else replace(_LENIENT, falling="cut")
+        recording, _ = assemble(raw, usable, signal_map, lenient, name, rows)
     except DataError as error:
         findings.append(Finding("error", None, str(error)))
         empty = Recording(name or name_of_file(raw.path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
@@ -205,8 +212,9 @@ def _unit_clashes(raw: RawLog, signal_map: SignalMap) -> list[Finding]:
 def _time_findings(name: str, clock: Clock, repair: Repair) -> list[Finding]:
     at, findings = clock.stamps, []
     longest = float((at[clock.gaps + 1] - at[clock.gaps]).max()) if len(clock.gaps) else 0.0
+    back = '"sort", or "cut" for a clock that begins anew (--repair falling=sort, falling=cut)'
     defects = (
-        ("falling", clock.falling, f"time goes back ('{name}')", '"sort" (--repair falling=sort)'),
+        ("falling", clock.falling, f"time goes back ('{name}')", back),
         ("duplicates", clock.duplicates, f"duplicate time stamps ('{name}')", '"last" (--repair duplicates=last)'),
         ("gaps", clock.gaps, f"gaps in time ('{name}'), longest {longest:g} s", '"hold" or "cut" (--repair gaps=hold)'),
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edp.errors import StorageError
 from edp.storage import object_with, parse_json, read_bytes, replacing
 
-SCHEMA = 3
+SCHEMA = 4
 MOST_BYTES = 1 << 30
 """Largest file of a snapshot: days of a simulation's log."""
 _FACTS = "facts"

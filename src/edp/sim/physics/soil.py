@@ -45,6 +45,8 @@ BOUNDS = {
     "stones_per_m": span(0.0, 10.0),
     "sawtooth": span(0.0, 0.9),
     "compaction": span(0.0, 1.0),
+    "back_push": span(0.0, 1.0),
+    "back_friction_deg": span(0.0, 40.0),
 }
 """Of a material; the softest mud has a cone index of some kPa, rock has no cone index."""
 
@@ -62,9 +64,12 @@ class Material:
         roughness_length: length over which it varies, m.
         sawtooth: share of the resistance lost when a chip breaks off.
         compaction: share of the heel's lasting sinkage, up to 0.1 m of it, that stays as a rut once the heel has left.
+        back_push: share of the soil in the way of the bucket's back that it pushes ahead; the rest flows around it and
+            lies behind. 0: the back meets resistance and moves no soil.
+        back_friction_deg: of the soil on the back while it pushes, at most that of the soil.
 
     Raises:
-        ConfigError: a value is out of its bounds.
+        ConfigError: a value is out of its bounds, or friction of a back that pushes nothing or more than the soil has.
     """
 
     name: str
@@ -86,9 +91,21 @@ class Material:
     stones_per_m: float
     sawtooth: float
     compaction: float = 0.0
+    back_push: float = 0.0
+    back_friction_deg: float = 0.0
 
     def __post_init__(self) -> None:
         check_bounds("material", self, **BOUNDS)
+        if self.back_friction_deg > 0.0 and self.back_push == 0.0:
+            raise ConfigError(
+                f"material: back_friction_deg = {self.back_friction_deg:g} needs a back that pushes soil; "
+                "give back_push, too, or leave both out"
+            )
+        if self.back_friction_deg > self.friction_deg:
+            raise ConfigError(
+                f"material: back_friction_deg = {self.back_friction_deg:g} must be at most friction_deg = "
+                f"{self.friction_deg:g}; beyond it soil slides on soil"
+            )
         if self.cone_index[0] > self.cone_index[1]:
             raise ConfigError(f"material: cone_index = {list(self.cone_index)} Pa; the smaller one must come first")
 

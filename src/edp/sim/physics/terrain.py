@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
+from edp.sim.physics import bucket_back
 from edp.sim.physics import terramechanics as tm
 from edp.sim.physics.jit import compiled
 
@@ -80,6 +81,20 @@ def sweep(c: Array, moved: float, numbers: Array, heights: Array, memory: Array)
 
 
 @compiled
+def move_back(h: float, v: tuple[float, float, float, float], c: Array, ground: tuple[Array, ...]) -> None:
+    """What the back moves in a step: soil before it, and what the heel has shoved aside when it leaves."""
+    numbers, heights, memory = ground[0], ground[3], ground[4]
+    if c[tm.ON] > 0.0 and c[tm.PUSH_DEPTH] > 0.0:
+        moved = h * (v[0] if c[tm.POINTS + 1] <= c[tm.POINTS + 3] else v[2])
+        if moved > 0.0:
+            if c[tm.DEPTH] <= 0.0:
+                memory[at.DISTANCE] += moved
+            bucket_back.push(c[tm.POINTS : tm.POINTS + 4], moved, numbers[tm.BACK], heights, memory)
+    if c[tm.HEEL_DEPTH] <= 0.0 and memory[at.HEEL_SET] > 0.0:
+        bucket_back.shove_aside(c[tm.POINTS + 2], memory[at.HEEL_SET], heights, memory)
+
+
+@compiled
 def settle(state: Array, h: float, c: Array, ground: tuple[Array, ...]) -> None:
     """After a step: forces for the log, distance and shear, swept soil, the chassis."""
     numbers, heights, memory = ground[0], ground[3], ground[4]
@@ -99,6 +114,8 @@ def settle(state: Array, h: float, c: Array, ground: tuple[Array, ...]) -> None:
             # Only a drag towards the machine, edge first, fills the bucket.
             if v[0] < 0.0 and into > 0.0:
                 sweep(c, -h * v[0], numbers, heights, memory)
+        if numbers[tm.BACK] > 0.0:
+            move_back(h, v, c, ground)
         if c[tm.HEEL_DEPTH] > 0.0:
             slid = h * abs(v[2])
             memory[at.SHEAR] += slid
@@ -109,6 +126,8 @@ def settle(state: Array, h: float, c: Array, ground: tuple[Array, ...]) -> None:
         damping = 1.0
     else:
         damping = 0.0
+        if numbers[tm.BACK] > 0.0:
+            move_back(h, v, c, ground)
         memory[at.SHEAR] = memory[at.HEEL_SET] = 0.0
     # A margin above the ground: an edge that skims the surface would begin a dig at each touch.
     if memory[at.IN_SOIL] > 0.0 and c[tm.DEPTH] < -LEFT_M:
@@ -200,6 +219,9 @@ def look(row: Array, time_s: float, axes: Array, ground: tuple[Array, ...]) -> t
         spill(angle, x - 0.5 * axes[2, at.LENGTH] * math.cos(angle), time_s, numbers, heights, memory)
     if near:
         slide(x, numbers, heights)
+        if numbers[tm.BACK] > 0.0:
+            # The back pushes soil ahead of the heel, a floor's length away.
+            slide(max(x, x + length * floor_x), numbers, heights)
     else:
         memory[at.FORCE_X] = memory[at.FORCE_Y] = memory[at.PITCH] = memory[at.PITCH_RATE] = 0.0
     carry(numbers, memory, axes)

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
+from edp.sim.physics import bucket_back
+from edp.sim.physics.ground_profile import DEEPEST, GRAVITY, press, pressed_at
 from edp.sim.physics.ground_profile import SPACING as SPACING
 from edp.sim.physics.ground_profile import height_at as height_at
-from edp.sim.physics.ground_profile import press, pressed_at
 from edp.sim.physics.jit import compiled, inlined
 from edp.sim.sensors import filters
 
@@ -36,14 +37,13 @@ Four = tuple[float, float, float, float]
     ACTIVE, WIDTH, DENSITY, SWELL, COHESION, ADHESION, BEKKER, EXPONENT, SHEAR_LENGTH, CONE, STEEPEST, REPOSE,
     ROUGHNESS, COURSE_STEP, SAWTOOTH, CAPACITY, FLOOR_COS, FLOOR_SIN, FLOOR_LENGTH, EDGE_AREA, LOAD_X, LOAD_Y,
     BUCKET_MASS, BUCKET_X, BUCKET_Y, BUCKET_INERTIA, PITCH_INERTIA, PITCH_STIFFNESS, PITCH_DAMPING, LIFT_MOMENT,
-    UNLOADING, HEEL_DAMPING, HEAP_LIMIT, BEARING_LIMIT, METAL_COS, METAL_SIN, COMPACTION,
-) = range(37)  # fmt: skip
-NUMBERS = 37
+    UNLOADING, HEEL_DAMPING, HEAP_LIMIT, BEARING_LIMIT, METAL_COS, METAL_SIN, COMPACTION, BACK,
+) = range(38)  # fmt: skip
+NUMBERS = BACK + bucket_back.VALUES
 # contact[...]: what one step needs; Jacobians of tip and heel hold one value per joint
 (ON, DRAG, ACROSS, EDGE, EDGE_X, EDGE_Y, NORMAL, NORMAL_DAMPING, SLIDE, DEPTH, HEEL_DEPTH) = range(11)
-TIP_JX, TIP_JY, HEEL_JX, HEEL_JY, PITCHED, POINTS, DAMPING = 11, 14, 17, 20, 23, 27, 31
-CONTACTS = 40
-GRAVITY = 9.81
+TIP_JX, TIP_JY, HEEL_JX, HEEL_JY, PITCHED, POINTS, DAMPING, PUSH_DEPTH = 11, 14, 17, 20, 23, 27, 31, 40
+CONTACTS = 41
 CREEP = 0.02
 """Speed (m/s) over which the direction of soil forces is smoothed."""
 STONE_STEP = 0.005
@@ -58,14 +58,12 @@ EDGE_DEPTH = 0.05
 """Depth (m) at which the whole edge is in the ground."""
 HEEL_CONTACT = 0.2
 """Length (m) of floor plate that bears on the ground; E."""
-DEEPEST = 1.2
-"""Depth (m) beyond which the cutting force stays: about the height of a bucket."""
 PIN_STIFFNESS = 1.2e7
 """Stiffness (N/m) of the front behind the heel; E."""
 TURNING = 0.05
 """Horizontal speed (m/s) over which the soil before the edge changes from one side to the other."""
 PUSHED_BACK = 0.5
-"""Share of the cutting force when the back of the bucket pushes loose soil away; E."""
+"""Share of the cutting force that the back of the bucket meets where it moves no soil (`back_push` is 0); E."""
 
 
 def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> tuple[float, float, float]:
@@ -172,6 +170,7 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
     }
     numbers = np.zeros(NUMBERS)
     numbers[list(values)] = list(values.values())
+    numbers[BACK:] = bucket_back.pack(material, bucket.width)
     return numbers
 
 
@@ -217,7 +216,7 @@ def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Ar
     rake = math.atan2(floor[1], floor[0])
     force = inward * factor * cutting_force(depth, rake, 0.5 * loose * GRAVITY * heap, numbers, table)
     back = 0.0
-    if inward < 1.0:
+    if inward < 1.0 and numbers[BACK] == 0.0:
         # The back of the bucket meets the soil at the supplementary rake, and has no heap before it.
         back = (1.0 - inward) * factor * cutting_force(depth, math.pi - rake, 0.0, numbers, table)
     along, rise = floor
@@ -297,6 +296,8 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
     if c[HEEL_DEPTH] > 0.0:
         c[ON] = 1.0
         engage_heel(numbers, heights, memory, c)
+    if numbers[BACK] > 0.0:
+        engage_back(w1, w2, w3, ground, c)
     if c[ON] > 0.0:
         hold(w1, w2, w3, c)
         damp(c)
@@ -310,6 +311,24 @@ def velocities(c: Array, w1: float, w2: float, w3: float) -> Four:
     heel_x = c[HEEL_JX] * w1 + c[HEEL_JX + 1] * w2 + c[HEEL_JX + 2] * w3 + c[PITCHED + 2]
     heel_y = c[HEEL_JY] * w1 + c[HEEL_JY + 1] * w2 + c[HEEL_JY + 2] * w3 + c[PITCHED + 3]
     return tip_x, tip_y, heel_x, heel_y
+
+
+@compiled
+def engage_back(w1: float, w2: float, w3: float, ground: Ground, c: Array) -> None:
+    """Add what the soil before the back resists with to the forces in `c`, at the lower of tip and heel."""
+    v = velocities(c, w1, w2, w3)
+    back, tip_lower = ground[0][BACK:], c[POINTS + 1] <= c[POINTS + 3]
+    outward = min(max(0.5 + 0.5 * (v[0] if tip_lower else v[2]) / TURNING, 0.0), 1.0)
+    c[PUSH_DEPTH], push = bucket_back.before_it(c[POINTS : POINTS + 4], ground[3], ground[4], back)
+    if outward > 0.0 and c[PUSH_DEPTH] > 0.0:
+        c[ON] = 1.0
+        push *= outward * strength(ground[0], ground[2], ground[4])[0]
+        if tip_lower:
+            c[DRAG] += push
+            # Its friction lifts the floor plate, the more so the steeper that stands.
+            c[ACROSS] += push * back[bucket_back.LIFT] * -c[EDGE_Y]
+        else:
+            c[SLIDE] += push
 
 
 @inlined

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edp.data.folds import Folds, blocked_folds
+from edp.data.folds import Folds, blocked_folds, recording_folds
 from edp.data.lags import DoubleArray
 from edp.data.prepared import Prepared
 from edp.data.series import Series
@@ -28,6 +28,9 @@ PRESENT_BEYOND, CHANGE_BEYOND = 1.0, 10.0
 """How far beyond what trained a column may go, in ranges of it. A position or temperature that leaves its range by more
 than all of it says little by a linear map; larger changes than recorded ones are often real, as in quicker motion
 (findings: Sjoberg's arm, and an arm of which an axis moved for the first time)."""
+FEW_LEVELS = 16
+"""Levels of a channel up to which it and its changes are held at their range: an encoder of an axis that rests shows a
+few steps of noise or drift; a line through them says nothing of the axis in motion (findings: one axis a log)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +129,15 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
             # No gradient reaches these weights: random ones would answer a channel that moves later for the first time.
             group.weights[0][:, still] = 0.0
     lengths = [len(of) for of in chosen]
+    whole = _whole_recordings(stretches, data.test, lengths, spec.folds)
+    starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), firsts, strict=True)
+    if whole is not None:
+        return Table(columns, targets, whole, stride, tuple(starts))
     pieces = _pieces(rows / spec.folds, data.test, reach, stride)
     # Rows within the bank's reach and the largest horizon of a fold share samples with it. Beside pieces as short as
     # what tests there is the gap that lies beside that (`prepare`): wider ones would cost a third of what trains.
     gap = math.ceil(((net.spec.window if pieces > 1 else bank.reach) + reach) / stride)
     gap = min(gap, max(1, sum(lengths) // (4 * spec.folds * pieces)))
-    starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), firsts, strict=True)
     return Table(columns, targets, blocked_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
 
 
@@ -139,8 +145,20 @@ def _limits(columns: NDArray[np.float32], present: int) -> tuple[torch.Tensor, t
     """Least and largest value that each column may have: its range, widened; the first `present` are no changes."""
     low, high = columns.min(axis=0), columns.max(axis=0)
     share = np.where(np.arange(len(low)) < present, PRESENT_BEYOND, CHANGE_BEYOND)
+    few = np.array([len(np.unique(columns[:, channel])) <= FEW_LEVELS for channel in range(present)])
+    share[np.tile(few, len(low) // present)] = 0.0
     beyond = (share * (high - low)).astype(np.float32)
     return torch.from_numpy(low - beyond), torch.from_numpy(high + beyond)
+
+
+def _whole_recordings(
+    stretches: Sequence[Series], test: Sequence[Series], lengths: Sequence[int], folds: int
+) -> Folds | None:
+    """Folds of whole recordings where whole recordings test, of which no row trains; None where parts of them do."""
+    names = [part.recording for part in stretches]
+    if not test or not all(names) or not {part.recording for part in test}.isdisjoint({*names, ""}):
+        return None
+    return recording_folds(lengths, names, folds)
 
 
 def _pieces(share: float, test: Sequence[Series], reach: int, stride: int) -> int:

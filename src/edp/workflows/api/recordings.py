@@ -273,7 +273,7 @@ def read(
         map: which columns become which channels: a map file, or its content as a mapping. Without one every column of
             numbers is taken under its own name; the vocabulary or else the file's unit tells its kind.
         repair: what may be repaired, by default nothing: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``,
-            ``keep``), ``duplicates`` (``last``), ``falling`` (``sort``).
+            ``keep``), ``duplicates`` (``last``), ``falling`` (``sort``, ``cut``).
 
     Raises:
         DataError: nothing to read, or a log that cannot be used as it is.

@@ -10,6 +10,7 @@ from typing import Any
 
 from edp.config.experiment import build, plain_tree
 from edp.evaluation.judge import JudgedModel, JudgedPart, JudgeSpec, ModelBench, by_effort, network_parts
+from edp.evaluation.judged_data import judged_data
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -18,7 +19,7 @@ from edp.training.blas import one_blas_thread
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.packing import packed, unpacked
 from edp.workflows.executors.units import UnitResult, WorkUnit, forget_units, run_units
-from edp.workflows.train_evaluate import evaluate, judged_data, trained_run
+from edp.workflows.train_evaluate import evaluate, other_recordings, trained_run
 
 UNITS, NETWORK = "units", "network"
 
@@ -106,7 +107,8 @@ def _bench(run: str, digest: str, source: str, at_most_h: float | None, spec: Ju
         at_most_h: as in `edp.workflows.train_evaluate.evaluate`.
         spec: how to judge.
     """
-    bundle, _, _, data = trained_run(Path(run))
+    bundle, _, provenance, data = trained_run(Path(run))
     other = json.loads(source)
-    data, _ = judged_data(bundle, data, None if other is None else DataSource.from_plain(other).read(), at_most_h)
+    others = other_recordings(None if other is None else DataSource.from_plain(other), provenance)
+    data, _ = judged_data(bundle, data, others, at_most_h)
     return ModelBench(bundle.predictor, data, spec)

@@ -21,6 +21,7 @@ from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scor
 from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
 from edp.evaluation.step_response import step_responses
+from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor, describe
 from edp.networks.running import stream_predictions
@@ -175,6 +176,7 @@ def evaluate_twin(
         )
     target = folder
     if source is not None:
+        source = read_as_before(source, bundle.provenance["data"]["reader"])
         recordings = [matched(channels, recording) for recording in source.read()]
         data = replace(data, test=[channels.task().series(recording) for recording in recordings])
         target = make_folder(folder / f"on_{source.path.stem}")

@@ -14,6 +14,7 @@ from edp.errors import ConfigError, DataError, closest
 from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
 from edp.logs import write_recording
+from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
 from edp.recording import Recording
@@ -65,7 +66,7 @@ def rollout_log(
 
     Args:
         run: run folder of a twin.
-        source: one log.
+        source: one log; without a map it is read with that of the run.
         seconds: length of the free run.
         start_s: its start in the log; None: as early as the prefix allows.
         measured: channels that stay measured throughout (mixed mode).
@@ -78,7 +79,7 @@ def rollout_log(
     """
     bundle = load_twin(run)
     twin = bundle.twin
-    recording = matched(twin.channels, _only(source.read()))
+    recording = matched(twin.channels, _only(read_as_before(source, bundle.provenance["data"]["reader"]).read()))
     measured_columns = _columns(twin, measured)
     series = twin.channels.task().series(recording)
     start, ticks = _span(twin, recording, seconds, start_s)

@@ -14,6 +14,7 @@ import scipy.io
 
 from edp.errors import DataError, brief
 from edp.logs.formats.matlab.check import check_size
+from edp.logs.formats.matlab.experiments import experiment_names, pick_experiment
 from edp.logs.formats.matlab.library import matio
 from edp.logs.formats.matlab.objects import collect
 from edp.logs.formats.matlab.sigstream import place_streams, variable_names
@@ -31,7 +32,7 @@ def unpack(path: Path, variable: str | None = None) -> MatVariables:
 
     Args:
         path: the file.
-        variable: read this one only.
+        variable: read this one only, or one experiment of several in it (``train{2}``).
 
     Raises:
         DataError: the file is damaged or holds more than this machine's memory.
@@ -40,9 +41,12 @@ def unpack(path: Path, variable: str | None = None) -> MatVariables:
     info = variables.pop(INFO, None)
     names = list(variables)
     if variable is not None:
-        variables = {name: value for name, value in variables.items() if name == variable}
+        picked = None if variable in variables else pick_experiment(variables, variable)
+        names += [] if picked is None else [variable]
+        variables = picked or {name: value for name, value in variables.items() if name == variable}
     mat_variables = collect(variables)
     mat_variables.names = names
+    mat_variables.experiment_names = experiment_names(variables)
     if info is not None:
         array = np.asarray(info)
         mat_variables.info = str(array.ravel()[0]) if array.size else ""

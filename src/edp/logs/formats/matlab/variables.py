@@ -34,7 +34,8 @@ class MatVariables:
         repeated: names that several columns have, with the names that tell them apart.
         names: of the variables.
         info: EDP's facts, a text; None where the file has none.
-        experiments: in one ``iddata``; those of more than one are not read.
+        experiments: in one ``iddata``; those of more than one are read one by one.
+        experiment_names: names of those that stand beside each other in one variable (``train{1}``).
     """
 
     signals: list[Part] = field(default_factory=list)
@@ -43,6 +44,7 @@ class MatVariables:
     names: list[str] = field(default_factory=list)
     info: str | None = None
     experiments: int = 1
+    experiment_names: list[str] = field(default_factory=list)
 
 
 def is_v4(head: bytes) -> bool:

@@ -1,0 +1,74 @@
+"""Experiments that stand beside each other in a MAT file, each a recording of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from edp.errors import DataError
+from edp.logs.proposal.columns import look_at_log
+from edp.logs.proposal.groups import LogGroup, fits, some_of
+
+TRAINING_WORDS = ("est", "train", "id", "training", "identification")
+TEST_WORDS = ("val", "test", "validation")
+"""Names of variables by which an author parted experiments."""
+MOST_EXPERIMENTS = 2000
+"""Experiments of a group of files: each is a recording in a data-set file."""
+
+
+@dataclass(frozen=True)
+class Experiments:
+    """Experiments with the same columns.
+
+    Attributes:
+        group: those that were looked at, as logs.
+        entries: file and name of each.
+        others: those among these with other columns, by file and name.
+    """
+
+    group: LogGroup
+    entries: tuple[tuple[Path, str], ...]
+    others: tuple[str, ...]
+
+    def names(self) -> list[str]:
+        """A name a recording: ``train_1``; behind that of the file where there are several."""
+        files = {path for path, _ in self.entries}
+        short = [entry.replace("{", "_").rstrip("}") for _, entry in self.entries]
+        return short if len(files) == 1 else [f"{path.stem}_{name}" for (path, _), name in zip(self.entries, short)]
+
+    def tests(self) -> list[str]:
+        """Recordings that the author set apart as tests; empty where no names say so."""
+        variables = [entry.partition("{")[0].lower() for _, entry in self.entries]
+        parted = {word in TRAINING_WORDS for word in variables} == {True, False}
+        named = set(variables) <= {*TRAINING_WORDS, *TEST_WORDS}
+        if not (parted and named):
+            return []
+        return [name for name, word in zip(self.names(), variables) if word in TEST_WORDS]
+
+
+def part_experiments(group: LogGroup) -> Experiments | None:
+    """The experiments within the logs of a group; None where they hold none.
+
+    Raises:
+        DataError: too many for a data set.
+    """
+    entries = [(look.path, name) for look in group.looks for name in look.experiments]
+    if not entries:
+        return None
+    if len(entries) > MOST_EXPERIMENTS:
+        raise DataError(
+            f"'{group.looks[0].path}' and its like hold {len(entries):,} experiments; at most {MOST_EXPERIMENTS:,} "
+            "become recordings: give fewer files"
+        )
+    looks = [replace(look_at_log(path, name), path=_pseudo_path(path, name)) for path, name in some_of(entries)]
+    alike = [look for look in looks if fits(looks[0], frozenset(look.names))]
+    others = {look.path for look in looks if look not in alike}
+    alike_entries = tuple(entry for entry in entries if _pseudo_path(*entry) not in others)
+    ordered = tuple(sorted(alike, key=lambda look: -look.rows))
+    group = LogGroup(ordered, tuple(_pseudo_path(*entry) for entry in alike_entries))
+    return Experiments(group, alike_entries, tuple(path.name for path in others))
+
+
+def _pseudo_path(path: Path, name: str) -> Path:
+    """A path that stands for an experiment: no file has it."""
+    return path.with_name(f"{path.name} {name.replace('/', '_')}")
