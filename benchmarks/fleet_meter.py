@@ -89,8 +89,11 @@ class Meter:
 
     def busiest(self) -> float:
         """Of the worker that took most, likewise."""
-        workers = [self._since(spent) for process, spent in self.seen.items() if process != os.getpid()]
-        return max(workers, default=0.0)
+        return max(self.each(), default=0.0)
+
+    def each(self) -> list[float]:
+        """Of each worker, likewise."""
+        return [self._since(spent) for process, spent in self.seen.items() if process != os.getpid()]
 
     def _since(self, place: dict[int, float]) -> float:
         before = self.begun | self.marked

@@ -6,6 +6,9 @@ process of its own. Stores of more hours list the same ten hours again and again
 numbers would take 65 GB of disk. So what a command holds in memory is that of so many hours, and so is the time that it
 computes; the time to read from a disk is not, since ten hours stay in the system's cache.
 
+With ``--at-most HOURS`` it is only asked what commands take on the largest store where they look at so many hours of
+it: `inspect`, `screen`, and `evaluate` of a run that was trained on the base, judged on that store.
+
 Memory is what a process holds beside files that the system may drop and read again (anonymous memory), looked at every
 0.2 s. The time of an update is the difference of two trainings of one epoch, in processor time.
 """
@@ -114,6 +117,32 @@ def of_hours(store: Path, folder: Path, times: int, hours: float, commands: list
     return rows
 
 
+def of_a_part(folder: Path, base: float, hours: float, at_most: float, quick: bool, seed: int) -> None:
+    """What commands take that look at some hours of a store, and their verdicts, in results of their own."""
+    store, data = folder / "store", folder / f"store_{hours:g}"
+    write_logs(folder / "logs", base, 20, seed)
+    run(["store", "build", str(folder / "logs"), "--out", str(store), "--workers", "1"])
+    repeated(store, data, max(1, round(hours / base)))
+    run(training(store, folder / "trained", 2 if quick else UPDATES[0], 1))
+    part = ["--at-most", f"{at_most:g}"]
+    names = "persistence,ridge_arx"
+    orders = {
+        "inspect": ["inspect", str(data), *part],
+        "screen": ["screen", str(data), "--out", str(folder / "screened"), "--no-pictures", *part],
+        "evaluate": ["evaluate", str(folder / "trained"), "--data", str(data), "--baselines", names, *part],
+    }
+    rows: list[Row] = []
+    for name, order in orders.items():
+        rows.append((name, hours, at_most, *run(order)))
+        print(*rows[-1], flush=True)
+    table([f"{CHANNELS} channels, {RATE_HZ:g} Hz", "hours", "looked at, h", "processor s", "anonymous MB"], rows)
+    verdicts = [
+        verdict(f"memory of {row[0]} on {at_most:g} of {hours:g} h", row[4], GOAL_MB, "<= 1", "MB", quick)
+        for row in rows
+    ]
+    finish("store_part", verdicts, seed, {"rows": rows, "base_hours": base})
+
+
 def draw_ms(store: Path, in_memory: bool) -> tuple[float, float]:
     """Processor time to plan an epoch of the preset quick in s, and to draw each of 300 batches of it in ms."""
     names = tuple(TABLE_A1)
@@ -138,7 +167,14 @@ def main() -> None:
     added = parser(__doc__ or "")
     added.add_argument("--hours", type=float, nargs="*", default=[10.0, 100.0, 1000.0], help="of the stores")
     added.add_argument("--commands", nargs="*", default=list(COMMANDS), help="which commands to measure at each size")
+    added.add_argument("--at-most", type=float, default=None, help="only commands that look at so many hours")
+    added.add_argument("--base", type=float, default=2.0, help="with --at-most: hours that are listed again and again")
     arguments = added.parse_args()
+    if arguments.at_most is not None:
+        base, hours = (0.1, 0.4) if arguments.quick else (arguments.base, arguments.hours[-1])
+        with tempfile.TemporaryDirectory(dir=arguments.data) as temporary:
+            of_a_part(Path(temporary), base, hours, arguments.at_most, arguments.quick, arguments.seed)
+        return
     base, updates = (0.2, 20) if arguments.quick else (BASE_HOURS, 300)
     # Screening alone would take half of the minute.
     sizes, commands = ([0.4], ["evaluate", "inspect"]) if arguments.quick else (arguments.hours, arguments.commands)

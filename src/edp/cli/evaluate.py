@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,6 +35,10 @@ def evaluate(
         float | None,
         typer.Option(min=0.0, help="After these begin no further baseline; cheap ones come first."),
     ] = None,
+    at_most: Annotated[
+        float | None,
+        typer.Option("--at-most", help="Judge on evenly spread stretches of at most so many hours, about."),
+    ] = None,
     predictor: Annotated[
         Path | None, typer.Option(help="Of a twin: run folder of a look-ahead predictor to compare with.")
     ] = None,
@@ -56,7 +60,8 @@ def evaluate(
     if minutes is not None and not workforce.alone:
         raise ConfigError("--minutes bounds what one process does; leave it out with --workers and --cluster")
     if holds_twin(run):
-        refuse_for_a_twin(run, workforce.alone, baselines is None and not channel_importance and minutes is None)
+        plain = baselines is None and not channel_importance and minutes is None and at_most is None
+        refuse_for_a_twin(run, workforce.alone, plain)
         evaluate_twin_run(run, source, predictor, as_json)
         return
     if predictor is not None:
@@ -67,12 +72,12 @@ def evaluate(
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
     from edp.storage.runs import read_provenance
 
-    folder, scores = run_evaluation(run, source, names, as_json, minutes, workforce)
+    folder, scores = run_evaluation(run, source, names, as_json, minutes, workforce, at_most)
     beaten = beaten_by(scores, minutes_of(run))
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
     choice = read_choice(run) if source is None else None
     beyond, promise = situation_line(scores), "" if choice is None else promise_line(choice)
-    importances = run_importance(run, source, as_json) if channel_importance else None
+    importances = run_importance(run, source, as_json, at_most) if channel_importance else None
 
     def show() -> None:
         for sentence in ("" if beaten is None else beaten.sentence(), lost):
@@ -108,18 +113,21 @@ def refuse_for_a_twin(run: Path, alone: bool, plain: bool) -> None:
         raise ConfigError(f"'{run}' holds a twin, which one process judges; leave --workers and --cluster out")
     if not plain:
         raise ConfigError(
-            f"'{run}' holds a twin, which has no --baselines, --minutes or --channel-importance; leave them out: "
+            f"'{run}' holds a twin, which has no --baselines, --minutes, --at-most or --channel-importance; leave "
+            "them out: "
             "its floors are those of its settings, judge.floors"
         )
 
 
-def show_scores(scores: Mapping[str, Any], sentences: Sequence[str], minutes: float | None) -> None:
+def show_scores(scores: dict[str, Any], sentences: Sequence[str], minutes: float | None) -> None:
     """Print the tables of an evaluation, what is to be said of it, and what the time was too short for."""
     score_table(scores)
     by_situation_table(scores)
     for sentence in sentences:
         if sentence:
             out.print(sentence)
+    if "drawn" in scores:
+        out.print(f"judged on {scores['drawn']['what']}; leave --at-most out for all")
     if scores.get("left_out"):
         left = ", ".join(map(str, scores["left_out"]))
         out.print(f"left out after --minutes {minutes:g}: {left}; give the command without it to judge them, too")
@@ -178,6 +186,7 @@ def run_evaluation(
     quiet: bool = False,
     minutes: float | None = None,
     workforce: Workforce | None = None,
+    at_most_h: float | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Judge with a progress display; returns the folder of the scores and the scores."""
     from edp.storage import read_object
@@ -193,21 +202,23 @@ def run_evaluation(
             steps.say(f"evaluate: {name}, {duration(time.monotonic() - began)} so far")
 
         if workforce is None or workforce.alone:
-            folder = judge_run(run, source, names, on_step, minutes)
+            folder = judge_run(run, source, names, on_step, minutes, at_most_h=at_most_h)
         else:
             from edp.workflows.fleet.judging import evaluate_with
 
-            folder = evaluate_with(workforce, run, source, names, on_step)
+            folder = evaluate_with(workforce, run, source, names, on_step, at_most_h)
     return folder, read_object(folder / "scores.json")
 
 
-def run_importance(run: Path, source: DataSource | None = None, quiet: bool = False) -> ChannelImportances:
+def run_importance(
+    run: Path, source: DataSource | None = None, quiet: bool = False, at_most_h: float | None = None
+) -> ChannelImportances:
     """Take channels away with a progress display."""
     from edp.workflows.train_evaluate import channel_importance
 
     with progress(quiet) as shown:
         on_group = counted(shown, Steps(quiet), "channel importance", "removed")
-        importances, _ = channel_importance(run, source, on_group=on_group)
+        importances, _ = channel_importance(run, source, on_group=on_group, at_most_h=at_most_h)
     return importances
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
-from edp.cli.quality import LogDisplay, show_between, show_lines, show_report, verdict_text
+from edp.cli.quality import AtMostOption, LogDisplay, show_between, show_lines, show_report, verdict_text
 from edp.cli.train import MapOption
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import DataError, EdpError
@@ -48,6 +49,7 @@ def inspect(
     inputs: Annotated[
         str, typer.Option(help="Command channels, where names and kinds do not identify them: a,b.")
     ] = "",
+    at_most: AtMostOption = None,
     workers: WorkersOption = 1,
     cluster: ClusterOption = "",
     open_cluster: OpenOption = False,
@@ -62,7 +64,8 @@ def inspect(
     """
     from edp.logs.source import DataSource
 
-    source, asked = DataSource.of(data, signal_map), page is not None or bool(split or inputs)
+    source = replace(DataSource.of(data, signal_map), at_most_h=at_most)
+    asked = page is not None or bool(split or inputs)
     names, inspection = tuple(filter(None, inputs.split(","))), None
     workforce = workforce_of(workers, cluster, open_cluster)
     with progress(as_json) as shown:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from edp.cli.console import Steps, out, table
 
@@ -14,6 +16,12 @@ if TYPE_CHECKING:
 
     from edp.logs import DataQuality, Finding, QualityReport
 
+AtMostOption = Annotated[
+    float | None,
+    typer.Option(
+        "--at-most", help="Of a store, look at evenly spread stretches of at most so many hours, about; default: all."
+    ),
+]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _MOST_KINDS = 12
 """Kinds of findings of one severity that are shown without --details."""

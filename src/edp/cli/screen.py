@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, listing, out, progress, table
-from edp.cli.quality import LogDisplay, show_between, verdict_text
+from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 
@@ -60,6 +60,7 @@ def screen(
     own: Annotated[
         list[Path], typer.Option("--features", help="With --trials: further feature-set file; may be repeated.")
     ] = [],  # noqa: B006
+    at_most: AtMostOption = None,
     workers: WorkersOption = 1,
     cluster: ClusterOption = "",
     open_cluster: OpenOption = False,
@@ -93,7 +94,7 @@ def screen(
             trials=trial_spec,
             sets=_own_sets(own),
         )
-    source = source_of(data, signal_map, repair)
+    source = replace(source_of(data, signal_map, repair), at_most_h=at_most)
     selection = run_screening(source, folder, order, as_json, workforce_of(workers, cluster, open_cluster))
     command = next_command(data, signal_map, repair, selection)
 

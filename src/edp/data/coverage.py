@@ -18,9 +18,9 @@ from edp.data.distance import Distance, split_distance
 from edp.data.integrals import contradiction, integral_fit
 from edp.data.roles import Axis, Roles, roles_of, signed
 from edp.data.splits import Split
-from edp.data.spread_rows import spread_recordings
 from edp.data.twin_channels import INTEGRAL
 from edp.errors import DataError
+from edp.logs.drawn import STRETCH_S, spread_recordings
 from edp.recording import Recording
 from edp.signals import KINDS, Kind
 
@@ -33,8 +33,6 @@ TAIL = 5e-4
 """Share of the samples at either end that lies outside a joint histogram."""
 QUANTILES = 32
 """Bins of equal content for the mutual information."""
-STRETCH_S = 120.0
-"""Of the stretches that a large data set is looked at by."""
 INFORMED = 200_000
 """Samples for the mutual information, evenly spread."""
 MEASURED, INTEGRATED = "strokes", "integrated velocity"

@@ -142,6 +142,16 @@ def some_columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
     return values[:, list(places)]
 
 
+def some_rows(values: FloatArray, start: int, stop: int) -> FloatArray:
+    """The rows ``start:stop`` of an array; those of a gathered one stay where they are."""
+    if isinstance(values, _Gathered):
+        first = values._rows[0]
+        rows = first + start, min(first + stop, values._rows[1])
+        some = _Gathered(values._values, values._places.tolist(), values._gains.tolist(), rows)
+        return cast(FloatArray, some)
+    return values[start:stop]
+
+
 def on_demand(values: FloatArray, places: Sequence[int]) -> FloatArray:
     """Columns of samples, ``(time, column)``: a view where they lie side by side, else gathered row by row."""
     first = places[0] if places else 0

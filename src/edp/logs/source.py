@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ import numpy as np
 from edp.errors import ConfigError, DataError
 from edp.logs.buckets import BucketReader, RemoteFile, bucket_address
 from edp.logs.detect import known_suffixes
+from edp.logs.drawn import checked_hours, drawn_recordings, findings_of_part
+from edp.logs.quality.checks import Finding
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into, unreadable
 from edp.logs.quality.quality import inspect
@@ -20,7 +22,7 @@ from edp.logs.quality.sketches import Sketches, sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
 from edp.logs.store.building import StoredLog, StoreProgress, build_store
-from edp.logs.store.index import StoreIndex, is_store
+from edp.logs.store.index import StoreIndex, is_store, read_index
 from edp.logs.store.opening import read_store
 from edp.logs.store.remote import is_remote_store, local_store
 from edp.recording import MACHINE, Recording
@@ -67,11 +69,20 @@ class DataSource:
             store in a bucket, and for logs to build one from.
         signal_map: columns to channels; None takes the vocabulary's names.
         repair: what may be repaired.
+        at_most_h: of a store, evenly spread stretches of at most so many hours, about, in place of all; None for all.
+
+    Raises:
+        ConfigError: not a positive number of hours.
     """
 
     path: Path
     signal_map: SignalMap | None = None
     repair: Repair | None = None
+    at_most_h: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.at_most_h is not None:
+            checked_hours(self.at_most_h)
 
     @staticmethod
     def of(path: str | Path, map_file: str | Path | None = None, repair: Repair | None = None) -> DataSource:
@@ -99,6 +110,8 @@ class DataSource:
             plain["map"] = plain_tree(self.signal_map)
         if self.repair is not None:
             plain["repair"] = plain_tree(self.repair)
+        if self.at_most_h is not None:
+            plain["at_most_h"] = self.at_most_h
         return plain
 
     @staticmethod
@@ -106,7 +119,7 @@ class DataSource:
         """The source that `to_plain` described."""
         signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
-        return DataSource(Path(plain["path"]), signal_map, repair)
+        return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"))
 
     def logs(self) -> list[Log]:
         """The logs of the source, unread, each with the map that belongs to it; a store has none."""
@@ -127,8 +140,9 @@ class DataSource:
         """
         if self.stored:
             self.check_store_options()
-            return read_store(self.store_folder())
-        self._refuse_bucket()
+            stored = read_store(self.store_folder())
+            return stored if self.at_most_h is None else drawn_recordings(stored, self.at_most_h)
+        self._refuse_bucket_and_sample()
         if self.path.suffix != ".toml":
             return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
         recordings = [log.read() for log in self.logs()]
@@ -146,7 +160,7 @@ class DataSource:
         """
         if self.stored:
             return self._inspect_store(on_log)
-        self._refuse_bucket()
+        self._refuse_bucket_and_sample()
         logs = self.logs()
         reports, sketches, sketched = [], Sketches(), []
         broken: list[DataError] = []
@@ -195,22 +209,31 @@ class DataSource:
         return build_store(stored, folder, workers, on_progress)
 
     def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
-        self.check_store_options()
-        recordings = read_store(self.store_folder())
+        recordings = self.read()
         reports, sketches = [], Sketches()
         for i, recording in enumerate(recordings):
             if on_log is not None:
                 on_log(self.path / recording.name, i + 1, len(recordings))
             reports.append(inspect(recording))
             sketches.add(sketch(recording))
-        return compare(reports, sketches)
+        return compare(reports, sketches, self.drawn_findings(recordings))
 
-    def _refuse_bucket(self) -> None:
-        """Logs in buckets are read once: each command would copy them again."""
+    def drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
+        """What an inspection says where these recordings are only a part of the store."""
+        whole = self.at_most_h is None
+        return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
+
+    def _refuse_bucket_and_sample(self) -> None:
+        """Each command would copy logs in buckets again, and how long logs are is known once they are read."""
         if self.address:
             raise ConfigError(
                 f"'{self.address}' holds logs and no store; read them once with `edp store build {self.address} --out "
                 "store`, and give this command the store"
+            )
+        if self.at_most_h is not None:
+            raise ConfigError(
+                f"--at-most {self.at_most_h:g} came with '{self.path}', which is no store; read the logs once with "
+                "`edp store build LOGS --out STORE`, and give this command the store"
             )
 
     def check_store_options(self) -> None:

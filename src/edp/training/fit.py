@@ -26,7 +26,7 @@ from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
 from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, by_gradient, check_training, thread_count
-from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, TrainingStrategy
+from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, StreamStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
 
 
@@ -261,24 +261,24 @@ class Loop:
         x = torch.from_numpy(batch.inputs).to(self.device)
         reset = torch.from_numpy(batch.reset).to(self.device)
         initial = self.net.initial_state(len(x), x)
-        if state is None or len(x) != self.spec.chunks.batch or self.spec.chunks.regime == "window":
-            state = initial
-        else:
-            state = reset_where(reset, initial, state)
+        anew = state is None or len(x) != self.spec.chunks.batch or self.spec.chunks.regime == "window"
+        state = initial if anew or state is None else reset_where(reset, initial, state)
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * self._factor()
         future, valid = (torch.from_numpy(part).to(self.device) for part in (batch.future, batch.valid))
         if isinstance(self.strategy, EpisodicStrategy):
             loss = self.strategy.episode(self.net, self.objective, (x, future, valid))
         else:
+            taught = None if batch.teacher_targets is None else torch.from_numpy(batch.teacher_targets).to(self.device)
+            if taught is not None and isinstance(self.strategy, StreamStrategy):
+                self.strategy.tell(self.net, taught, reset)
             answer, features, hidden, state = self.net.forward_features(x, state)
-            if self.strategy is None or batch.teacher_targets is None:
+            if self.strategy is None or taught is None:
                 loss = self.objective.evaluate(answer, future, features, valid)
             else:
-                teacher_targets = torch.from_numpy(batch.teacher_targets).to(self.device)
                 done = self.progress.updates / (self.updates * self.spec.epochs)
-                batch_context = BatchContext(answer, future, features, hidden, valid, teacher_targets, done)
-                loss = self.strategy.loss(self.objective, batch_context)
+                context = BatchContext(answer, future, features, hidden, valid, taught, done)
+                loss = self.strategy.loss(self.objective, context)
         self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):

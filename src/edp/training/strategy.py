@@ -70,6 +70,15 @@ class TrainingStrategy(Protocol):
 
 
 @runtime_checkable
+class StreamStrategy(TrainingStrategy, Protocol):
+    """A training strategy that sets what the network is told of each stream before it runs along a chunk."""
+
+    def tell(self, net: Predictor, teacher_targets: Tensor, reset: Tensor) -> None:
+        """Set it from ``(batch, time, column)`` and from which streams ``(batch,)`` start anew with this chunk."""
+        ...
+
+
+@runtime_checkable
 class DirectFit(Protocol):
     """Fits the network by itself, without the loop over chunks."""
 

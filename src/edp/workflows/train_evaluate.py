@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -21,6 +21,7 @@ from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, first_scored, judge, score_network
+from edp.evaluation.judged_data import judged_data
 from edp.evaluation.scores_file import earlier_scores
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
@@ -233,6 +234,7 @@ def evaluate(
     on_step: Callable[[str], None] | None = None,
     minutes: float | None = None,
     judged_by: JudgedBy | None = None,
+    at_most_h: float | None = None,
 ) -> Path:
     """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
 
@@ -240,11 +242,12 @@ def evaluate(
 
     Args:
         run: run folder.
-        source: other recordings; all of them are judged. Logs without a map are read with that of the run.
+        source: other recordings. Logs without a map are read with that of the run.
         baselines: names; None takes those of the settings.
         on_step: called with the name of each model before it runs.
         minutes: after which no further baseline is begun; a later call judges it.
         judged_by: measures all models in place of this process; `minutes` is then not looked at.
+        at_most_h: judge on evenly spread stretches of so many hours, about, where there are more; None judges on all.
 
     Returns:
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
@@ -252,13 +255,13 @@ def evaluate(
     folder = Path(run)
     _check_run_writable(folder)
     bundle, experiment, provenance, data = trained_run(folder)
-    target, judged = folder, [data.digest]
+    target, judged, others = folder, [data.digest], other_recordings(source, provenance)
     if source is not None:
-        recordings = read_as_before(source, provenance["data"]["reader"]).read()
-        data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
         # Content by name and digest: the same file changed is another judgement.
-        judged += [part for recording in recordings for part in (recording.name, recording.digest)]
+        judged += [part for recording in others or () for part in (recording.name, recording.digest)]
         target = make_folder(folder / f"on_{source.path.stem}")
+    data, drawn = judged_data(bundle, data, others, at_most_h)
+    judged += [part.name for part in data.test] if drawn else []
     chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
     settings = plain_tree(replace(experiment, judge=chosen))["judge"]
     # Settings may leave the first tick to what models need, which versions have seen differently.
@@ -273,13 +276,19 @@ def evaluate(
             bench = ModelBench(bundle.predictor, data, chosen)
             evaluation = bench.together(judged_by(bench, " ".join(judged)))
         # Scores that lack a baseline are not kept for a call that asks for all.
-        scores = evaluation.scores | {"key": "" if "left_out" in evaluation.scores else key}
+        sample = {} if drawn is None else {"drawn": {**asdict(drawn), "what": drawn.what}}
+        scores = evaluation.scores | sample | {"key": "" if "left_out" in evaluation.scores else key}
         write_bytes(target / "predictions.safetensors", save(evaluation.tensors))
         write_json(target / "scores.json", scores)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
         save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
     return target
+
+
+def other_recordings(source: DataSource | None, provenance: Mapping[str, Any]) -> list[Recording] | None:
+    """Other recordings, those without a map read with that of the run; None for the held-out ones."""
+    return None if source is None else read_as_before(source, provenance["data"]["reader"]).read()
 
 
 def _check_run_writable(folder: Path) -> None:
@@ -312,14 +321,16 @@ def channel_importance(
     source: DataSource | None = None,
     spec: ChannelImportanceSpec | None = None,
     on_group: Callable[[str, int, int], None] | None = None,
+    at_most_h: float | None = None,
 ) -> tuple[ChannelImportances, Path]:
     """Importance of each input channel to the network of a run, on its held-out recordings or on other ones.
 
     Args:
         run: run folder.
-        source: other recordings; all of them are judged.
+        source: other recordings.
         spec: how channels are taken away; without it, collinear channels are also taken away together.
         on_group: called with the channels, how many groups are done and of how many.
+        at_most_h: as in `evaluate`.
 
     Returns:
         The figures, and their file ``channel_importance.json`` in the run folder, or in its subfolder for `source`.
@@ -328,9 +339,8 @@ def channel_importance(
     _check_run_writable(folder)
     bundle, _, provenance, data = trained_run(folder)
     target = folder
+    data, _ = judged_data(bundle, data, other_recordings(source, provenance), at_most_h)
     if source is not None:
-        recordings = read_as_before(source, provenance["data"]["reader"]).read()
-        data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
         target = make_folder(folder / f"on_{source.path.stem}")
     if spec is None:
         groups = collinear([part.inputs for part in data.train])

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from edp.data.chunks import ChunkSampler
 from edp.errors import ConfigError
 from edp.ir.builder import Builder
 from edp.networks.backbones import GruSpec
 from edp.networks.blocks.machine_code import MachineCode
+from edp.networks.predictor import build_model
 from edp.networks.running import mean_error
 from edp.training import load_bundle
 from edp.training.delta import delta_of
-from edp.workflows.pretraining import MetaSpec, Pretrain, pretrain
-from edp.workflows.pretraining.methods.codes import MachineSampler, coded_block
+from edp.workflows.pretraining import Pretrain, pretrain
+from edp.workflows.pretraining.methods.codes import WithCodes, coded_block
 from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
 
@@ -25,7 +27,7 @@ def fleet(machines, experiment, tmp_path_factory):
     split = dataclasses.replace(experiment.split, validation=("press-2",), test=("press-4",))
     backbone = dataclasses.replace(experiment.model.backbone, channels=(10,), units=10)
     model = dataclasses.replace(experiment.model, backbone=backbone, blocks=(MachineCode(size=2),))
-    order = Pretrain(method="codes", meta=MetaSpec(shots=1))
+    order = Pretrain(method="codes")
     pretrain(machines, dataclasses.replace(experiment, training=training, split=split, model=model), order, folder)
     return folder
 
@@ -84,13 +86,26 @@ def test_the_block_is_gains_and_shifts_of_its_code_and_its_layer_holds_them():
     np.testing.assert_allclose(found["shift"], shift.detach().numpy(), rtol=1e-6)
 
 
-def test_pieces_of_a_machine_carry_its_number(prepared_machines, experiment):
-    sampler = MachineSampler(prepared_machines.train, (2,), experiment.training.chunks, 1, 0)
-    owners = list(sampler.owned)
-    batch = next(iter(sampler.epoch(0)))
-    assert batch.inputs.shape[2] == prepared_machines.train[0].inputs.shape[1] + 1
-    for lane in batch.inputs:
-        machine = owners[int(lane[0, -1])]
-        parts = [prepared_machines.train[i].inputs for i in sampler.owned[machine]]
-        assert any((part[:, 0, None] == lane[0, 0]).any() and np.isin(lane[:, 1], part[:, 1]).all() for part in parts)
-        assert np.ptp(lane[:, -1]) == 0
+def test_a_stream_has_the_code_of_its_machine_or_none_from_its_start_to_its_end(prepared_machines, experiment):
+    data, strategy = prepared_machines, WithCodes()
+    network = build_model(
+        data.task, dataclasses.replace(experiment.model, blocks=(MachineCode(size=2),)), data.scaler(), 0
+    )
+    series = strategy.series(data.task, data.train)
+    assert [part.machine for part in series] == [part.machine for part in data.train]
+    strategy.begin(network, experiment.training)
+    block, seen = coded_block(network), set()
+    table = block.table.detach().view(strategy.machines, -1)
+    sampler = ChunkSampler(series, data.task.horizons, dataclasses.replace(experiment.training.chunks, carried=3), 0)
+    unknown = None
+    for batch in (batch for number in range(40) for batch in sampler.epoch(number)):
+        numbers, reset = torch.from_numpy(batch.teacher_targets), torch.from_numpy(batch.reset)
+        assert (numbers == numbers[:, :1]).all()
+        strategy.tell(network, numbers, reset)
+        without = (block.lanes == 0).all(dim=1)
+        own = numbers[:, 0, 0].long()
+        assert torch.equal(block.lanes[~without].detach(), table[own[~without]])
+        if unknown is not None:
+            assert torch.equal(without[~reset], unknown[~reset])
+        unknown, seen = without, seen | {*without.tolist()}
+    assert seen == {True, False}

@@ -247,7 +247,7 @@ def test_a_start_is_a_candidate_and_another_start_another_run(machines, experime
 
 def test_streams_are_carried_for_a_minute_unless_the_settings_say_otherwise(made, experiment):
     _, found = made
-    assert found["carried"] == (150 if found["method"] == "joint" else 0)
+    assert found["carried"] == (150 if found["method"] in ("joint", "codes") else 0)
 
 
 def test_what_cannot_be_is_refused(machines, experiment, tmp_path, prepared_machines):

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from edp.data.gathered import on_demand, some_columns
 from edp.data.screening.result import Array
 from edp.data.screening.spec import ScreeningSpec
-from edp.data.spread_rows import MOST_ROWS, spread_stretches
 from edp.errors import DataError, closest
 from edp.recording import FloatArray, Recording
 from edp.signals import TABLE_A1, Kind
+from edp.stats.stretches import MOST_ROWS, spread_stretches
 
 LEAST_LAGS, LAGS_A_STRETCH = 5, 40
 """Largest lags that a recording is long at least, and that a stretch of a large data set is."""

@@ -63,18 +63,19 @@ class DataQuality:
         }
 
 
-def compare(reports: Sequence[QualityReport], sketches: Sketches) -> DataQuality:
+def compare(reports: Sequence[QualityReport], sketches: Sketches, more: Sequence[Finding] = ()) -> DataQuality:
     """Compare the recordings of a data set.
 
     Args:
         reports: of the recordings, each alone.
         sketches: of those that could be read.
+        more: what else is to be said of all of them.
     """
     repeats = find_repeats(sketches.all)
     advice = (
         "keep one of them, or put both on one side of the split: a test that repeats training says nothing of new data"
     )
-    findings = [Finding("warning", None, repeat.what, 1, "", advice) for repeat in repeats]
+    findings = [*more, *(Finding("warning", None, repeat.what, 1, "", advice) for repeat in repeats)]
     if sketches.by_hash:
         first = len(sketches.all) - sketches.by_hash
         what = (
@@ -116,6 +117,8 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
 def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
     """Which two units explain both ratios, empty where none do."""
     decades = [math.log10(ratio) for ratio in ratios]
+    if min(map(abs, decades)) < math.log10(_LEAST_RATIO) - _NEAR_DECADES:  # Most channels: no two units explain it.
+        return ""
     for text, between in _unit_pairs(kind):
         if all(abs(one - between) < _NEAR_DECADES for one in decades):
             return text

@@ -19,7 +19,9 @@ from edp.logs.quality.sketches import Floats, Sketch
 WINDOW = 128
 """Blocks of a fingerprint, 12.8 s."""
 _HOP = 32
-"""Distance of the windows that are searched in; all windows are searched for, so any lag meets one."""
+"""Distance of the windows that are searched in, less or more one by turns: at even and at odd blocks. Windows at even
+blocks are searched for, so any lag, even or odd, meets one in 64 blocks."""
+_STEP = 2
 _COEFFICIENTS = 12
 """Cosines of a fingerprint: up to 0.47 Hz."""
 _NEAR = 0.15
@@ -32,7 +34,7 @@ _OWN, _OWN_UNNAMED = 2, 16
 _SAME = 0.98
 """Correlation of a window in both recordings."""
 _LEAST_WINDOWS = 2
-_LEAST_VOTES = 4
+_LEAST_VOTES = 3
 """Fingerprints that must agree on a lag before it is checked."""
 _HOPELESS = 0.8
 """Correlation below which no fraction of a block makes two windows the same."""
@@ -143,17 +145,18 @@ def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
     searched: list[Floats] = []
     labels: list[Labels] = []
     for i, column in columns_of:
-        marks, places = _fingerprints(sketches[i].values[:, column])
-        probes = np.flatnonzero(places % _HOP == 0)
-        searched.append(marks[probes])
-        labels.append(np.stack([np.full(len(probes), i), places[probes]], axis=1))
+        values = sketches[i].values[:, column]
+        marks, places = _fingerprints(values, _searched_places(len(values) - WINDOW + 1))
+        searched.append(marks)
+        labels.append(np.stack([np.full(len(places), i), places], axis=1))
     owners = np.concatenate(labels)
     if not len(owners):
         return {}
     tree = cKDTree(np.concatenate(searched))
     votes = []
     for i, column in columns_of:
-        marks, places = _fingerprints(sketches[i].values[:, column])
+        values = sketches[i].values[:, column]
+        marks, places = _fingerprints(values, np.arange(0, len(values) - WINDOW + 1, _STEP))
         near, which = tree.query(marks, k=_NEIGHBOURS, distance_upper_bound=_NEAR)
         asked, rank = np.nonzero(np.isfinite(near))
         theirs = owners[which[asked, rank]]
@@ -217,9 +220,21 @@ def _lively(entry: Sketch) -> list[float]:
     return [float(share) for share in moved.mean(axis=0)] if len(moved) else [0.0] * len(entry.channels)
 
 
-def _fingerprints(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Fingerprints of every window in which the channel moves, shape ``(window, 12)``, and where they begin."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW)
+def _searched_places(windows: int) -> NDArray[np.int64]:
+    """First blocks of the windows that are searched in, of so many: even and odd ones by turns."""
+    every = np.arange(0, windows, _HOP)
+    every[1::2] += 1
+    return every[every < windows]
+
+
+def _fingerprints(values: Floats, places: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+    """Fingerprints ``(window, 12)`` of those windows in which the channel moves, and where they begin.
+
+    Args:
+        values: blocks of a channel.
+        places: where the windows begin.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW)[places]
     phase = np.pi * (np.arange(WINDOW) + 0.5) / WINDOW
     order = np.arange(1, _COEFFICIENTS + 1)
     basis = np.cos(np.outer(phase, order)) * np.sqrt(2.0 / WINDOW)
@@ -228,7 +243,7 @@ def _fingerprints(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
     moving_windows = np.flatnonzero(np.linalg.norm(marks, axis=1) > _MOVES * WINDOW**0.5)
     # Slow parts are large in every motion: as in a derivative, faster ones count for more.
     marks = marks[moving_windows] * order.astype(np.float32)
-    return marks / np.linalg.norm(marks, axis=1, keepdims=True), moving_windows
+    return marks / np.linalg.norm(marks, axis=1, keepdims=True), places[moving_windows]
 
 
 def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:

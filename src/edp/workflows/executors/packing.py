@@ -23,6 +23,7 @@ from safetensors.numpy import load, save
 from edp.errors import DataError
 
 T = TypeVar("T")
+_NESTED = (list, dict)
 TREE, KIND, VALUE = "tree", "of", "is"
 MOST_DEPTH = 40
 
@@ -86,10 +87,10 @@ def unpacked(data: bytes, kind: type[T]) -> T:
 def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str, type], depth: int) -> Any:
     if depth > MOST_DEPTH:
         raise ValueError(f"nested deeper than {MOST_DEPTH} levels")
+    if not isinstance(tree, _NESTED):
+        return tree
     if isinstance(tree, list):
         return [_together(part, tensors, classes, depth + 1) for part in tree]
-    if not isinstance(tree, dict):
-        return tree
     kind, value = tree[KIND], tree[VALUE]
     if kind == "float":
         return float(value)
@@ -98,12 +99,20 @@ def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str,
     if kind == "array":
         return tensors[str(value)]
     if kind == "tuple":
-        return tuple(_together(part, tensors, classes, depth + 1) for part in value)
+        return tuple(
+            _together(part, tensors, classes, depth + 1) if isinstance(part, _NESTED) else part for part in value
+        )
     if kind == "map":
         # Two levels: a pair, and what is in it.
         pairs = [[_together(part, tensors, classes, depth + 2) for part in pair] for pair in value]
         return dict(pairs)
-    return classes[kind](**{name: _together(part, tensors, classes, depth + 1) for name, part in value.items()})
+    # Plain values, most of all, are not handed down.
+    return classes[kind](
+        **{
+            name: _together(part, tensors, classes, depth + 1) if isinstance(part, _NESTED) else part
+            for name, part in value.items()
+        }
+    )
 
 
 # Asked for with every unit of work, and the same in each.

@@ -13,7 +13,6 @@ from edp.config.experiment import Experiment, FeatureSettings, TaskSettings
 from edp.data.feature_files import set_text
 from edp.data.features import FEATURE_SETS, FeatureSet
 from edp.data.screening import FlagKind, OnProgress, ScreeningResult, ScreeningSpec, screen
-from edp.data.spread_rows import MOST_ROWS
 from edp.errors import DataError, closest
 from edp.logs import DataQuality, Repair, common_channels, open_log
 from edp.logs.formats.base import is_truth
@@ -22,6 +21,7 @@ from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
+from edp.stats.stretches import MOST_ROWS
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import command_line
 from edp.workflows.feature_selection.changes import with_changes

@@ -1,8 +1,9 @@
-"""`edp inspect` and the inspection of `edp screen` by a pool or a cluster: a unit a log, and one for the coverage."""
+"""`edp inspect` and the inspection of `edp screen` by a pool or a cluster: a unit is some logs, or the coverage."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +16,7 @@ from edp.logs.quality.inspection import unreadable
 from edp.logs.quality.sketches import Sketches
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource
-from edp.logs.store import read_index, read_store
+from edp.logs.store import read_index
 from edp.recording import Recording
 from edp.settings.tree import build, plain_tree
 from edp.signals import SignalMap
@@ -28,6 +29,8 @@ from edp.workflows.fleet.storing import keys_of, stored_logs
 
 STORED_UNITS = 64
 """Units that the recordings of a store are divided into, about: opening a store takes longer the more it holds."""
+UNIT_BYTES = 4 * 2**20
+"""Of the logs of a unit, about a second of work: a unit takes hundredths of one to hand out and to take back."""
 OnLog = Callable[[Path, int, int], None]
 
 
@@ -76,7 +79,8 @@ def inspect_with(
     Raises:
         DataError: no log can be read at all.
     """
-    units = _units_of_store(source) if source.stored else _units_of_logs(source)
+    recordings = source.read() if source.stored or source.at_most_h is not None else []
+    units = _units_of_store(source, recordings) if source.stored else _units_of_logs(source)
     looks = len(units)
     if covers is not None:
         # First: it takes longest.
@@ -93,7 +97,7 @@ def inspect_with(
         why = str(first.values["why"])
         covered = None if first.content is None else unpacked(first.content, Coverage)
     looked = [unpacked(result.content or b"", LookedAt) for result in results[:looks]]
-    broken = [str(result.values.get("broken", "")) for result in results[:looks]]
+    broken = [str(why) for result in results[:looks] for why in result.values.get("broken", ("",))]
     if broken and all(broken):  # as one process says it
         raise DataError(broken[0])
     reports = [report for one in looked for report in one.reports]
@@ -107,65 +111,82 @@ def inspect_with(
     for entry in sketches:
         if entry is not None:
             bounded.add(entry)
-    return Inspection(compare(reports, bounded), covered, why)
+    return Inspection(compare(reports, bounded, source.drawn_findings(recordings)), covered, why)
 
 
 def _units_of_logs(source: DataSource) -> list[WorkUnit]:
-    units = []
-    for log, stored in zip(source.logs(), stored_logs(source), strict=True):
-        arguments = {
-            "map": None if log.signal_map is None else plain_tree(log.signal_map),
-            "name": log.name,
-            "rows": None if log.rows is None else list(log.rows),
-            "repair": None if log.repair is None else plain_tree(log.repair),
-        }
-        where = {"path": str(log.path.resolve()), "shown": str(log.path)}
-        units.append(WorkUnit(f"{__name__}:look_at_log", str(log.path), arguments, stored.key, where))
+    units, logs, keys, places, size = [], list[dict[str, Any]](), list[str](), list[dict[str, str]](), 0
+    listed = list(zip(source.logs(), stored_logs(source), strict=True))
+    for number, (log, stored) in enumerate(listed):
+        logs.append(
+            {
+                "map": None if log.signal_map is None else plain_tree(log.signal_map),
+                "name": log.name,
+                "rows": None if log.rows is None else list(log.rows),
+                "repair": None if log.repair is None else plain_tree(log.repair),
+            }
+        )
+        keys.append(stored.key)
+        places.append({"path": str(log.path.resolve()), "shown": str(log.path)})
+        size += log.path.stat().st_size if log.path.is_file() else 0
+        if size >= UNIT_BYTES or number == len(listed) - 1:
+            label, where = places[0]["shown"], {"logs": places}
+            units.append(WorkUnit(f"{__name__}:look_at_logs", label, {"logs": logs}, " ".join(keys), where))
+            logs, keys, places, size = [], [], [], 0
     return units
 
 
-def look_at_log(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
-    """Look into one log."""
-    table, rows = identity.config["map"], identity.config["rows"]
-    signal_map = None if table is None else build(SignalMap, table, f"map of '{where['shown']}'")
+def look_at_logs(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Look into some logs."""
+    looked = [_look(log, at) for log, at in zip(identity.config["logs"], where["logs"], strict=True)]
+    reports, sketches, broken = zip(*looked, strict=True)
+    return WithState({"broken": list(broken)}, packed(LookedAt(reports, sketches)))
+
+
+def _look(log: Mapping[str, Any], at: Mapping[str, str]) -> tuple[QualityReport, Sketch | None, str]:
+    """Report and sketch of a log, and why it cannot be read."""
+    signal_map = None if log["map"] is None else build(SignalMap, log["map"], f"map of '{at['shown']}'")
     # The path as it was given stands in messages; where it leads nowhere on this node, the resolved one is read.
-    shown = Path(where["shown"])
-    path = shown if shown.exists() else Path(where["path"])
-    span = None if rows is None else (rows[0], rows[1])
-    repairs = identity.config["repair"]
-    repair = None if repairs is None else build(Repair, repairs, f"repairs of '{where['shown']}'")
-    broken = ""
+    shown = Path(at["shown"])
+    path = shown if shown.exists() else Path(at["path"])
+    span = None if log["rows"] is None else (log["rows"][0], log["rows"][1])
+    repair = None if log["repair"] is None else build(Repair, log["repair"], f"repairs of '{at['shown']}'")
     try:
-        report, drawn = look_into(path, signal_map, identity.config["name"], span, repair)
+        return (*look_into(path, signal_map, log["name"], span, repair), "")
     except DataError as error:
-        broken, report, drawn = str(error), unreadable(shown, error), None
-    return WithState({"verdict": report.verdict, "broken": broken}, packed(LookedAt((report,), (drawn,))))
+        return unreadable(shown, error), None, str(error)
 
 
-def _units_of_store(source: DataSource) -> list[WorkUnit]:
-    source.check_store_options()
-    entries = read_index(source.store_folder()).recordings
-    each = max(1, -(-len(entries) // STORED_UNITS))
+def _units_of_store(source: DataSource, recordings: Sequence[Recording]) -> list[WorkUnit]:
+    # What decides all of them: a stretch is drawn by how many recordings there are, and how long.
+    digest = _digest([entry.digest for entry in read_index(source.store_folder()).recordings])
+    each = max(1, -(-len(recordings) // STORED_UNITS))
     units = []
-    for first in range(0, len(entries), each):
-        part = entries[first : first + each]
-        arguments = {"first": first, "digests": [entry.digest for entry in part]}
+    for first in range(0, len(recordings), each):
+        part = recordings[first : first + each]
+        arguments = {"first": first, "count": len(part), "at_most_h": source.at_most_h}
         where = {"store": str(source.store_folder().resolve())}
-        units.append(WorkUnit(f"{__name__}:look_at_stored", str(source.path / part[0].name), arguments, where=where))
+        label = str(source.path / part[0].name)
+        units.append(WorkUnit(f"{__name__}:look_at_stored", label, arguments, digest, where))
     return units
+
+
+def _digest(parts: Sequence[str]) -> str:
+    return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
 
 
 def look_at_stored(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
     """Look at some recordings of a store."""
-    digests = identity.config["digests"]
-    recordings = _opened(where["store"], tuple(digests))[identity.config["first"] :][: len(digests)]
+    config = identity.config
+    opened = _opened(where["store"], identity.data, config["at_most_h"])
+    recordings = opened[config["first"] :][: config["count"]]
     looked = LookedAt(tuple(map(inspect, recordings)), tuple(map(sketch, recordings)))
     return WithState({"recordings": len(recordings)}, packed(looked))
 
 
 @lru_cache(maxsize=1)
-def _opened(store: str, digests: tuple[str, ...]) -> list[Recording]:
-    return read_store(store)
+def _opened(store: str, digest: str, at_most_h: float | None) -> list[Recording]:
+    return DataSource(Path(store), at_most_h=at_most_h).read()
 
 
 def _coverage_unit(source: DataSource, covers: CoverageOrder) -> WorkUnit:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import build, plain_tree
 from edp.evaluation.judge import JudgedModel, JudgedPart, JudgeSpec, ModelBench, by_effort, network_parts
+from edp.evaluation.judged_data import judged_data
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -19,7 +19,7 @@ from edp.training.blas import one_blas_thread
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.packing import packed, unpacked
 from edp.workflows.executors.units import UnitResult, WorkUnit, forget_units, run_units
-from edp.workflows.train_evaluate import evaluate, trained_run
+from edp.workflows.train_evaluate import evaluate, other_recordings, trained_run
 
 UNITS, NETWORK = "units", "network"
 
@@ -30,6 +30,7 @@ def evaluate_with(
     source: DataSource | None = None,
     baselines: Sequence[str] | None = None,
     on_step: Callable[[str], None] | None = None,
+    at_most_h: float | None = None,
 ) -> Path:
     """As `edp.workflows.train_evaluate.evaluate`, by a workforce: models run side by side.
 
@@ -39,6 +40,7 @@ def evaluate_with(
         source: other recordings.
         baselines: names; None takes those of the settings.
         on_step: called with a sentence when a model is done.
+        at_most_h: as in `evaluate`.
 
     Returns:
         The folder with ``scores.json``.
@@ -52,10 +54,11 @@ def evaluate_with(
         # Costly ones first, so that none of them begins last; parts of the network, all alike, fill what is left.
         names, spec = [*reversed(by_effort(bench.spec.baselines))], bench.spec
         parts = network_parts(bench.data)
-        models = [_unit(f"model '{name}'", {"model": name}, spec, digest, folder, source) for name in names]
+        told = None if source is None else source.to_plain()
+        at = {"run": str(folder.resolve()), "source": told, "at_most_h": at_most_h}
+        models = [_unit(f"model '{name}'", {"model": name}, spec, digest, at) for name in names]
         runs = [
-            _unit(f"network, part {part + 1} of {parts}", {"part": part}, spec, digest, folder, source)
-            for part in range(parts)
+            _unit(f"network, part {part + 1} of {parts}", {"part": part}, spec, digest, at) for part in range(parts)
         ]
 
         def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
@@ -72,15 +75,12 @@ def evaluate_with(
         judged[NETWORK] = bench.network_of(measured, label, seconds)
         return {name: judged[name] for name in [NETWORK, *by_effort(spec.baselines)]}
 
-    scored = evaluate(folder, source, baselines, judged_by=by_units)
+    scored = evaluate(folder, source, baselines, judged_by=by_units, at_most_h=at_most_h)
     forget_units(folder / UNITS)
     return scored
 
 
-def _unit(
-    label: str, does: Mapping[str, Any], spec: JudgeSpec, digest: str, folder: Path, source: DataSource | None
-) -> WorkUnit:
-    where = {"run": str(folder.resolve()), "source": None if source is None else source.to_plain()}
+def _unit(label: str, does: Mapping[str, Any], spec: JudgeSpec, digest: str, where: Mapping[str, Any]) -> WorkUnit:
     return WorkUnit(f"{__name__}:judge_model", label, {**does, "judge": plain_tree(spec)}, digest, where)
 
 
@@ -88,7 +88,8 @@ def _unit(
 def judge_model(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
     """Scores of one baseline, or what the network of a run measures on one part, and what pictures show of it."""
     spec = build(JudgeSpec, identity.config["judge"], "of the unit")
-    bench = _bench(where["run"], identity.data, json.dumps(where["source"], sort_keys=True), spec)
+    source = json.dumps(where["source"], sort_keys=True)
+    bench = _bench(where["run"], identity.data, source, where["at_most_h"], spec)
     if "part" in identity.config:
         return WithState({"part": identity.config["part"]}, packed(bench.network_part(identity.config["part"])))
     name = identity.config["model"]
@@ -96,17 +97,18 @@ def judge_model(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithSta
 
 
 @lru_cache(maxsize=1)
-def _bench(run: str, digest: str, source: str, spec: JudgeSpec) -> ModelBench:
+def _bench(run: str, digest: str, source: str, at_most_h: float | None, spec: JudgeSpec) -> ModelBench:
     """A run with its data, once for all that a process measures of them.
 
     Args:
         run: run folder.
         digest: of the data, so that changed data are read anew.
         source: other recordings as JSON.
+        at_most_h: as in `edp.workflows.train_evaluate.evaluate`.
         spec: how to judge.
     """
-    bundle, _, _, data = trained_run(Path(run))
+    bundle, _, provenance, data = trained_run(Path(run))
     other = json.loads(source)
-    if other is not None:
-        data = replace(data, test=[bundle.task.series(recording) for recording in DataSource.from_plain(other).read()])
+    others = other_recordings(None if other is None else DataSource.from_plain(other), provenance)
+    data, _ = judged_data(bundle, data, others, at_most_h)
     return ModelBench(bundle.predictor, data, spec)

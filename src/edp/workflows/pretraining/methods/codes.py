@@ -10,17 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edp.data.chunks import Piece, Sampler
-from edp.data.episodes import EpisodeSampler
-from edp.data.prepared import Prepared
+from edp.data.episodes import by_machine
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.networks.blocks.machine_code import CodedChannels, MachineCode
 from edp.networks.predictor import ModelSpec, Predictor
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec
-from edp.training.strategy import BatchContext, EpisodicStrategy, TrainingStrategy
-from edp.training.validation import validation_scores
+from edp.training.strategy import BatchContext, StreamStrategy, TrainingStrategy
 from edp.training.warm_start import continue_from
 from edp.workflows.pretraining.methods.base import PRETRAININGS
 from edp.workflows.pretraining.spec import MetaSpec
@@ -38,7 +35,7 @@ class Codes:
     """Minimise the mean error over all machines, each with a code of its own that is learned with the weights."""
 
     label: ClassVar[str] = "With codes"
-    episodic: ClassVar[bool] = True
+    episodic: ClassVar[bool] = False
 
     def model(self, spec: ModelSpec) -> ModelSpec:
         """The network with the block that reads a code, behind the blocks that it has."""
@@ -47,75 +44,60 @@ class Codes:
         return replace(spec, blocks=(*spec.blocks, MachineCode()))
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy:
-        """Pieces of machines, each with its code."""
-        return WithCodes(spec, start)
+        """Streams of machines, each with its code."""
+        return WithCodes(start)
 
 
-class MachineSampler(EpisodeSampler):
-    """Episodes whose inputs have one more column: the number of the machine, constant over a piece."""
-
-    def _episode(self, machine: str, rng: np.random.Generator) -> list[Piece]:
-        number = list(self.owned).index(machine)
-        return [
-            (np.column_stack([inputs, np.full(len(inputs), number, np.float32)]), *rest)
-            for inputs, *rest in super()._episode(machine, rng)
-        ]
-
-
-class WithCodes(EpisodicStrategy):
+class WithCodes(StreamStrategy):
     """Learns the codes of the machines that train beside the weights, and keeps the weights alone.
 
     Args:
-        spec: `shots`, pieces of a machine in an update, counts here; no step is taken.
         start: a network to begin with; None begins at random.
     """
 
-    def __init__(self, spec: MetaSpec, start: Predictor | None = None) -> None:
-        self.spec, self.start = spec, start
-        self.machines: tuple[str, ...] = ()
+    def __init__(self, start: Predictor | None = None) -> None:
+        self.start, self.machines = start, 0
+        self.block: CodedChannels | None = None
+        self.told = self.size = torch.zeros(0)
+        """Which streams have a code, and the mean square of the codes of the last chunk."""
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series as they are; their machines are noted."""
-        self.machines = tuple(dict.fromkeys(part.machine for part in own_series))
-        return list(own_series)
-
-    def sampler(self, series: Sequence[Series], task: Task, spec: TrainingSpec) -> Sampler:
-        """Pieces of as many machines as a batch holds."""
-        return MachineSampler(series, task.horizons, spec.chunks, self.spec.shots, spec.seed)
+        """The training series, each with the number of its machine in place of a teacher."""
+        owned = by_machine(own_series)
+        self.machines = len(owned)
+        numbers = {name: np.float32(number) for number, name in enumerate(owned)}
+        return [
+            replace(part, teacher_targets=np.broadcast_to(numbers[part.machine], (part.samples, 1)))
+            for part in own_series
+        ]
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Take over the start, and give the block a table of codes, which the optimiser then learns."""
         if self.start is not None:
             continue_from(net, self.start)
-        block, self.training = coded_block(net), spec
-        draws = torch.randn(
-            len(self.machines) * len(block.machine_code), generator=torch.Generator().manual_seed(spec.seed)
-        )
+        block, self.told = coded_block(net), torch.zeros(0)
+        draws = torch.randn(self.machines * len(block.machine_code), generator=torch.Generator().manual_seed(spec.seed))
         # A vector: optimisers that precondition matrices would need the square of the number of machines.
         block.table = nn.Parameter(SPREAD * draws)
         return self.start is not None
 
-    def episode(self, net: Predictor, objective: Objective, batch: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """The loss of pieces from reset, each with the code of its machine or none."""
-        x, future, valid = batch
-        block = coded_block(net)
-        codes = block.table.view(len(self.machines), -1)[x[:, 0, -1].long()]
-        block.lanes = codes * (torch.rand(len(x), 1, device=x.device) >= UNKNOWN)
-        try:
-            answer, features, _, _ = net.forward_features(x[..., :-1], net.initial_state(len(x), x))
-        finally:
-            block.lanes = None
-        return objective.evaluate(answer, future, features, valid) + WEIGHT * codes.square().mean()
-
-    def judge(self, net: Predictor, objective: Objective, data: Prepared) -> tuple[float, float, float]:
-        """Errors on machines that did not train, without a code."""
-        return validation_scores(net, data.validation, self.training, data)
+    def tell(self, net: Predictor, teacher_targets: Tensor, reset: Tensor) -> None:
+        """Give each stream the code of its machine, or from its start to its end none."""
+        self.block = block = coded_block(net)
+        drawn = (torch.rand(len(reset), 1, device=reset.device) >= UNKNOWN).float()
+        # Of another size only before the first chunk, with which all streams begin.
+        self.told = torch.where(reset[:, None], drawn, self.told) if len(self.told) == len(reset) else drawn
+        codes = block.table.view(self.machines, -1)[teacher_targets[:, 0, 0].long()]
+        block.lanes, self.size = codes * self.told, codes.square().mean()
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """Not asked: `episode` gives the loss."""
-        return objective.evaluate(
+        """The error, and what keeps codes small; the network is without codes again."""
+        if self.block is not None:
+            self.block.lanes = None
+        error = objective.evaluate(
             batch_context.answer, batch_context.future, batch_context.features, batch_context.valid
         )
+        return error + WEIGHT * self.size
 
     def end(self, net: Predictor) -> None:
         """Drop the table: the code of any machine is found from its logs."""

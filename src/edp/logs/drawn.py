@@ -1,0 +1,74 @@
+"""Evenly spread stretches of recordings, where a command is to look at some hours of many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from edp.errors import ConfigError
+from edp.logs.quality.checks import Finding
+from edp.recording import Recording
+from edp.stats.stretches import MOST_ROWS, spread_stretches
+
+STRETCH_S = 120.0
+"""Of the stretches that a large data set is looked at by."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """How much was drawn.
+
+    Attributes:
+        hours: of the stretches.
+        of_hours: of all recordings.
+        stretches: how many.
+    """
+
+    hours: float
+    of_hours: float
+    stretches: int
+
+    @property
+    def what(self) -> str:
+        """The same in words."""
+        return f"{self.hours:.3g} of {self.of_hours:,.4g} h: {self.stretches:,} evenly spread stretch(es) of them"
+
+
+def checked_hours(hours: float) -> float:
+    """Hours of a sample.
+
+    Raises:
+        ConfigError: not a positive, finite number.
+    """
+    if not 0.0 < hours < float("inf"):
+        raise ConfigError(f"--at-most {hours:g}: a positive number of hours must hold")
+    return hours
+
+
+def spread_recordings(recordings: Sequence[Recording], seconds: float, most: int = MOST_ROWS) -> list[Recording]:
+    """Recordings, or evenly spread stretches of them of so many seconds; samples on disk stay there."""
+    length = max(1, round(seconds * recordings[0].rate_hz))
+    stretches = spread_stretches([recording.samples for recording in recordings], length, most)
+    return [
+        recordings[i]
+        if (start, stop) == (0, recordings[i].samples)
+        else replace(
+            recordings[i], values=recordings[i].values[start:stop], name=f"{recordings[i].name}[{start}:{stop}]"
+        )
+        for i, start, stop in stretches
+    ]
+
+
+def drawn_recordings(recordings: Sequence[Recording], hours: float) -> list[Recording]:
+    """Recordings of at most so many hours, about: evenly spread stretches of `STRETCH_S` where there are more."""
+    most = max(1, round(3600.0 * hours * recordings[0].rate_hz))
+    return spread_recordings(recordings, STRETCH_S, most)
+
+
+def findings_of_part(recordings: Sequence[Recording], of_hours: float) -> tuple[Finding, ...]:
+    """What an inspection of these recordings says where they are not all of so many hours."""
+    hours = sum(recording.samples / recording.rate_hz for recording in recordings) / 3600.0
+    drawn = Drawn(hours, of_hours, len(recordings))
+    if drawn.hours == drawn.of_hours:
+        return ()
+    return (Finding("note", None, f"looked at {drawn.what}", drawn.stretches, "", "leave --at-most out for all"),)
