@@ -10,6 +10,9 @@ A change makes the future harder to know for any predictor: how much is shown by
 
 The options' defaults were chosen on other recordings of these scenarios (seed 50) than those that count here (seed 90).
 
+A grey box of the machine as it was follows the machine, too (`adaptation_follower.py`, the C code of `edp export --to
+follower`), alone and before the correction above, without and with a thermometer in the oil.
+
 Rivals on the same ticks: no adaptation; offset and gain of each predicted change, by recursive least squares; the whole
 last layer's features by recursive least squares with forgetting and no bounds, from the backbone's representation.
 
@@ -25,10 +28,12 @@ import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptation_follower import WAYS, Follower, fitted_grey
 from common import Verdict, finish, parser, table, verdict
 from controller_cycles import PROGRAM
 from edp.config.experiment import load_experiment
@@ -40,11 +45,16 @@ from edp.ir.rls import Adaptation, AdaptationSpec
 from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import Predictor, build_model
 from edp.networks.running import stream_hidden, stream_predictions
+from edp.networks.twin.grey.fit_spec import GreyFitSpec
+from edp.networks.twin.greybox import GreyTwin
 from edp.sim.machine import machine_files
+from edp.training import load_bundle, save_bundle
 from edp.training.bundle import Bundle
+from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin, save_twin
 from edp.workflows.adaptation import fit_adaptation, motion_s
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set, train
 from embedded_step import on_board
+from twin import QUICK_FIT
 
 PROGRAMS = Path(__file__).parents[1] / "tests/export"
 DAY = 8_640_000
@@ -59,12 +69,22 @@ class Size:
     recordings: int
     epochs: int
     updates: int
+    tests: int
     test_minutes: float
     behind_s: float
     ticks: int
+    grey: GreyFitSpec
+    grey_recordings: int
+    retrained: tuple[str, ...] = ()
 
 
-SIZES = {True: Size(6.0, 14, 2, 30, 8.5, 10.0, 60_000), False: Size(120.0, 60, 24, 250, 17.5, 60.0, DAY)}
+GREY = GreyFitSpec(ticks=3000, starts=1, final_rounds=8)
+SIZES = {
+    "quick": Size(6.0, 14, 2, 30, 2, 1.2, 10.0, 60_000, QUICK_FIT, 6),
+    "short": Size(60.0, 30, 12, 250, 3, 7.5, 60.0, 360_000, GREY, 18, ("clay",)),
+    "full": Size(120.0, 60, 24, 250, 7, 17.5, 60.0, DAY, GREY, 18, ("oil 65 degrees", "clay", "dead band +3 points")),
+}
+"""Forms: under a minute or so; about eight processor minutes; everything."""
 
 
 def machines(folder: Path) -> dict[str, tuple[str, str]]:
@@ -157,21 +177,38 @@ def driven(folder: Path, part: Series) -> tuple[Rows, Rows]:
     return numbers[:, :targets], numbers[:, targets : 2 * targets]
 
 
+@dataclass(frozen=True, eq=False)
+class Recovered:
+    """MAE of each way by scenario, mean over recordings and each, and factors that the follower found at the end."""
+
+    mae: dict[str, dict[str, float]]
+    each: dict[str, dict[str, list[float]]]
+    factors: dict[str, dict[str, list[dict[str, float]]]]
+
+
 def recovery(
-    bundle: Bundle, law: Adaptation, tests: dict[str, DataSource], folder: Path, behind_s: float
-) -> dict[str, dict[str, float]]:
-    """MAE of each way by scenario, mean over recordings; `folder` holds the program."""
-    predictor, found = bundle.predictor, {}
+    bundle: Bundle, law: Adaptation, tests: dict[str, DataSource], folder: Path, follower: Follower, behind_s: float
+) -> Recovered:
+    """What every way makes of the scenarios; `folder` holds the program of network and correction."""
+    predictor, window = bundle.predictor, bundle.predictor.spec.window
+    result, labels = Recovered({}, {}, {}), follower.parts.correction().tuned.labels
     for name, source in tests.items():
-        series = [bundle.task.series(recording) for recording in source.read()]
         rows: dict[str, list[float]] = {}
-        for part in series:
+        factors: dict[str, list[dict[str, float]]] = {}
+        for recording in source.read():
+            part = bundle.task.series(recording)
             base, adapted = driven(folder, part)
-            ways = {"frozen": base, "adapted": adapted}
+            followed = follower.ways(recording, part, base, law, window)
+            ways = {"frozen": base, "adapted": adapted} | {way: followed[way] for way in WAYS}
             for way, made in (ways | rivals(predictor, law, part, base)).items():
-                rows.setdefault(way, []).append(scored(made, part, law, predictor.spec.window, behind_s))
-        found[name] = {way: float(np.mean(values)) for way, values in rows.items()}
-    return found
+                rows.setdefault(way, []).append(scored(made, part, law, window, behind_s))
+            for way in ("follower", "follower with thermometer"):
+                numbers = [round(float(x), 3) for x in followed[f"factors, {way}"]]
+                factors.setdefault(way, []).append(dict(zip(labels, numbers, strict=True)))
+        result.each[name], result.factors[name] = rows, factors
+        result.mae[name] = {way: float(np.mean(values)) for way, values in rows.items()}
+        print(name, {way: round(value, 3) for way, value in result.mae[name].items()}, flush=True)
+    return result
 
 
 def frozen_mae(bundle: Bundle, law: Adaptation, source: DataSource, behind_s: float) -> float:
@@ -228,39 +265,79 @@ def attacked(bundle: Bundle, bank: NDArray[np.float32], ticks: int) -> list[floa
 
 
 def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    quick, seed, size = arguments.quick, arguments.seed, SIZES[arguments.quick]
+    arguments_of = parser(__doc__ or "")
+    arguments_of.add_argument("--short", action="store_true", help="60 min, three recordings, an hour of the adversary")
+    arguments = arguments_of.parse_args()
+    form = "quick" if arguments.quick else "short" if arguments.short else "full"
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.data or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        study(folder, size, seed, quick)
+        study(folder, form, arguments.seed)
 
 
-def study(folder: Path, size: Size, seed: int, quick: bool) -> None:
-    cases = machines(folder)
-    source = simulated(folder / "source", cases["before"], size.minutes, size.recordings, seed + 1)
-    network = trained(folder / "network", source, size, seed)
-    experiment = load_experiment(folder / "network" / "config.toml", None)
-    law = fit_adaptation(network.predictor, prepare_data(source, experiment), AdaptationSpec())
+def study(folder: Path, form: str, seed: int) -> None:
+    size, quick, cases = SIZES[form], form == "quick", machines(folder)
+    bundle, law, grey = prepared(folder, cases["before"], size, seed)
     tests = {
-        name: simulated(folder / f"test {name}", case, size.test_minutes, 7, seed + 90) for name, case in cases.items()
+        name: simulated(folder / f"test {name}", case, size.test_minutes, size.tests, seed + 90)
+        for name, case in cases.items()
     }
-    bundle = replace(network, adaptation=law)
     with tempfile.TemporaryDirectory() as temporary:
-        program = Path(temporary)
+        program = Path(temporary) / "network"
+        program.mkdir()
         built(bundle, program, PROGRAMS / "adaptation_driver.c")
-        found = recovery(bundle, law, tests, program, size.behind_s)
-    verdicts, details = judged(found, quick), {"mae": found, "options": law.to_plain()}
-    if not quick:
-        details["trained after the change"] = attainable = {}
-        for name in (name for name in cases if name != "before"):
-            taught = simulated(folder / f"changed {name}", cases[name], size.minutes, size.recordings, seed + 3)
-            own = frozen_mae(trained(folder / f"network {name}", taught, size, seed), law, tests[name], size.behind_s)
-            attainable[name] = own
-            print(f"{name}: a network trained after the change alone has an MAE of {own:.3f} mm/s there")
+        follower = Follower.built(grey, bundle, law, Path(temporary) / "follower")
+        found = recovery(bundle, law, tests, program, follower, size.behind_s)
+        cost = follower.cost()
+    print(f"a tick of the follower on a Cortex-M7: {cost}")
+    attainable = retrained(folder, cases, tests, (size, law, seed))
+    details = {
+        "form": form, "mae": found.mae, "each": found.each, "factors": found.factors, "options": law.to_plain(),
+        "follower on a Cortex-M7": cost, "trained after the change": attainable,
+    }  # fmt: skip
+    verdicts = [*judged(found.mae, quick), *judged_followers(found.mae, attainable, quick)]
+    verdicts += costs_and_attacks(bundle, tests["before"], (size, seed, quick), details)
+    finish("adaptation", verdicts, seed, details)
+
+
+def prepared(folder: Path, before: tuple[str, str], size: Size, seed: int) -> tuple[Bundle, Adaptation, GreyTwin]:
+    """Network with its adaptation, and grey box, of the machine before its change; what a run has left is read."""
+    if not holds_twin(folder / "grey"):
+        source = simulated(folder / "source", before, size.minutes, size.recordings, seed + 1)
+        network = trained(folder / "network", source, size, seed)
+        experiment = load_experiment(folder / "network" / "config.toml", None)
+        law = fit_adaptation(network.predictor, prepare_data(source, experiment), AdaptationSpec())
+        save_bundle(replace(network, adaptation=law), folder / "adapted")
+        grey, seconds = fitted_grey(source.read()[: size.grey_recordings], size.grey, seed)
+        print(f"grey box fitted in {seconds:.0f} processor s", flush=True)
+        save_twin(TwinBundle(grey.spec, grey), folder / "grey")
+    bundle, twin = load_bundle(folder / "adapted"), load_twin(folder / "grey").twin
+    if bundle.adaptation is None or not isinstance(twin, GreyTwin):
+        raise RuntimeError(f"{folder} holds other models than this benchmark leaves there")
+    return bundle, bundle.adaptation, twin
+
+
+def retrained(
+    folder: Path, cases: dict[str, tuple[str, str]], tests: dict[str, DataSource], how: tuple[Size, Adaptation, int]
+) -> dict[str, float]:
+    """MAE of networks that were trained after the change alone, by scenario."""
+    (size, law, seed), attainable = how, {}
+    for name in size.retrained:
+        taught = simulated(folder / f"changed {name}", cases[name], size.minutes, size.recordings, seed + 3)
+        own = frozen_mae(trained(folder / f"network {name}", taught, size, seed), law, tests[name], size.behind_s)
+        attainable[name] = own
+        print(f"{name}: a network trained after the change alone has an MAE of {own:.3f} mm/s there", flush=True)
+    return attainable
+
+
+def costs_and_attacks(
+    bundle: Bundle, bank_of: DataSource, how: tuple[Size, int, bool], details: dict[str, Any]
+) -> list[Verdict]:
+    """Instructions of a tick, and what an adversary does to the correction; written into `details`, too."""
+    size, seed, quick = how
     without, with_ = instructions(bundle)
-    verdicts.append(verdict("instructions of a tick, with over without", with_, without, "<= 1.1", "1", quick))
-    bank = network.task.series(tests["before"].read()[0]).inputs
+    verdicts = [verdict("instructions of a tick, with over without", with_, without, "<= 1.1", "1", quick)]
+    bank = bundle.task.series(bank_of.read()[0]).inputs
     names = ("corrected", "worst", "not_finite", "repairs", "beyond", "without", "with", "worst_turn", "taken_back")
     attack = dict(zip(names, attacked(narrow(bundle, seed), bank, size.ticks), strict=True))
     details["adversary"] = attack | {"ticks": size.ticks}
@@ -270,7 +347,23 @@ def study(folder: Path, size: Size, seed: int, quick: bool) -> None:
     verdicts.append(verdict("largest correction over its limit", attack["worst"], 1.0, "<= 1.000001", "1", quick))
     verdicts.append(verdict("error under the adversary, with over without", attack["with"], attack["without"],
                             "<= 1.05", "units", quick))  # fmt: skip
-    finish("adaptation", verdicts, seed, details)
+    return verdicts
+
+
+def judged_followers(found: dict[str, dict[str, float]], attainable: dict[str, float], quick: bool) -> list[Verdict]:
+    """Of the loss that a change is to the network, what the follower has not; in clay, over what training wins."""
+    verdicts, before = [], found["before"]
+    for name, ways in found.items():
+        if name not in ("before", "clay"):
+            loss = ways["frozen"] - before["frozen"]
+            for way in ("follower, adapted", "follower with thermometer, adapted"):
+                kept = loss - (ways[way] - before[way])
+                verdicts.append(verdict(f"{name}: {way}: of the change alone", kept, loss, ">= 0.5", "mm/s", quick))
+        elif name in attainable:
+            won = ways["frozen"] - ways["follower, adapted"]
+            verdicts.append(verdict("clay: follower, adapted: over what training wins", won,
+                                    ways["frozen"] - attainable[name], ">= 0.8", "mm/s", quick))  # fmt: skip
+    return verdicts
 
 
 def judged(found: dict[str, dict[str, float]], quick: bool) -> list[Verdict]:

@@ -5,15 +5,16 @@ observer and with the commands held, become channels of the logs, which a networ
 Beside it the same network without forecasts, which trains for as long as fit, forecasts and network take together,
 ridge ARX and persistence; all on the same held-out recordings. All read what the grey box reads, velocities, strokes,
 pressures and pilots, and the accelerations, but no channel that a simulation alone knows. The limit is that of
-futures from the true state, with the commands unknown.
+futures from the true state, with the commands unknown. A smaller network on the forecasts, which a controller has room
+for, is judged in float and in integer arithmetic (W8A16).
 
 The simulator has the structure of the grey box, which flatters it.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,12 @@ from common import finish, in_folder, kept, parser, table, verdict
 from edp.config.experiment import Experiment, load_experiment
 from edp.config.twin import load_twin_experiment
 from edp.data.prepared import Prepared
-from edp.evaluation.judge import judge
+from edp.evaluation.footprint import footprint
+from edp.evaluation.judge import JudgeSpec, judge
+from edp.export.c.sizes import constant_bytes
 from edp.logs.source import DataSource
+from edp.networks.integer import integer_predictor
+from edp.networks.predictor import Predictor
 from edp.networks.twin import fit_scales
 from edp.networks.twin.greybox import GreyFitSpec
 from edp.signals import TABLE_A1
@@ -45,6 +50,9 @@ SOON = 0.83
 LOOKS = 6
 VALIDATED = 4
 """Recordings that validate: a look at all of them would cost as much as training."""
+SMALL = 60
+"""Channels and units of the smaller network: the widest multiple of four whose constants take 100,000 bytes."""
+MOST_PARAMETERS, MOST_BYTES = 166_000, 100_000
 BYPASS_OF = (
     'model.blocks=[{{kind="temporal_difference"}},'
     ' {{kind="linear_bypass", taps={taps}, start="crossed", trained=false}}]'
@@ -97,6 +105,11 @@ def run(arguments: Any, work: Path) -> None:
     rows["network without them"] = kept(
         work / "plain.json", lambda: trained(plain, settings, rows["network on its forecasts"]["seconds"], 0.0)
     )
+    small = kept(
+        work / "small.json", lambda: trained(extended, smaller(settings_ahead), arguments.budget / 2, before, True)
+    )
+    rows["smaller network on its forecasts"] = small
+    rows["the same in W8A16"] = {"mae": small["integer"], "seconds": small["seconds"]}
     rows["ridge ARX on its forecasts"] = {"mae": rows["network on its forecasts"]["ridge_arx"], "seconds": before}
     rows["ridge ARX"] = {"mae": rows["network without them"]["ridge_arx"], "seconds": 0.0}
     rows["persistence"] = {"mae": rows["network without them"]["persistence"], "seconds": 0.0}
@@ -111,6 +124,12 @@ def experiment(seed: int, quick: bool, ahead: bool = False) -> Experiment:
     channels = f"task.features={{name='measured', channels={[*MEASURED, *forecast]}}}"
     changes = [*CHANGES, *short, channels, f"task.horizons={list(HORIZONS)}", f"training.seed={seed}"]
     return load_experiment(None, "quick" if quick else "standard", changes)
+
+
+def smaller(settings: Experiment) -> Experiment:
+    """The same with fewer channels and units."""
+    backbone = replace(settings.model.backbone, channels=(SMALL,), units=SMALL)
+    return replace(settings, model=replace(settings.model, backbone=backbone))
 
 
 def forecasts(logs: Path, ahead: Path, grey: Path, seed: int, quick: bool) -> dict[str, Any]:
@@ -143,20 +162,31 @@ def forecast_error(data: Prepared) -> dict[str, float]:
     return errors
 
 
-def trained(data: Prepared, settings: Experiment, budget_s: float, before_s: float) -> dict[str, Any]:
-    """Train for a budget of processor seconds counted in updates, and judge."""
+def trained(
+    data: Prepared, settings: Experiment, budget_s: float, before_s: float, rounded: bool = False
+) -> dict[str, Any]:
+    """Train for a budget of processor seconds counted in updates, and judge; in integer arithmetic too if asked."""
     cost = update_cost(data, settings)
     updates = max(1, int(budget_s / cost / LOOKS))
-    short = dataclasses.replace(data, validation=data.validation[:VALIDATED])
-    training = dataclasses.replace(settings.training, epochs=LOOKS, updates=updates)
-    fitted = fit(short, settings.model, training)
-    models = judge(
-        fitted.predictor, data, dataclasses.replace(settings.judge, baselines=("persistence", "ridge_arx")), "network"
-    ).scores["models"]
-    errors = {name: {str(k): row["overall"][str(k)]["mean"]["mae"] for k in HORIZONS} for name, row in models.items()}
-    found = {"mae": errors.pop("network"), **errors, "updates": LOOKS * updates, "cost_of_update_s": cost}
+    short = replace(data, validation=data.validation[:VALIDATED])
+    training = replace(settings.training, epochs=LOOKS, updates=updates)
+    net = fit(short, settings.model, training).predictor
+    rivals = () if rounded else ("persistence", "ridge_arx")
+    errors = judged(net, data, replace(settings.judge, baselines=rivals))
+    found: dict[str, Any] = {"mae": errors.pop("network"), **errors, "updates": LOOKS * updates}
+    found |= {"cost_of_update_s": cost, "parameters": footprint(net).parameters}
+    if rounded:
+        integers = integer_predictor(net, data.train)
+        found["integer"] = judged(integers, data, replace(settings.judge, baselines=()))["network"]
+        found["bytes"] = constant_bytes(integers.integers, None)
     print(f"{LOOKS * updates} updates of {cost:.3f} s: {found['mae']}", flush=True)
     return found | {"seconds": before_s + LOOKS * updates * cost}
+
+
+def judged(net: Predictor, data: Prepared, spec: JudgeSpec) -> dict[str, dict[str, float]]:
+    """Mean absolute error of the network and of baselines by horizon, mm/s."""
+    models = judge(net, data, spec, "network").scores["models"]
+    return {name: {str(k): row["overall"][str(k)]["mean"]["mae"] for k in HORIZONS} for name, row in models.items()}
 
 
 def verdicts(rows: dict[str, Any], limits: dict[int, float], quick: bool) -> list[Any]:
@@ -187,9 +217,26 @@ def verdicts(rows: dict[str, Any], limits: dict[int, float], quick: bool) -> lis
         verdict("processor time of its fit", rows["grey box, looks ahead"]["seconds"], 300.0, "<= 1", "s", quick)
     )
     mae = {name: rows[name]["mae"]["10"] for name in ("network on its forecasts", "network without them")}
+    asked += small_verdicts(rows, share["the same in W8A16"], quick)
     asked.append(
         verdict("MAE at k = 10 with forecasts against without, equal time", *mae.values(), "<= 0.8", "mm/s", quick)
     )
+    return asked
+
+
+def small_verdicts(rows: dict[str, Any], share: dict[int, float], quick: bool) -> list[Any]:
+    """What is asked of the network that a controller has room for."""
+    small, large = rows["smaller network on its forecasts"], rows["network on its forecasts"]
+    asked = [
+        verdict("parameters of the smaller network", small["parameters"], MOST_PARAMETERS, "<= 1", "1", quick),
+        verdict("bytes of its constants in W8A16", small["bytes"], MOST_BYTES, "<= 1", "bytes", quick),
+    ]
+    for k, goal in GOALS.items():
+        asked.append(verdict(f"share of the gap closed at k = {k} by it", share[k], 1.0, f">= {goal}", "1", quick))
+        ours, theirs = small["integer"][str(k)], large["mae"][str(k)]
+        asked.append(
+            verdict(f"MAE at k = {k}, it against the network of float", ours, theirs, "<= 1.05", "mm/s", quick)
+        )
     return asked
 
 

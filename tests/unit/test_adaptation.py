@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
 from edp.training import load_bundle, save_bundle, upgrade_bundle
 from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
-from edp.training.twin_bundle import TwinBundle, save_twin
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.adaptation import adapt, fit_adaptation, replay, replay_run
+from edp.workflows.adaptation.with_twin import TwinMoves, tuned_spec
 from edp.workflows.deployment import footprint_of
 from edp.workflows.train_evaluate import evaluate, train, trained_run
 
@@ -194,6 +196,51 @@ def test_a_grey_box_that_follows_the_machine_moves_what_is_replayed(adapted, lev
     static = saved_twin(TWINS["static"](), lever_sessions, tmp_path / "static")
     with pytest.raises(ConfigError, match="only a grey box"):
         replay_run(folder, lever_sessions, twin=static)
+
+
+def test_a_thermometer_in_the_logs_of_twin_and_replay_moves_its_numbers(adapted, lever_sessions, tmp_path):
+    bundle = load_bundle(adapted[0])
+    grey = load_twin(saved_twin(GreyBox(), lever_sessions, tmp_path / "grey"))
+    assert math.isnan(tuned_spec(grey).oil_c)
+    spec = tuned_spec(dataclasses.replace(grey, provenance={"oil_c": 20.0}))
+    moves, recordings = TwinMoves(grey.twin, bundle.adaptation, bundle.task, spec), lever_sessions.read()
+    cold = recordings[0]
+    warm = with_channel(cold, Channel("OilTemperature", Kind.TEMPERATURE), 273.15 + 60.0)
+    other = with_channel(cold, Channel("OilTemperature", Kind.GENERIC), 333.15)
+    zeros = np.zeros((cold.samples, len(bundle.adaptation.horizons), len(bundle.task.targets)), np.float32)
+    for recording, viscosity in ((cold, 1.0), (other, 1.0), (warm, math.exp(-1.4))):
+        moves([recording], [zeros], carry=False, learn=False)
+        assert moves.correction.tuned.factors["oil"] == pytest.approx(viscosity)
+    for wrong in (True, "hot", 4000.0, [20.0]):
+        with pytest.raises(BundleError, match="no temperature of oil"):
+            tuned_spec(dataclasses.replace(grey, provenance={"oil_c": wrong}))
+
+
+def with_channel(recording, channel, value):
+    values = np.column_stack([recording.values, np.full(recording.samples, value, np.float32)])
+    return dataclasses.replace(recording, channels=(*recording.channels, channel), values=values)
+
+
+def test_a_grey_box_that_follows_leaves_as_c(run, adapted, lever_sessions, tmp_path):
+    twin, out, command = saved_twin(GreyBox(), lever_sessions, tmp_path / "grey"), tmp_path / "out", CliRunner()
+    given = ["export", str(adapted[0]), "--to", "follower", "--out", str(out)]
+    done = command.invoke(app, [*given, "--twin", twin, "--set", "learn_ticks=10", "--set", "oil_c=20"])
+    assert done.exit_code == 0, done.output
+    assert "read follower.h first" in done.output
+    assert "at most 10" not in (out / "follower.h").read_text()
+    assert "learning 10." in (out / "follower.h").read_text()
+    for wrong, said in (
+        ((), "belong together"),
+        (("--twin", twin, "--set", "groups=gain"), "no such option"),
+        (("--twin", twin, "--set", "gain=x"), "a number must hold"),
+        (("--twin", twin, "--set", "learn_ticks=1"), "learn_ticks"),
+        (("--twin", twin, "--name", "../x"), "prefix of C functions"),
+    ):
+        assert said in str(command.invoke(app, [*given, *wrong]).exception)
+    plain = command.invoke(app, ["export", str(run), "--to", "follower", "--twin", twin, "--out", str(out)])
+    assert "edp adapt" in str(plain.exception)
+    alone = command.invoke(app, ["export", str(run), "--to", "c", "--twin", twin, "--out", str(out)])
+    assert "belong together" in str(alone.exception)
 
 
 def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, lever_sessions, tmp_path):

@@ -13,6 +13,8 @@ from edp.errors import ConfigError, closest
 
 CONTROLLER, CONTROLLER_NAME = "controller", "machine"
 """The form of a run of edp control, and the name of what it holds unless one is given."""
+FOLLOWER = "follower"
+"""The form of a grey box that follows the machine, and the name of what it holds unless one is given."""
 MONITOR_NAME = "monitor"
 
 
@@ -25,6 +27,10 @@ def _list_forms(listing_asked: bool) -> None:
             out.print(f"{name}: {summary}", soft_wrap=True)
         out.print(
             f"{CONTROLLER}: C99, float32: the controller of a run of edp control, with model and solver", soft_wrap=True
+        )
+        out.print(
+            f"{FOLLOWER}: C99, float64: a grey box that follows the machine, and moves a network's predictions",
+            soft_wrap=True,
         )
         raise typer.Exit
 
@@ -40,7 +46,8 @@ def export(
     to: Annotated[str, typer.Option(help="Form, such as c (C99 for controllers); --forms lists all.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an existing export is replaced.")],
     name: Annotated[
-        str, typer.Option(help="Name in the exported files; default: predictor, machine (a controller) or monitor.")
+        str,
+        typer.Option(help="Name in the exported files; default: predictor, machine (a controller), monitor, follower."),
     ] = "",
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
@@ -48,6 +55,10 @@ def export(
     w8a16: Annotated[
         Path | None,
         typer.Option(help="Of a twin: logs on which it is brought into W8A16, for forms around the C code."),
+    ] = None,
+    twin: Annotated[
+        Path | None,
+        typer.Option("--twin", help="For --to follower: the run of a grey box of the machine as it was."),
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -59,21 +70,33 @@ def export(
     """Write a trained network in a form that runs without EDP; it reads and gives SI units.
 
     Example: `edp export runs/first --to c --out firmware/predictor`
+
+    Example: `edp export runs/first_adapted --to follower --twin runs/grey --out firmware/follower`
     """
     from edp.workflows.deployment import export_bundle, unheld_adaptation
     from edp.workflows.deployment import forms as registered_forms
     from edp.workflows.monitor.export_monitor import export_monitor, holds_monitor
 
-    names = (CONTROLLER, *registered_forms())
+    names = (CONTROLLER, FOLLOWER, *registered_forms())
     if to not in names:
         raise ConfigError(f"unknown export target '{to}'{closest(to, names)}; `edp export --forms` lists them")
     monitor = holds_monitor(bundle)
-    name = name or (MONITOR_NAME if monitor else CONTROLLER_NAME if to == CONTROLLER else "predictor")
+    usual = {CONTROLLER: CONTROLLER_NAME, FOLLOWER: FOLLOWER}
+    name = name or (MONITOR_NAME if monitor else usual.get(to, "predictor"))
     options = dict(map(_option, changes or []))
-    if (monitor or to == CONTROLLER) and w8a16 is not None:
+    if (to == FOLLOWER) != (twin is not None):
+        raise ConfigError(
+            "--to follower and --twin belong together: edp export RUN --to follower --twin GREY, RUN of edp adapt and "
+            "GREY of a grey box (edp twin --set twin.kind=greybox)"
+        )
+    if (monitor or to in usual) and w8a16 is not None:
         raise ConfigError("--w8a16: only twins are brought into W8A16 while they are exported; leave it out")
     if monitor:
         files = export_monitor(bundle, to, folder, name, options)
+    elif twin is not None:
+        from edp.workflows.adaptation import export_follower
+
+        files = export_follower(bundle, twin, folder, name, options)
     elif to == CONTROLLER:
         from edp.workflows.control import export_controller
 
@@ -88,7 +111,7 @@ def export(
     def show() -> None:
         for file in files:
             out.print(str(file))
-        if to != CONTROLLER and not monitor and unheld_adaptation(bundle, to):
+        if to not in usual and not monitor and unheld_adaptation(bundle, to):
             out.print(f"note: the form '{to}' holds the network alone; its adaptation is held by c")
         out.print(f"written: {files[0].parent.resolve()}; read {files[0].name} first")
         if (files[0].parent / "CMakeLists.txt").is_file():

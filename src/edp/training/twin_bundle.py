@@ -35,6 +35,8 @@ PARTS = ("commands", "velocities", "strokes", "pressures")
 RATE = above(0.0, 1e6)
 STROKES = "full_strokes_m"
 """In the metadata of simulated recordings, and in the provenance of a twin that learned from them."""
+OIL_C = "oil_c"
+"""Mean temperature of the oil in the logs that a twin learned from, degC, in its provenance where they hold it."""
 _TREE = SettingsTree({"twin": TWINS}, what="twin")
 
 

@@ -114,19 +114,41 @@ def test_predictions_move_to_what_is_better_and_stay_where_nothing_is(bench):
     assert np.isnan(tight.step(levers[0], measured[0], np.full((1, 1), np.nan))).all()
 
 
-def test_a_thermometer_tells_friction_and_leakage_at_once(bench):
+def test_a_thermometer_tells_the_oil_at_once(bench):
     twin, levers, measured = bench
     tuned = TunedTwin(twin, TunedSpec(oil_c=20.0))
     tuned.step(levers[0], measured[0], 60.0)
-    assert tuned.factors["ram.friction"] == pytest.approx(np.exp(-0.7))
-    assert tuned.factors["leakage"] == pytest.approx(np.exp(1.4))
-    assert tuned.factors["ram.dead_band"] == 1.0
+    assert tuned.factors["oil"] == pytest.approx(np.exp(-1.4))
+    assert tuned.factors["ram.friction"] == tuned.factors["ram.dead_band"] == 1.0
     for broken in (np.nan, np.inf, 4000.0):
         tuned.step(levers[1], measured[1], broken)
-    assert tuned.factors["leakage"] == pytest.approx(np.exp(1.4))
+    assert tuned.factors["oil"] == pytest.approx(np.exp(-1.4))
     unknown = TunedTwin(twin)
     unknown.step(levers[0], measured[0], 60.0)
-    assert unknown.factors["leakage"] == 1.0
+    assert unknown.factors["oil"] == 1.0
+
+
+def test_thinner_oil_leaks_more_rubs_less_and_is_softer(bench):
+    twin = bench[0]
+    labels, moves, _, _ = group_matrix(twin, ("oil",))
+    assert labels == ("oil",)
+    thin = np.exp(moves @ [np.log(0.2)])
+    factors = {number.name: factor for number, factor in zip(twin.table.numbers, thin, strict=True) if factor != 1.0}
+    assert factors["piston_leakage"] == factors["spool_leakage"] == pytest.approx(5.0)
+    assert factors["viscous"] == pytest.approx(0.2**0.5)
+    assert factors["bulk_modulus"] == pytest.approx(0.83, abs=0.01)
+    assert len(factors) == 4
+
+
+def test_equations_that_come_apart_begin_anew(bench):
+    twin, levers, measured = bench
+    tuned = followed(TunedTwin(twin, BAND), levers[:100], measured[:100])
+    assert np.isfinite(tuned.forecast(K)).all()
+    tuned._state = {name: np.full_like(rows, np.nan) for name, rows in tuned._state.items()}
+    tuned.step(levers[100], measured[100])
+    assert tuned.forecast(K) is None
+    followed(tuned, levers[101:200], measured[101:200])
+    assert np.isfinite(tuned.forecast(K)).all()
 
 
 def test_what_cannot_follow_is_refused(bench):

@@ -16,7 +16,7 @@ estimated tick by tick (`LoadEstimate`). A forecast runs from the observer's sta
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,27 +54,26 @@ class NumberGroup:
     """Numbers of a grey box that grow and shrink together.
 
     Attributes:
-        names: how their names begin.
-        deviation: prior deviation of the logarithm of their factor.
+        powers: by how their names begin, the power of the group's factor by which they grow.
+        deviation: prior deviation of the logarithm of the factor.
         shared: one group for the machine; else one for each actuator, its valves included.
         per_kelvin: by how much the logarithm changes with the oil's temperature, where that is measured.
     """
 
-    names: tuple[str, ...]
+    powers: Mapping[str, float]
     deviation: float
     shared: bool = False
     per_kelvin: float = 0.0
 
 
 NUMBER_GROUPS: Registry[NumberGroup] = Registry("group of numbers")
-NUMBER_GROUPS.register("dead_band")(NumberGroup(names=("dead_band_",), deviation=0.25))
-NUMBER_GROUPS.register("gain")(NumberGroup(names=("into_", "out_of_"), deviation=0.15))
-# The viscosity of mineral oil falls by some 3.5 % a K about 40 degC: leakage goes with its inverse, friction in seals
-# and bearings with about its root.
-NUMBER_GROUPS.register("friction")(NumberGroup(names=("viscous",), deviation=0.5, per_kelvin=-0.0175))
-NUMBER_GROUPS.register("leakage")(
-    NumberGroup(names=("piston_leakage", "spool_leakage"), deviation=1.0, shared=True, per_kelvin=0.035)
-)
+NUMBER_GROUPS.register("dead_band")(NumberGroup(powers={"dead_band_": 1.0}, deviation=0.25))
+NUMBER_GROUPS.register("gain")(NumberGroup(powers={"into_": 1.0, "out_of_": 1.0}, deviation=0.15))
+NUMBER_GROUPS.register("friction")(NumberGroup(powers={"viscous": 1.0}, deviation=0.5))
+# The factor is that of the viscosity, which of mineral oil falls by some 3.5 % a K about 40 degC: leakage goes with its
+# inverse, friction in seals and bearings with about its root, and the modulus falls by some 0.4 % a K.
+OIL = {"piston_leakage": -1.0, "spool_leakage": -1.0, "viscous": 0.5, "bulk_modulus": 0.114}
+NUMBER_GROUPS.register("oil")(NumberGroup(powers=OIL, deviation=1.0, shared=True, per_kelvin=-0.035))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +93,7 @@ class TunedSpec:
         ConfigError: a value out of range or a group that does not exist.
     """
 
-    groups: tuple[str, ...] = ("dead_band", "gain", "friction", "leakage")
+    groups: tuple[str, ...] = ("dead_band", "gain", "friction", "oil")
     learn_ticks: int = 20
     forgetting_s: float = 60.0
     gain: float = 0.3
@@ -123,16 +122,17 @@ def group_matrix(twin: GreyTwin, groups: Sequence[str]) -> tuple[tuple[str, ...]
     columns, deviations, warmth = [], [], []
     for kind in groups:
         group = NUMBER_GROUPS[kind]
-        by_element: dict[str, list[int]] = {}
+        by_element: dict[str, Doubles] = {}
         for index, number in enumerate(twin.table.numbers):
-            if number.name.startswith(group.names) and number.positive:
+            power = next((power for name, power in group.powers.items() if number.name.startswith(name)), None)
+            if power is not None and number.positive:
                 element = "" if group.shared else owner.get(number.element, number.element)
-                by_element.setdefault(element, []).append(index)
+                by_element.setdefault(element, np.zeros(len(twin.table.numbers)))[index] = power
         if not by_element:
             raise ConfigError(f"tuning: the grey box has no number of the group '{kind}'; leave it out of groups")
-        for element, places in by_element.items():
+        for element, powers in by_element.items():
             labels.append(f"{element}.{kind}".lstrip("."))
-            columns.append(np.isin(np.arange(len(twin.table.numbers)), places).astype(np.float64))
+            columns.append(powers)
             deviations.append(group.deviation)
             warmth.append(group.per_kelvin)
     return tuple(labels), np.stack(columns, axis=1), np.array(deviations), np.array(warmth)
@@ -147,6 +147,9 @@ class TunedTwin:
 
     Attributes:
         labels: of the groups.
+        moves: powers by which each number grows with each group's factor ``(number, group)``.
+        deviation: prior, of the logarithms of the factors ``(group,)``.
+        warmth: their change by a kelvin ``(group,)``.
         logs: logarithms of the groups' factors, less `by_oil` ``(group,)``; 0 where nothing has changed.
         by_oil: what the oil's temperature makes of them ``(group,)``.
         learn: False freezes them.
@@ -164,14 +167,14 @@ class TunedTwin:
             )
         self.twin, self.spec = twin, spec or TunedSpec()
         self._speeds = np.arange(len(twin.channels.velocities))
-        self.labels, self._moves, self._deviation, self._warmth = group_matrix(twin, self.spec.groups)
+        self.labels, self.moves, self.deviation, self.warmth = group_matrix(twin, self.spec.groups)
         self._floor = (LEAST * np.asarray(twin.scales.answer_width[self._speeds], np.float64)) ** 2
         self.learn = True
         self.reset()
 
     def reset(self) -> None:
         """Forget the machine and all that was learned."""
-        self.logs, self._prior = np.zeros(len(self.labels)), np.diag(self._deviation**2)
+        self.logs, self._prior = np.zeros(len(self.labels)), np.diag(self.deviation**2)
         self.by_oil = np.zeros(len(self.labels))
         self._covariance, self.learned = self._prior.copy(), 0
         self._square, self._judged = np.zeros(len(self._speeds)), 0
@@ -193,7 +196,7 @@ class TunedTwin:
         self._runner.resistance = forces.copy()
 
     def _with(self, logs: Doubles) -> GreyTwin:
-        return self.twin.with_numbers(self.twin.numbers * np.exp(self._moves @ (self.by_oil + logs)))
+        return self.twin.with_numbers(self.twin.numbers * np.exp(self.moves @ (self.by_oil + logs)))
 
     @property
     def factors(self) -> dict[str, float]:
@@ -227,6 +230,10 @@ class TunedTwin:
         if self._begin is not None:
             self._commands.append(command)
         after = self._runner.step(command, self._state, row)
+        if not np.isfinite(after["answer"]).all():
+            # Equations that have come apart would stay so: a port that reads a difference to NaN is free.
+            self.interrupt()
+            return
         self._load.expect(command, row, self._state, after)
         self._state = after
 
@@ -243,7 +250,7 @@ class TunedTwin:
         apart = oil_c - self.spec.oil_c
         if not (abs(apart) <= 2.0 * HOTTEST_C and abs(oil_c) <= HOTTEST_C):
             return
-        logs = self._warmth * apart
+        logs = self.warmth * apart
         if (np.abs(logs - self.by_oil) > WARMER).any():
             self.by_oil = logs
             self._renew(np.array(self._runner.resistance))
@@ -287,7 +294,7 @@ class TunedTwin:
         slopes = (slopes / unit[:, None]).reshape(len(clipped), -1)
         posterior = np.linalg.inv(np.linalg.inv(self._covariance) + slopes.T @ slopes / count)
         keep = math.exp(-self.spec.learn_ticks / (self.spec.forgetting_s * self.twin.channels.rate_hz))
-        most = BOUND * self._deviation
+        most = BOUND * self.deviation
         self.logs = np.clip(keep * (self.logs + posterior @ (slopes.T @ clipped) / count), -most, most)
         # Its symmetric part, so that rounding of thousands of inversions does not add up.
         self._covariance = keep**2 * 0.5 * (posterior + posterior.T) + (1.0 - keep**2) * self._prior

@@ -37,6 +37,8 @@ class TunedCorrection:
 
     Attributes:
         weight: w ``(horizon, target)``.
+        columns: velocity of the twin that each target is.
+        limit: largest correction ``(horizon, target)``, SI units.
 
     Raises:
         ConfigError: a target that is no velocity of the twin, a horizon below 1, or a limit that is not positive.
@@ -55,16 +57,16 @@ class TunedCorrection:
         shape = (len(horizons), len(targets))
         if np.shape(limit) != shape or not (np.isfinite(limit) & (limit > 0)).all():
             raise ConfigError(f"limit of shape {np.shape(limit)}; positive numbers of shape {shape} must hold")
-        self.tuned, self._horizons, self._limit = tuned, tuple(horizons), np.asarray(limit, np.float64)
-        self._columns = [names.index(name) for name in targets]
+        self.tuned, self._horizons, self.limit = tuned, tuple(horizons), np.asarray(limit, np.float64)
+        self.columns = [names.index(name) for name in targets]
         self._rate = 1.0 / (JUDGED_S * tuned.twin.channels.rate_hz)
         self.reset()
 
     def reset(self) -> None:
         """Forget the machine and all that was learned."""
         self.tuned.reset()
-        self.weight = np.zeros(self._limit.shape)
-        self._products = np.zeros((3, *self._limit.shape))
+        self.weight = np.zeros(self.limit.shape)
+        self._products = np.zeros((3, *self.limit.shape))
         self._judged = np.zeros(len(self._horizons), np.int64)
         self.interrupt()
 
@@ -85,14 +87,14 @@ class TunedCorrection:
         if not np.isfinite(command).all():
             self.interrupt()
         self.tuned.step(command, measured, oil_c)
-        self._judge(np.asarray(measured, np.float64)[self._columns])
+        self._judge(np.asarray(measured, np.float64)[self.columns])
         base = np.asarray(prediction, np.float64)
         moved = base.copy()
         for h, k in enumerate(self._horizons):
             forecast = self.tuned.forecast(k)
-            ahead = np.full(base.shape[1], np.nan) if forecast is None else forecast[self._columns]
+            ahead = np.full(base.shape[1], np.nan) if forecast is None else forecast[self.columns]
             self._rows[h].append((base[h], ahead))
-            step = np.clip(self.weight[h] * (ahead - base[h]), -self._limit[h], self._limit[h])
+            step = np.clip(self.weight[h] * (ahead - base[h]), -self.limit[h], self.limit[h])
             moved[h] += np.where(np.isfinite(step), step, 0.0)
         return moved.astype(np.float32)
 
@@ -102,7 +104,7 @@ class TunedCorrection:
             if len(self._rows[h]) < k:
                 continue
             # Shares of the limit, so that one spike of a sensor weighs no more than the largest correction.
-            ours, theirs = (np.clip((present - row) / self._limit[h], -1.0, 1.0) for row in self._rows[h].pop(0))
+            ours, theirs = (np.clip((present - row) / self.limit[h], -1.0, 1.0) for row in self._rows[h].pop(0))
             products = np.stack([ours * ours, theirs * theirs, ours * theirs])
             if not np.isfinite(products).all() or (np.abs(present) <= REST).all():
                 continue

@@ -21,7 +21,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 from edp.training import load_bundle
 from edp.training.twin_bundle import load_twin
-from edp.workflows.adaptation.with_twin import TwinMoves
+from edp.workflows.adaptation.with_twin import TwinMoves, tuned_spec
 
 # 60 s are the usual forgetting time: beyond it the adaptation is settled.
 BINS = (0.0, 10.0, 30.0, 60.0)
@@ -187,7 +187,8 @@ def replay_run(
     series = [bundle.task.series(recording) for recording in recordings]
     moves = None
     if twin is not None:
-        by_twin = TwinMoves(load_twin(twin).twin, bundle.adaptation, bundle.task)
+        grey = load_twin(twin)
+        by_twin = TwinMoves(grey.twin, bundle.adaptation, bundle.task, tuned_spec(grey))
         moves = partial(by_twin, recordings, carry=carry, learn=learn)
     result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording, moves)
     return result.to_json(bundle.task, bundle.target_kinds)

@@ -2,25 +2,65 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.derived_velocities import matched
+from edp.data.oil import oil_celsius
 from edp.data.task import Task
-from edp.errors import ConfigError, DataError
+from edp.errors import BundleError, ConfigError, DataError
 from edp.ir.rls import Adaptation
 from edp.networks.twin import Twin
-from edp.networks.twin.tuned import TunedSpec, TunedTwin
+from edp.networks.twin.tuned import HOTTEST_C, TunedSpec, TunedTwin
 from edp.networks.twin.tuned_correction import TunedCorrection
 from edp.recording import Recording
+from edp.training.twin_bundle import OIL_C, TwinBundle
 
 Rows = NDArray[np.float32]
 
 
+def tuned_spec(bundle: TwinBundle) -> TunedSpec:
+    """How the numbers of a twin follow: the temperature of the oil in its logs is known where they held it.
+
+    Raises:
+        BundleError: its provenance holds another thing than a temperature there.
+    """
+    celsius = bundle.provenance.get(OIL_C, math.nan)
+    if isinstance(celsius, bool) or not isinstance(celsius, int | float) or abs(celsius) > HOTTEST_C:
+        raise BundleError(
+            f"the twin's provenance holds {OIL_C} = {str(celsius)[:40]!r}, which is no temperature of oil"
+        )
+    return TunedSpec(oil_c=float(celsius))
+
+
+def correction_of(twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpec | None = None) -> TunedCorrection:
+    """What moves a network's predictions towards the forecasts of a grey box that follows the machine.
+
+    Args:
+        twin: a grey box of the machine as it was.
+        adaptation: of the network, which tells horizons, and by its units what a large correction is.
+        task: of the network.
+        spec: how the numbers follow.
+
+    Raises:
+        ConfigError: another rate than the network's, no grey box, or a target that is no velocity of it.
+    """
+    if twin.channels.rate_hz != task.rate_hz:
+        raise ConfigError(
+            f"the twin has {twin.channels.rate_hz:g} Hz, the network {task.rate_hz:g} Hz; train a twin at the "
+            "network's rate"
+        )
+    limit = adaptation.spec.limit * adaptation.unit.astype(np.float64)
+    return TunedCorrection(TunedTwin(twin, spec), task.targets, adaptation.horizons, limit)
+
+
 class TwinMoves:
     """Recordings of one machine through a `TunedCorrection`, one after the other.
+
+    Where a recording and the logs of the twin tell the temperature of the oil, the numbers follow it at once.
 
     Args:
         twin: a grey box of the machine as it was.
@@ -33,14 +73,7 @@ class TwinMoves:
     """
 
     def __init__(self, twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpec | None = None) -> None:
-        if twin.channels.rate_hz != task.rate_hz:
-            raise ConfigError(
-                f"the twin has {twin.channels.rate_hz:g} Hz, the network {task.rate_hz:g} Hz; train a twin at the "
-                "network's rate"
-            )
-        limit = adaptation.spec.limit * adaptation.unit.astype(np.float64)
-        self._twin = twin
-        self.correction = TunedCorrection(TunedTwin(twin, spec), task.targets, adaptation.horizons, limit)
+        self._twin, self.correction = twin, correction_of(twin, adaptation, task, spec)
 
     def __call__(
         self, recordings: Sequence[Recording], predictions: Sequence[Rows], carry: bool, learn: bool
@@ -67,6 +100,6 @@ class TwinMoves:
                 self.correction.interrupt()
             else:
                 self.correction.reset()
-            rows = zip(part.inputs, part.targets, predicted, strict=True)
+            rows = zip(part.inputs, part.targets, predicted, oil_celsius(recording).tolist(), strict=True)
             moved.append(np.stack([self.correction.step(*row) for row in rows]))
         return moved

@@ -9,8 +9,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
+from edp.data.oil import oil_celsius
 from edp.data.prepared import Prepared
 from edp.evaluation.beyond import RANGES, command_ranges
 from edp.evaluation.free_run import calibrated
@@ -29,7 +32,7 @@ from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FittedTwin, FreeRunProgress
-from edp.training.twin_bundle import STROKES, TwinBundle, load_twin, save_twin
+from edp.training.twin_bundle import OIL_C, STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
@@ -115,7 +118,9 @@ def train_twin(
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         tell("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
-        provenance = _provenance(source, experiment, data, fitted) | _full_strokes(recordings) | result.facts
+        provenance = (
+            _provenance(source, experiment, data, fitted) | _full_strokes(recordings) | _oil(recordings) | result.facts
+        )
         before = None if base is None else base.bundle.provenance.get(RANGES)
         provenance[RANGES] = command_ranges(channels, [*data.train, *data.validation], before)
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
@@ -172,6 +177,12 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
         "seconds": round(fitted.seconds, 2),
         "data": {"source": str(source.path), "reader": source.to_plain(), "digest": data.digest, "names": parts},
     }
+
+
+def _oil(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Temperature of the oil that all recordings tell; nothing where one does not."""
+    celsius = np.concatenate([oil_celsius(recording) for recording in recordings])
+    return {OIL_C: float(celsius.mean())} if np.isfinite(celsius).all() else {}
 
 
 def _full_strokes(recordings: Sequence[Recording]) -> dict[str, Any]:

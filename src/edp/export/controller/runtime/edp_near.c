@@ -215,7 +215,7 @@ static void move_valves(const edp_near *n, const float *demands, uint32_t ticks,
             }
             if ((run == 0u) || (*apart != 0u)) {
                 double spools[2];
-                double pilot;
+                double pilot = 0.0;
                 double *const x = n->x + run * 2u * valves + j;
                 double *const middle = n->pilots + run * valves + j;
                 move_valve(n, row, j, delayed(n, own, history, t, j), spools, &pilot);

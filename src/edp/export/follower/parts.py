@@ -1,0 +1,87 @@
+"""What a follower in C is made of: a grey box, how its numbers follow, and the predictions that move towards it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.greybox import GreyTwin
+from edp.networks.twin.tuned import TunedSpec, TunedTwin
+from edp.networks.twin.tuned_correction import TunedCorrection
+
+Array = NDArray[np.float32]
+GOLDEN_TICKS = 160
+"""Of the self-test: the observer settles, and a few stretches teach."""
+WORN = 0.2
+"""Logarithm by which the groups of the self-test's machine differ from those of the grey box, up and down by turns."""
+
+
+@dataclass(frozen=True, eq=False)
+class GoldenTicks:
+    """A stretch of ticks of a machine that has changed, and what the Python package makes of it.
+
+    Attributes:
+        inputs: commands, measured values and predictions ``(tick, number)``.
+        forecasts: velocities ``(tick, horizon and velocity)``, NaN where there is none.
+        factors: of the groups at the end ``(group,)``.
+        taught: stretches that have taught.
+    """
+
+    inputs: Array
+    forecasts: Array
+    factors: Array
+    taught: int
+
+
+@dataclass(frozen=True, eq=False)
+class FollowerParts:
+    """What is written.
+
+    Attributes:
+        title: a line about it.
+        twin: the grey box of the machine as it was.
+        spec: how its numbers follow.
+        targets: names of the predicted channels, velocities of the twin.
+        horizons: ticks ahead.
+        limit: largest correction ``(horizon, target)``, SI units.
+    """
+
+    title: str
+    twin: GreyTwin
+    spec: TunedSpec
+    targets: tuple[str, ...]
+    horizons: tuple[int, ...]
+    limit: NDArray[np.float64]
+
+    def correction(self) -> TunedCorrection:
+        """The same in Python.
+
+        Raises:
+            ConfigError: a target that is no velocity of the twin, or a group that it has no number of.
+        """
+        return TunedCorrection(TunedTwin(self.twin, self.spec), self.targets, self.horizons, self.limit)
+
+    def golden(self) -> GoldenTicks:
+        """A stretch of a machine whose groups have changed."""
+        correction, rng = self.correction(), np.random.default_rng(0)
+        tuned, scales = correction.tuned, self.twin.scales
+        signs = np.where(np.arange(len(tuned.labels)) % 2, -WORN, WORN)
+        worn = self.twin.with_numbers(self.twin.numbers * np.exp(tuned.moves @ signs))
+        levels = np.repeat(rng.normal(size=(GOLDEN_TICKS // 20, len(scales.command_offset))), 20, axis=0)
+        commands = (scales.command_offset + scales.command_width * levels).astype(np.float32)
+        start = np.clip(scales.answer_offset, scales.low, scales.high).astype(np.float32)[None]
+        answers, _ = worn.rollout(commands[None, :-1], worn.initial_state(commands[:1], start))
+        measured = np.concatenate([start, answers[0]])
+        predictions = np.zeros((GOLDEN_TICKS, len(self.horizons), len(self.targets)), np.float32)
+        forecasts = np.full((GOLDEN_TICKS, len(self.horizons), len(tuned.twin.channels.velocities)), np.nan, np.float32)
+        for tick in range(GOLDEN_TICKS):
+            correction.step(commands[tick], measured[tick], predictions[tick])
+            for h, k in enumerate(self.horizons):
+                forecast = tuned.forecast(k)
+                if forecast is not None:
+                    forecasts[tick, h] = forecast
+        inputs = np.concatenate([commands, measured, predictions.reshape(GOLDEN_TICKS, -1)], axis=1)
+        factors = np.array(list(tuned.factors.values()), np.float32)
+        return GoldenTicks(inputs, forecasts.reshape(GOLDEN_TICKS, -1), factors, tuned.learned)
