@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 from edp.cli import app
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
-from edp.evaluation.judged_data import judged_data
 from edp.logs import write_recording
 from edp.logs.drawn import drawn_recordings
 from edp.logs.source import DataSource
@@ -17,6 +16,7 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.inspecting import inspect_with
+from edp.workflows.judged_data import judged_data
 from edp.workflows.train_evaluate import train, trained_run
 
 CHANNELS = (Channel("v", Kind.VELOCITY), Channel("u", Kind.RATIO))

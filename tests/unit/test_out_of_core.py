@@ -23,16 +23,14 @@ from edp.data.task import TargetMode, Task
 from edp.errors import DataError, StorageError
 from edp.evaluation.tally import Tally
 from edp.logs import read_data_set, write_recording
-from edp.logs.drawn import spread_recordings
 from edp.logs.quality.cross_recording import compare
 from edp.logs.quality.quality import inspect
 from edp.logs.quality.sketches import Sketches, sketch
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
-from edp.recording import Recording
+from edp.recording import Recording, spread_recordings, spread_stretches
 from edp.signals import Channel, Kind
 from edp.stats.sketch import QuantileSketch
-from edp.stats.stretches import spread_stretches
 from edp.workflows.executors.packing import packed, unpacked
 
 NAMES = ("a", "b", "c", "d", "e", "f")
@@ -324,7 +322,7 @@ def test_stretches_of_recordings_and_series_are_views():
 
 def test_a_large_data_set_is_screened_on_stretches_of_it(monkeypatch):
     monkeypatch.setattr("edp.data.screening.table.MOST_ROWS", 8_000)
-    monkeypatch.setattr("edp.stats.stretches.spread_stretches.__defaults__", (8_000,))
+    monkeypatch.setattr("edp.recording.spread_stretches.__defaults__", (8_000,))
     rng = np.random.default_rng(0)
     recordings = []
     for number in range(8):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from edp.cli.console import JsonFlag, emit, listing, out
+
+if TYPE_CHECKING:
+    from edp.storage.run_listing import ListedRun
 
 
 def runs(
@@ -32,9 +36,14 @@ def runs(
             out.print(f"no runs below '{folder}'; edp train writes one")
             return
         listing("", ["run", "kind", "state", "when", "error on test logs"], rows)
-        for source in dict.fromkeys(run.data for run in listed[:most] if run.data):
-            names = [str(_below(run.folder, folder)) for run in listed[:most] if run.data == source]
-            out.print(f"  data {source}: {', '.join(names[:4])}{', ...' if len(names) > 4 else ''}")
+        # One log may have been given by a relative and by an absolute path.
+        sources: dict[str, list[ListedRun]] = {}
+        for run in listed[:most]:
+            if run.data:
+                sources.setdefault(os.path.abspath(run.data), []).append(run)
+        for own in sources.values():
+            names = [str(_below(run.folder, folder)) for run in own]
+            out.print(f"  data {own[0].data}: {', '.join(names[:4])}{', ...' if len(names) > 4 else ''}")
         if len(listed) > most:
             out.print(f"and {len(listed) - most} older ones (--most)")
         if not whole:

@@ -20,8 +20,7 @@ from edp.data.roles import Axis, Roles, roles_of, signed
 from edp.data.splits import Split
 from edp.data.twin_channels import INTEGRAL
 from edp.errors import DataError
-from edp.logs.drawn import STRETCH_S, spread_recordings
-from edp.recording import Recording
+from edp.recording import STRETCH_S, Recording, spread_recordings
 from edp.signals import KINDS, Kind
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from edp.data.gathered import some_rows
 from edp.data.series import Series
-from edp.stats.stretches import spread_stretches
+from edp.recording import spread_stretches
 
 
 def spread_series(series: Sequence[Series], length: int, most: int, on_disk: bool = False) -> list[Series]:

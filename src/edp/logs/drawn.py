@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from edp.errors import ConfigError
 from edp.logs.quality.checks import Finding
-from edp.recording import Recording
-from edp.stats.stretches import MOST_ROWS, spread_stretches
-
-STRETCH_S = 120.0
-"""Of the stretches that a large data set is looked at by."""
+from edp.recording import STRETCH_S, Recording, spread_recordings
 
 
 @dataclass(frozen=True)
@@ -43,20 +39,6 @@ def checked_hours(hours: float) -> float:
     if not 0.0 < hours < float("inf"):
         raise ConfigError(f"--at-most {hours:g}: a positive number of hours must hold")
     return hours
-
-
-def spread_recordings(recordings: Sequence[Recording], seconds: float, most: int = MOST_ROWS) -> list[Recording]:
-    """Recordings, or evenly spread stretches of them of so many seconds; samples on disk stay there."""
-    length = max(1, round(seconds * recordings[0].rate_hz))
-    stretches = spread_stretches([recording.samples for recording in recordings], length, most)
-    return [
-        recordings[i]
-        if (start, stop) == (0, recordings[i].samples)
-        else replace(
-            recordings[i], values=recordings[i].values[start:stop], name=f"{recordings[i].name}[{start}:{stop}]"
-        )
-        for i, start, stop in stretches
-    ]
 
 
 def drawn_recordings(recordings: Sequence[Recording], hours: float) -> list[Recording]:

@@ -21,7 +21,6 @@ from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, first_scored, judge, score_network
-from edp.evaluation.judged_data import judged_data
 from edp.evaluation.scores_file import earlier_scores
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
@@ -37,6 +36,7 @@ from edp.training.bundle import weights_digest
 from edp.training.fit import fit
 from edp.training.spec import check_fitted_parts, check_training, thread_count
 from edp.training.strategy import DirectFit, TrainingStrategy
+from edp.workflows.judged_data import judged_data
 
 if TYPE_CHECKING:
     from edp.sim.data_set import SimulationOrder, simulate_data_set

@@ -1,6 +1,7 @@
 """`edp runs` lists what is on disk, `edp doctor` what is installed; neither trusts what it finds."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -63,6 +64,15 @@ def test_runs_are_listed_with_kind_state_and_score(edp, folder):
     with hold(folder / "deep" / "er" / "two" / ".lock"):
         assert "running" in edp("runs", folder).out
     assert "and 2 older ones" in edp("runs", folder, "--most", 1).out
+
+
+def test_one_log_by_two_paths_is_listed_once(edp, tmp_path):
+    for name, source in (("a", "logs/x"), ("b", str(Path("logs/x").absolute()))):
+        run(tmp_path / name, run={}, status={}, provenance={"data": {"source": source}})
+    together = [line for line in edp("runs", tmp_path).out.splitlines() if line.startswith("  data ")]
+    assert len(together) == 1
+    assert "a" in together[0].rpartition(":")[2]
+    assert "b" in together[0].rpartition(":")[2]
 
 
 def test_hostile_runs_are_damaged_and_bounded(edp, folder, monkeypatch):

@@ -22,6 +22,7 @@ from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.proposal import columns as columns_module
 from edp.logs.proposal.kinds import BOUND
+from edp.logs.proposal.names import unit_by_ending
 from edp.logs.source import DataSource, load_signal_map
 from edp.workflows.auto import load_auto
 from edp.workflows.proposal import LogsProposal, propose, write_proposal
@@ -455,3 +456,27 @@ def test_numbered_columns_that_are_taken_for_the_same_stand_in_one_row_and_no_na
     assert shown[5:10] == ["s7", "s8", "s10", "x_1_a to x_3_a", "x_4_b"]
     assert len(set(shown)) == len(shown)
     assert all(len(name) <= 60 for name in shown)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("boom_mps", "m/s"),
+        ("acc_mps2", "m/s^2"),
+        ("a_m_s2", "m/s^2"),
+        ("v_mm_s", "mm/s"),
+        ("swing_rad_s", "rad/s"),
+        ("swing_degps", "deg/s"),
+        ("q_l_min", "L/min"),
+        ("oil_degC", "degC"),
+        ("oilTemp_degC", "degC"),
+        ("f_kN", "kN"),
+        ("p_kPa", "kPa"),
+        ("p_A", None),
+        ("x_m", None),
+        ("_kN", None),
+        ("CylVel_1", None),
+    ],
+)
+def test_names_end_in_units(name, unit):
+    assert unit_by_ending(name) == unit

@@ -13,9 +13,8 @@ from edp.data.gathered import on_demand, some_columns
 from edp.data.screening.result import Array
 from edp.data.screening.spec import ScreeningSpec
 from edp.errors import DataError, closest
-from edp.recording import FloatArray, Recording
+from edp.recording import MOST_ROWS, FloatArray, Recording, spread_stretches
 from edp.signals import TABLE_A1, Kind
-from edp.stats.stretches import MOST_ROWS, spread_stretches
 
 LEAST_LAGS, LAGS_A_STRETCH = 5, 40
 """Largest lags that a recording is long at least, and that a stretch of a large data set is."""

@@ -13,7 +13,7 @@ import typing
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ def unpacked(data: bytes, kind: type[T]) -> T:
     try:
         tensors = load(data)
         tree = json.loads(tensors.pop(TREE).tobytes())
-        value = _together(tree, tensors, classes_in(kind), 0)
+        value = _together(tree, tensors, classes_in(cast(type, kind)), 0)
     except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError) as error:
         raise DataError(f"the result of a unit of work is damaged: {error}; give the same command again") from error
     if not isinstance(value, kind):

@@ -18,10 +18,9 @@ from edp.logs import DataQuality, Repair, common_channels, open_log
 from edp.logs.formats.base import is_truth
 from edp.logs.resolve import resolve
 from edp.logs.source import DataSource
-from edp.recording import Recording
+from edp.recording import MOST_ROWS, Recording
 from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
-from edp.stats.stretches import MOST_ROWS
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import command_line
 from edp.workflows.feature_selection.changes import with_changes

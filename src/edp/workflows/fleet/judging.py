@@ -10,7 +10,6 @@ from typing import Any
 
 from edp.config.experiment import build, plain_tree
 from edp.evaluation.judge import JudgedModel, JudgedPart, JudgeSpec, ModelBench, by_effort, network_parts
-from edp.evaluation.judged_data import judged_data
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -19,6 +18,7 @@ from edp.training.blas import one_blas_thread
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.packing import packed, unpacked
 from edp.workflows.executors.units import UnitResult, WorkUnit, forget_units, run_units
+from edp.workflows.judged_data import judged_data
 from edp.workflows.train_evaluate import evaluate, other_recordings, trained_run
 
 UNITS, NETWORK = "units", "network"
@@ -54,8 +54,8 @@ def evaluate_with(
         # Costly ones first, so that none of them begins last; parts of the network, all alike, fill what is left.
         names, spec = [*reversed(by_effort(bench.spec.baselines))], bench.spec
         parts = network_parts(bench.data)
-        told = None if source is None else source.to_plain()
-        at = {"run": str(folder.resolve()), "source": told, "at_most_h": at_most_h}
+        source_fields = None if source is None else source.to_plain()
+        at = {"run": str(folder.resolve()), "source": source_fields, "at_most_h": at_most_h}
         models = [_unit(f"model '{name}'", {"model": name}, spec, digest, at) for name in names]
         runs = [
             _unit(f"network, part {part + 1} of {parts}", {"part": part}, spec, digest, at) for part in range(parts)

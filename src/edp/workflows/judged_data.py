@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from edp.data.prepared import Prepared
 from edp.data.spread_rows import spread_series
-from edp.logs.drawn import STRETCH_S, Drawn, checked_hours, drawn_recordings
-from edp.recording import Recording
+from edp.logs.drawn import Drawn, checked_hours, drawn_recordings
+from edp.recording import STRETCH_S, Recording
 from edp.training.bundle import Bundle
 
 
