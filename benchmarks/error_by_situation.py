@@ -45,6 +45,8 @@ ORACLES: Mapping[str, tuple[str, ...]] = {
     "true pressures": tuple(f"True{name}" for name in TABLE_A1 if name.startswith("CylPressures")),
     "oil temperature": ("OilTemperature",),
 }
+GROUND = {"contact, force and load of the ground": ("Event_SoilContact", "TipForceX", "TipForceY", "Payload")}
+"""What a soil-aware state could know at best, with --soil; the truth, which no sensor shows."""
 ALL = "all of these"
 """Every channel of the oracles at once: one long training that says whether any of them is worth something."""
 CONFLUX = (("BmUpConf", "BmDwnConf"), ("AmInConf", "AmOutConf"), ("BktInConf", "BktOutConf"))
@@ -69,7 +71,7 @@ def main() -> None:
     made.add_argument("--preset", choices=("quick", "standard"), default="quick", help="of the networks")
     made.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="changes of the preset")
     made.add_argument(
-        "--oracles", nargs="*", choices=(*ORACLES, ALL), default=list(ORACLES), help="first the plain one"
+        "--oracles", nargs="*", choices=(*ORACLES, *GROUND, ALL), default=list(ORACLES), help="first the plain one"
     )
     made.add_argument("--forecasts", type=Path, default=None, help="folder that twin_forecast.py --work left")
     made.add_argument("--work", type=Path, default=None, help="folder that keeps the data")
@@ -85,7 +87,7 @@ def run(arguments: Any, work: Path) -> None:
     """Networks, situations, tables."""
     recordings = data_of(arguments, work)
     rows, knowledge, errors = {}, {}, {}
-    hidden = {**ORACLES, ALL: tuple(channel for channels in ORACLES.values() for channel in channels)}
+    hidden = {**ORACLES, **GROUND, ALL: tuple(channel for channels in ORACLES.values() for channel in channels)}
     for name in arguments.oracles:
         channels = hidden[name]
         data, errors[name] = trained(recordings, channels, arguments)

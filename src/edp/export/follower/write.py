@@ -209,10 +209,11 @@ def _own(path: str) -> str:
 
 def _enum(prefix: str, channels: Iterable[Channel]) -> Code:
     every = list(channels)
-    return _listed(prefix, [c.name for c in every], [f"{c.unit}; {c.description}" for c in every])
+    return _listed(prefix, [c.name for c in every], ["; ".join((c.unit, c.description)) for c in every])
 
 
 def _listed(prefix: str, names: Iterable[str], texts: Iterable[str]) -> Code:
+    """Lines of an enumeration, each with a text that is escaped here as its comment."""
     ends = c_names(names, C_SIGNIFICANT - len(prefix))
     lines = (
         f"    {prefix}{end} = {i}, /* {c_comment(text)} */"
