@@ -7,46 +7,22 @@ import re
 import numpy as np
 import pytest
 
-from edp.data.series import Series
-from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, ExportError
 from edp.export.follower import FollowerParts, write_follower
 from edp.networks.twin import fit_scales
-from edp.networks.twin.grey.elements import CylinderElement, PumpElement, ValveElement
-from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.tuned import TunedSpec
-from edp.signals import Channel, Kind
+from edp.testing.bench import bench_channels, bench_grey_box, bench_series
 from edp.training.twin_bundle import TwinBundle, plant_bundle
 
-BENCH = GreyBox(
-    cylinders=(CylinderElement(name="ram", velocity="speed", head="head", rod="rod", bore=0.1, rod_diameter=0.06),),
-    valves=(ValveElement(name="valve", actuator="ram", extend="lever", supply="pump"),),
-    pumps=(PumpElement(name="pump", pressure="line"),),
-    inertia_degree=1,
-    potential_degree=2,
-    stretches=5,
-)
+BENCH = bench_grey_box()
 HORIZONS, LIMIT = (3, 8), np.array([[0.05], [0.1]])
 NAME = "follower"
-
-
-def bench_series(ticks, seed):
-    rng = np.random.default_rng(seed)
-    lever = np.repeat(rng.uniform(-1, 1, ticks // 40 + 1), 40)[:ticks]
-    low, high = np.array([-0.5, 0.0, 0.0, 0.0, 1e6]), np.array([0.5, 1.0, 2e7, 2e7, 2e7])
-    return Series("levers", lever[:, None].astype(np.float32), rng.uniform(low, high, (ticks, 5)).astype(np.float32))
 
 
 @pytest.fixture(scope="module")
 def bench():
     """A grey box of a cylinder, levers, and the answers of a machine with dead bands half as wide again."""
-    channels = TwinChannels(
-        (Channel("lever", Kind.RATIO, "*/ int y; /*"),),
-        (Channel("speed", Kind.VELOCITY),),
-        (Channel("place", Kind.POSITION),),
-        (Channel("head", Kind.PRESSURE), Channel("rod", Kind.PRESSURE), Channel("line", Kind.PRESSURE)),
-        100.0,
-    )
+    channels = bench_channels(description="*/ int y; /*")
     series = [bench_series(2000, seed) for seed in range(2)]
     twin = BENCH.start(channels, fit_scales(channels, series), series, 0)
     numbers = twin.table.nominal

@@ -24,7 +24,7 @@ from edp.training import load_bundle, save_bundle, upgrade_bundle
 from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.adaptation import adapt, fit_adaptation, replay, replay_run
-from edp.workflows.adaptation.with_twin import TwinMoves, tuned_spec
+from edp.workflows.adaptation.with_twin import TwinMoves, correction_of, tuned_spec
 from edp.workflows.deployment import footprint_of
 from edp.workflows.train_evaluate import evaluate, train, trained_run
 
@@ -203,7 +203,10 @@ def test_a_thermometer_in_the_logs_of_twin_and_replay_moves_its_numbers(adapted,
     grey = load_twin(saved_twin(GreyBox(), lever_sessions, tmp_path / "grey"))
     assert math.isnan(tuned_spec(grey).oil_c)
     spec = tuned_spec(dataclasses.replace(grey, provenance={"oil_c": 20.0}))
-    moves, recordings = TwinMoves(grey.twin, bundle.adaptation, bundle.task, spec), lever_sessions.read()
+    moves, recordings = (
+        TwinMoves(grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, spec)),
+        lever_sessions.read(),
+    )
     cold = recordings[0]
     warm = with_channel(cold, Channel("OilTemperature", Kind.TEMPERATURE), 273.15 + 60.0)
     other = with_channel(cold, Channel("OilTemperature", Kind.GENERIC), 333.15)
@@ -230,7 +233,7 @@ def test_a_grey_box_that_follows_leaves_as_c(run, adapted, lever_sessions, tmp_p
     assert "at most 10" not in (out / "follower.h").read_text()
     assert "learning 10." in (out / "follower.h").read_text()
     for wrong, said in (
-        ((), "belong together"),
+        ((), "needs --twin GREY"),
         (("--twin", twin, "--set", "groups=gain"), "no such option"),
         (("--twin", twin, "--set", "gain=x"), "a number must hold"),
         (("--twin", twin, "--set", "learn_ticks=1"), "learn_ticks"),
@@ -240,7 +243,7 @@ def test_a_grey_box_that_follows_leaves_as_c(run, adapted, lever_sessions, tmp_p
     plain = command.invoke(app, ["export", str(run), "--to", "follower", "--twin", twin, "--out", str(out)])
     assert "edp adapt" in str(plain.exception)
     alone = command.invoke(app, ["export", str(run), "--to", "c", "--twin", twin, "--out", str(out)])
-    assert "belong together" in str(alone.exception)
+    assert "'c' reads no grey box beside the run, follower does" in str(alone.exception)
 
 
 def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, lever_sessions, tmp_path):

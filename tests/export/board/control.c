@@ -1,15 +1,10 @@
 /* Checksum of levers of a controller, and on a Cortex-M the executed instructions of a tick: see count.c. */
+#include "cycles.h"
 #include "machine_control.h"
 #include "machine_control_golden.h"
 
 #include <stdio.h>
 
-#ifdef __arm__
-#define SYST_CSR (*(volatile uint32_t *)0xE000E010u)
-#define SYST_RVR (*(volatile uint32_t *)0xE000E014u)
-#define SYST_CVR (*(volatile uint32_t *)0xE000E018u)
-#define PER_COUNT (1000000000u / CLOCK_HZ)
-#endif
 #ifndef TICKS
 #define TICKS 8u
 #endif
@@ -26,16 +21,13 @@ int main(void) {
     }
     for (uint32_t tick = 0; tick < TICKS; tick++) {
 #ifdef __arm__
-        SYST_RVR = 0xFFFFFFu;
-        SYST_CVR = 0u;
-        SYST_CSR = 5u;
-        const uint32_t start = SYST_CVR;
+        const uint32_t start = begin_count();
 #endif
         if (machine_control_step(&control, golden_measured[tick], levers[tick]) != EDP_CONTROL_OK) {
             return 3;
         }
 #ifdef __arm__
-        instructions += ((start - SYST_CVR) & 0xFFFFFFu) * PER_COUNT;
+        instructions += counted_since(start);
 #endif
     }
     (void)printf("%lu instructions\n", instructions / TICKS);

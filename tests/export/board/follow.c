@@ -1,4 +1,5 @@
 /* Executed instructions of ticks of a follower on a Cortex-M, one run of a stretch a tick: see count.c. */
+#include "cycles.h"
 #include "follower.h"
 #include "follower_golden.h"
 
@@ -6,13 +7,6 @@
 
 #include <stdio.h>
 #include <string.h>
-
-#ifdef __arm__
-#define SYST_CSR (*(volatile uint32_t *)0xE000E010u)
-#define SYST_RVR (*(volatile uint32_t *)0xE000E014u)
-#define SYST_CVR (*(volatile uint32_t *)0xE000E018u)
-#define PER_COUNT (1000000000u / CLOCK_HZ)
-#endif
 
 static follower_state state;
 
@@ -29,14 +23,11 @@ int main(void) {
         (void)memcpy(tick.measured, golden_inputs[at] + FOLLOWER_COMMANDS, sizeof tick.measured);
         tick.oil_c = NAN;
 #ifdef __arm__
-        SYST_RVR = 0xFFFFFFu;
-        SYST_CVR = 0u;
-        SYST_CSR = 5u;
-        const uint32_t start = SYST_CVR;
+        const uint32_t start = begin_count();
 #endif
         (void)follower_step(&state, &tick, RUNS, y, y);
 #ifdef __arm__
-        const unsigned long spent = (unsigned long)((start - SYST_CVR) & 0xFFFFFFu) * PER_COUNT;
+        const unsigned long spent = counted_since(start);
         /* A stretch is run again from the prefix and one stretch on. */
         if (at >= SKIPPED) {
             most = (spent > most) ? spent : most;

@@ -9,16 +9,16 @@ import pytest
 
 from edp.config.twin import load_twin_experiment, twin_toml
 from edp.data.series import Series
-from edp.data.twin_channels import TwinChannels, twin_channels
+from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
-from edp.networks.twin.grey.elements import CylinderElement, Elements, PumpElement, ValveElement
+from edp.networks.twin.grey.elements import CylinderElement, Elements, ValveElement
 from edp.networks.twin.grey.numbers import monomials, number_table
 from edp.networks.twin.grey.plausible import Travel
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
-from edp.signals import Channel, Kind
+from edp.testing.bench import bench_channels, bench_grey_box, bench_series
 from edp.testing.twins import sample_actuators
 from edp.training import grey_fit
 from edp.training.bundle import HASH, header_digest
@@ -28,24 +28,7 @@ from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 PREFIX = 30
 
 
-def bench_channels():
-    """A cylinder with stroke, both chambers and its pump, at 100 Hz."""
-    return TwinChannels(
-        (Channel("lever", Kind.RATIO),),
-        (Channel("speed", Kind.VELOCITY),),
-        (Channel("place", Kind.POSITION),),
-        (Channel("head", Kind.PRESSURE), Channel("rod", Kind.PRESSURE), Channel("line", Kind.PRESSURE)),
-        100.0,
-    )
-
-
-BENCH = GreyBox(
-    cylinders=(CylinderElement(name="ram", velocity="speed", head="head", rod="rod", bore=0.1, rod_diameter=0.06),),
-    valves=(ValveElement(name="valve", actuator="ram", extend="lever", supply="pump"),),
-    pumps=(PumpElement(name="pump", pressure="line"),),
-    inertia_degree=1,
-    potential_degree=2,
-    stretches=5,
+BENCH = bench_grey_box(
     prefix_ticks=PREFIX,
     fit=GreyFitSpec(
         lengths_s=(0.1, 0.4),
@@ -58,15 +41,6 @@ BENCH = GreyBox(
         validation_runs=4,
     ),
 )
-
-
-def bench_series(ticks=800, seed=0):
-    """Levers of a bench, and plausible values that set the scales."""
-    rng = np.random.default_rng(seed)
-    lever = np.repeat(rng.uniform(-1, 1, ticks // 40 + 1), 40)[:ticks]
-    low, high = np.array([-0.5, 0.0, 0.0, 0.0, 1e6]), np.array([0.5, 1.0, 2e7, 2e7, 2e7])
-    targets = rng.uniform(low, high, (ticks, 5))
-    return Series("levers", lever[:, None].astype(np.float32), targets.astype(np.float32))
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,13 @@ from edp.export.golden import random_inputs, stream
 from edp.networks.twin import TwinPlant, fit_scales
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.residual import Residual
+from edp.testing.bench import bench_channels, bench_series
 from edp.testing.twins import sample_actuators, sample_twin
 from edp.training.free_run import FreeRunSpec
 from edp.training.residual_fit import fit_residual
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
-from .test_grey_box import BENCH, bench_channels, bench_series
+from .test_grey_box import BENCH
 
 UNITS = 6
 OPTIONS = {entry.name: getattr(BENCH, entry.name) for entry in fields(BENCH)}

@@ -8,9 +8,10 @@ from edp.errors import ConfigError
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.tuned import BOUND, NUMBER_GROUPS, TunedSpec, TunedTwin, group_matrix
 from edp.networks.twin.tuned_correction import TunedCorrection
+from edp.testing.bench import bench_channels, bench_series
 from edp.testing.twins import sample_actuators
 
-from .test_grey_box import BENCH, bench_channels, bench_series
+from .test_grey_box import BENCH
 
 BAND = TunedSpec(groups=("dead_band",), load_share=0.0)
 K = 5

@@ -6,7 +6,7 @@ import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 _PIECE_BYTES = 1 << 20
 """Of the text looked at or passed on at a time."""
@@ -105,7 +105,45 @@ def _end_of_table(path: Path, size: int, mark: bytes, skip: int, width: int) -> 
     return size - sum(map(len, lines[cut:]))
 
 
-class TableText(io.RawIOBase):
+class PassedText(io.RawIOBase):
+    """A text that is changed while it is read, some lines at a time.
+
+    Args:
+        stream: the text.
+    """
+
+    def __init__(self, stream: IO[Any]) -> None:
+        super().__init__()
+        self._stream = stream
+        self._rest = b""
+
+    def readable(self) -> bool:
+        """It is read only."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill a buffer as far as there is text."""
+        while not self._rest:
+            text = self._changed()
+            if text is None:
+                return 0
+            self._rest = text
+        count = min(len(buffer), len(self._rest))
+        buffer[:count] = self._rest[:count]
+        self._rest = self._rest[count:]
+        return count
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+        super().close()
+
+    def _changed(self) -> bytes | None:
+        """The next lines as they are to be read; None at the end of the text."""
+        raise NotImplementedError
+
+
+class TableText(PassedText):
     """A text with lines of `MARK` in place of the names that stand within its table again, up to the end of the table.
 
     Args:
@@ -117,38 +155,19 @@ class TableText(io.RawIOBase):
     """
 
     def __init__(self, path: Path, skip: int, delimiter: str, width: int, leftovers: Leftovers) -> None:
-        super().__init__()
-        self._stream = path.open("rb")
+        super().__init__(path.open("rb"))
         self._left = leftovers.end
         self._skip = skip
         self._names = leftovers.names
         self._marked = (MARK + delimiter * width + "\n").encode()
-        self._rest = b""
 
-    def readable(self) -> bool:
-        """It is read only."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        """Fill a buffer as far as there is text."""
-        while not self._rest and self._left > 0:
-            lines = self._stream.readlines(min(_PIECE_BYTES, self._left))
-            if not lines:
-                return 0
-            text = bytearray()
-            for line in lines:
-                above = self._skip > 0
-                self._skip -= above
-                if self._left > 0:
-                    text += line if above or line.strip() not in self._names else self._marked
-                self._left -= len(line)
-            self._rest = bytes(text)
-        count = min(len(buffer), len(self._rest))
-        buffer[:count] = self._rest[:count]
-        self._rest = self._rest[count:]
-        return count
-
-    def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
-        super().close()
+    def _changed(self) -> bytes | None:
+        lines = self._stream.readlines(min(_PIECE_BYTES, self._left)) if self._left > 0 else []
+        text = bytearray()
+        for line in lines:
+            above = self._skip > 0
+            self._skip -= above
+            if self._left > 0:
+                text += line if above or line.strip() not in self._names else self._marked
+            self._left -= len(line)
+        return bytes(text) if lines else None

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, brief
 from edp.logs.formats.base import BEHIND_TABLE, NAMES_AGAIN, PIECE_ROWS, TORN_LINE
-from edp.logs.formats.csv_leftovers import MARK, Leftovers, TableText, leftovers_of
+from edp.logs.formats.csv_leftovers import MARK, Leftovers, PassedText, TableText, leftovers_of
 from edp.storage.memory import free_bytes
 
 WHOLE_BYTES = 1 << 30
@@ -137,7 +137,7 @@ def _all_numbers(cells: pa.Array, nulls: pa.Array, decimal: str) -> bool:
     return True
 
 
-class SqueezedText(io.RawIOBase):
+class SqueezedText(PassedText):
     """The lines of a text behind the first ones, as UTF-8, blanks at their ends left out and those within them one.
 
     Args:
@@ -147,32 +147,13 @@ class SqueezedText(io.RawIOBase):
     """
 
     def __init__(self, path: Path, encoding: str, skip: int) -> None:
-        super().__init__()
-        self._stream = path.open(encoding=encoding, errors="replace", newline=None)
+        super().__init__(path.open(encoding=encoding, errors="replace", newline=None))
         for _ in range(skip):
             self._stream.readline(_LONGEST_LINE)
-        self._rest = b""
 
-    def readable(self) -> bool:
-        """It is read only."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        """Fill a buffer as far as there is text."""
-        while not self._rest:
-            lines = self._stream.readlines(_SQUEEZED_BYTES)
-            if not lines:
-                return 0
-            self._rest = "".join(" ".join(line.split()) + "\n" for line in lines).encode()
-        count = min(len(buffer), len(self._rest))
-        buffer[:count] = self._rest[:count]
-        self._rest = self._rest[count:]
-        return count
-
-    def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
-        super().close()
+    def _changed(self) -> bytes | None:
+        lines = self._stream.readlines(_SQUEEZED_BYTES)
+        return "".join(" ".join(line.split()) + "\n" for line in lines).encode() if lines else None
 
 
 class CsvTable:

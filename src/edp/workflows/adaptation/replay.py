@@ -21,7 +21,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 from edp.training import load_bundle
 from edp.training.twin_bundle import load_twin
-from edp.workflows.adaptation.with_twin import TwinMoves, tuned_spec
+from edp.workflows.adaptation.with_twin import TwinMoves, correction_of, tuned_spec
 
 # 60 s are the usual forgetting time: beyond it the adaptation is settled.
 BINS = (0.0, 10.0, 30.0, 60.0)
@@ -188,7 +188,7 @@ def replay_run(
     moves = None
     if twin is not None:
         grey = load_twin(twin)
-        by_twin = TwinMoves(grey.twin, bundle.adaptation, bundle.task, tuned_spec(grey))
+        by_twin = TwinMoves(grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, tuned_spec(grey)))
         moves = partial(by_twin, recordings, carry=carry, learn=learn)
     result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording, moves)
     return result.to_json(bundle.task, bundle.target_kinds)

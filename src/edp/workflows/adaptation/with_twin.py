@@ -64,16 +64,11 @@ class TwinMoves:
 
     Args:
         twin: a grey box of the machine as it was.
-        adaptation: of the network, which tells horizons, and by its units what a large correction is.
-        task: of the network.
-        spec: how the numbers follow.
-
-    Raises:
-        ConfigError: another rate than the network's, no grey box, or a target that is no velocity of it.
+        correction: of the network's predictions by it (`correction_of`).
     """
 
-    def __init__(self, twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpec | None = None) -> None:
-        self._twin, self.correction = twin, correction_of(twin, adaptation, task, spec)
+    def __init__(self, twin: Twin, correction: TunedCorrection) -> None:
+        self._twin, self.correction = twin, correction
 
     def __call__(
         self, recordings: Sequence[Recording], predictions: Sequence[Rows], carry: bool, learn: bool
