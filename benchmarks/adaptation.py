@@ -374,9 +374,10 @@ def judged(found: dict[str, dict[str, float]], quick: bool) -> list[Verdict]:
         for way, mae in ways.items():
             gained = ways["frozen"] - mae
             change = loss - (mae - before[way])
-            shares = ("", "") if name == "before" else (gained / loss, change / loss)
+            # A short form may drive where a change is not met: in clay, without a dig.
+            shares = (gained / loss, change / loss) if loss else ("", "")
             rows.append([name, way, mae, *shares])
-        if name != "before":
+        if loss:
             verdicts.append(verdict(f"{name}: recovered of the loss", ways["frozen"] - ways["adapted"], loss,
                                     ">= 0.5", "mm/s", quick))  # fmt: skip
     table(["scenario", "way", "MAE mm/s", "recovered", "of the change"], rows)

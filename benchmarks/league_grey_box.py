@@ -89,7 +89,7 @@ def main() -> None:
     made.add_argument("--work", type=Path, default=None, help="folder that keeps data and finished parts")
     arguments = made.parse_args()
     if arguments.quick:
-        arguments.minutes, arguments.logs, arguments.seeds = 6.0, 4, 1
+        arguments.minutes, arguments.logs, arguments.seeds = 4.0, 2, 1
     in_folder(arguments.work, lambda work: run(arguments, work))
 
 

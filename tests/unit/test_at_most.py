@@ -13,31 +13,17 @@ from edp.logs import write_recording
 from edp.logs.drawn import drawn_recordings
 from edp.logs.source import DataSource
 from edp.recording import Recording
-from edp.signals import Channel, Kind
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.inspecting import inspect_with
 from edp.workflows.judged_data import judged_data
 from edp.workflows.train_evaluate import train, trained_run
 
-CHANNELS = (Channel("v", Kind.VELOCITY), Channel("u", Kind.RATIO))
+from .test_workflow import CHANNELS, SMALL
+
 HZ = 2.0
 """A stretch of two minutes has 240 rows."""
 LENGTHS = (1500, 900, 120, 2000)
-SMALL = (
-    'task.features={name="rig", channels=["v", "u"]}',
-    'task.targets=["v"]',
-    "task.horizons=[2]",
-    'split={kind="time",validation_share=0.2,test_share=0.4}',
-    "training.epochs=1",
-    "training.updates=2",
-    'training.optimizer={kind="adamw"}',
-    'training.chunks={regime="chunk",length=16,batch=2,burn_in=5}',
-    'model.backbone={kind="lstm",units=4}',
-    "model.blocks=[]",
-    "model.window=8",
-    "judge.history=4",
-    'judge.baselines=["persistence"]',
-)
+HALVED = (*SMALL, "training.updates=2", 'split={kind="time",validation_share=0.2,test_share=0.4}')
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +41,7 @@ def store(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(store):
-    train(DataSource.of(store), load_experiment(None, "quick", list(SMALL)), store.parent / "run")
+    train(DataSource.of(store), load_experiment(None, "quick", list(HALVED)), store.parent / "run")
     return store.parent / "run"
 
 

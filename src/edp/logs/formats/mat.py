@@ -32,6 +32,8 @@ from edp.logs.units import normalise_unit
 from edp.recording import Recording
 from edp.signals import SignalMap
 
+_MOST_NAMED = 100
+"""Experiments of a file that are looked through for one that is named nearly so."""
 _VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
 """Our names and the library's: its v7 is v5 with packed variables."""
 
@@ -63,9 +65,9 @@ class MatFormat:
         )
         if signal_map.variable is not None:
             if signal_map.variable not in mat_variables.names:
+                known = (*mat_variables.names, *mat_variables.experiment_names[:_MOST_NAMED])
                 raise DataError(
-                    f"'{path}' has no variable '{signal_map.variable}'"
-                    f"{closest(signal_map.variable, mat_variables.names)}; "
+                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, known)}; "
                     "set 'variable' in the signal map to an existing one"
                 )
             if signal_map.variable == TRUTH and edp_metadata.truth:

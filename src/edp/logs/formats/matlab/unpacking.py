@@ -39,14 +39,15 @@ def unpack(path: Path, variable: str | None = None) -> MatVariables:
     """
     variables = _load(path)
     info = variables.pop(INFO, None)
-    names = list(variables)
+    names, every = list(variables), variables
     if variable is not None:
         picked = None if variable in variables else pick_experiment(variables, variable)
         names += [] if picked is None else [variable]
         variables = picked or {name: value for name, value in variables.items() if name == variable}
     mat_variables = collect(variables)
     mat_variables.names = names
-    mat_variables.experiment_names = experiment_names(variables)
+    # Of a variable that is not there all are named, so that a message can tell which ones are.
+    mat_variables.experiment_names = experiment_names(variables or every)
     if info is not None:
         array = np.asarray(info)
         mat_variables.info = str(array.ravel()[0]) if array.size else ""
