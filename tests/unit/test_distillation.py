@@ -66,11 +66,11 @@ def same(one, other):
 
 def test_a_student_of_the_teacher_alone_does_as_it_does_whatever_the_truth_says(tiny, brief, teacher, small):
     spec = dataclasses.replace(brief, updates=150)
-    teacher_targets, plain = (
+    strategy_columns, plain = (
         fit(tiny, small, spec, strategy=strategy).predictor
         for strategy in (Distillation([teacher], DistillationSpec(truth=0.0)), None)
     )
-    assert gap(teacher_targets, teacher, tiny.test) < 0.5 * gap(plain, teacher, tiny.test)
+    assert gap(strategy_columns, teacher, tiny.test) < 0.5 * gap(plain, teacher, tiny.test)
 
 
 def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
@@ -80,11 +80,11 @@ def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
 
     def loss(truth):
         strategy = Distillation([teacher], DistillationSpec(truth=truth, soft=MeanSquared()))
-        teacher_targets = strategy.series(tiny.task, tiny.train)
-        batch = next(ChunkSampler(teacher_targets, tiny.task.horizons, training.chunks, 0).epoch(0))
+        strategy_columns = strategy.series(tiny.task, tiny.train)
+        batch = next(ChunkSampler(strategy_columns, tiny.task.horizons, training.chunks, 0).epoch(0))
         x = torch.from_numpy(batch.inputs)
         answer, features, hidden, _ = net.forward_features(x, net.initial_state(len(x), x))
-        future, valid, said = (torch.from_numpy(part) for part in (batch.future, batch.valid, batch.teacher_targets))
+        future, valid, said = (torch.from_numpy(part) for part in (batch.future, batch.valid, batch.strategy_columns))
         batch_context = BatchContext(answer, future, features, hidden, valid, said)
         hard = objective.evaluate(answer, future, features, valid)
         goal = objective.code.encode(said[..., 1:].unflatten(-1, (2, 3)), features)
@@ -98,23 +98,23 @@ def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
 
 def test_what_is_taught_is_the_stream_of_the_mean_teacher(tiny, tiny_model, tiny_training, teacher):
     other = build_model(tiny.task, tiny_model, tiny.scaler(), seed=9)
-    teacher_targets = Distillation([teacher, other]).series(tiny.task, tiny.train)
-    for part, series in zip(teacher_targets[:1], tiny.train[:1], strict=True):
+    strategy_columns = Distillation([teacher, other]).series(tiny.task, tiny.train)
+    for part, series in zip(strategy_columns[:1], tiny.train[:1], strict=True):
         alone = [stream_predictions(net, [series])[0] for net in (teacher, other)]
-        assert part.teacher_targets.shape == (series.samples, 1 + 6)
+        assert part.strategy_columns.shape == (series.samples, 1 + 6)
         np.testing.assert_allclose(
-            part.teacher_targets[:, 1:].reshape(-1, 2, 3), np.mean(alone, axis=0), rtol=1e-5, atol=1e-7
+            part.strategy_columns[:, 1:].reshape(-1, 2, 3), np.mean(alone, axis=0), rtol=1e-5, atol=1e-7
         )
-        assert (part.teacher_targets[:, 0] == 1).all()
+        assert (part.strategy_columns[:, 0] == 1).all()
         assert part.inputs is series.inputs
 
 
 def test_chunks_and_windows_carry_the_lesson_of_their_own_ticks(tiny, teacher):
-    teacher_targets = Distillation([teacher]).series(tiny.task, tiny.train)
-    marked = [dataclasses.replace(part, teacher_targets=part.inputs) for part in teacher_targets]
+    strategy_columns = Distillation([teacher]).series(tiny.task, tiny.train)
+    marked = [dataclasses.replace(part, strategy_columns=part.inputs) for part in strategy_columns]
     for spec in (ChunkSpec(length=32, batch=4, burn_in=20), ChunkSpec(regime="window", length=10, batch=8)):
         for batch in ChunkSampler(marked, (1, 3), spec, seed=2, augmentations=(TimeWarp(),)).epoch(1):
-            np.testing.assert_array_equal(batch.teacher_targets, batch.inputs)
+            np.testing.assert_array_equal(batch.strategy_columns, batch.inputs)
 
 
 def test_series_without_truth_teach_without_a_share_in_the_loss_of_the_truth(tiny, brief, teacher, small):
@@ -126,7 +126,7 @@ def test_series_without_truth_teach_without_a_share_in_the_loss_of_the_truth(tin
     assert same(*made)
     assert not same(made[0], fit(tiny, small, brief, strategy=Distillation([teacher])).predictor)
     assert torch.equal(made[0].code.width, build_model(tiny.task, small, tiny.scaler(), seed=0).code.width)
-    assert [part.teacher_targets[0, 0] for part in lessons[0].series(tiny.task, tiny.train)] == [1, 1, 0]
+    assert [part.strategy_columns[0, 0] for part in lessons[0].series(tiny.task, tiny.train)] == [1, 1, 0]
 
 
 def test_unlabelled_takes_a_recording_that_has_inputs_only(tiny):
@@ -173,7 +173,7 @@ def test_a_refit_learns_from_the_teacher_too(tiny, tiny_training, teacher, small
 def test_the_gradient_of_a_hint_pulls_hidden_features_towards_the_teachers(tiny, teacher, small):
     strategy = Distillation([teacher], DistillationSpec(hint=1.0, components=6))
     part = strategy.series(tiny.task, tiny.train)[0]
-    wanted, x = torch.from_numpy(part.teacher_targets[None, :, 7:]), torch.from_numpy(part.inputs[None])
+    wanted, x = torch.from_numpy(part.strategy_columns[None, :, 7:]), torch.from_numpy(part.inputs[None])
     net = build_model(tiny.task, small, tiny.scaler(), seed=1)
     optimizer = torch.optim.Adam(net.backbone.parameters(), 1e-2)
     errors = []
@@ -306,4 +306,4 @@ def test_a_teacher_that_is_not_finite_is_told(tiny, tiny_model):
 
 def test_series_is_plain_without_a_lesson():
     part = Series("x", np.zeros((3, 1), np.float32), np.zeros((3, 1), np.float32))
-    assert part.teacher_targets is None
+    assert part.strategy_columns is None

@@ -54,7 +54,7 @@ def test_parts_are_unbroken_and_named_by_the_rows_of_their_recording(first_row):
             first = first_row or 0
             rows = np.arange(int(start or 0) - first, int(stop or part.samples) - first)
             np.testing.assert_array_equal(part.targets, series[int(which)].targets[rows])
-            np.testing.assert_array_equal(part.teacher_targets, part.targets)
+            np.testing.assert_array_equal(part.strategy_columns, part.targets)
 
 
 def test_the_seed_deals_the_stretches():

@@ -119,8 +119,8 @@ class TimeWarp:
         def read(values: NDArray[np.float32]) -> NDArray[np.float32]:
             return values[below] + share * (values[below + 1] - values[below])
 
-        teacher_targets = None if part.teacher_targets is None else read(part.teacher_targets)
-        return replace(part, inputs=read(part.inputs), targets=read(part.targets), teacher_targets=teacher_targets)
+        strategy_columns = None if part.strategy_columns is None else read(part.strategy_columns)
+        return replace(part, inputs=read(part.inputs), targets=read(part.targets), strategy_columns=strategy_columns)
 
 
 def input_deviation(series: list[Series]) -> NDArray[np.float32]:

@@ -85,14 +85,14 @@ class Batch:
         future: ``(batch, time, horizon, target)``: the target channels at t + k, SI units.
         valid: ``(batch, time)``: where a loss is taken.
         reset: ``(batch,)``: streams that start anew with this chunk.
-        teacher_targets: ``(batch, time, column)``: teacher predictions of each tick; None without a teacher.
+        strategy_columns: ``(batch, time, column)``: what a training strategy reads of each tick; None without.
     """
 
     inputs: NDArray[np.float32]
     future: NDArray[np.float32]
     valid: NDArray[np.bool_]
     reset: NDArray[np.bool_]
-    teacher_targets: NDArray[np.float32] | None = None
+    strategy_columns: NDArray[np.float32] | None = None
 
     @property
     def targets_seen(self) -> int:
@@ -244,9 +244,9 @@ class ChunkSampler:
         if rng is None or self.deviation is None:
             return part, 0
         stop = min(stop + max(self.horizons), part.samples)
-        teacher_targets = None if part.teacher_targets is None else part.teacher_targets[start:stop]
+        strategy_columns = None if part.strategy_columns is None else part.strategy_columns[start:stop]
         part = replace(
-            part, inputs=part.inputs[start:stop], targets=part.targets[start:stop], teacher_targets=teacher_targets
+            part, inputs=part.inputs[start:stop], targets=part.targets[start:stop], strategy_columns=strategy_columns
         )
         for augmentation in self.augmentations:
             part = augmentation.apply(part, self.deviation, rng)
@@ -273,14 +273,14 @@ def cut(part: Series, ticks: range, horizons: tuple[int, ...], silent: int) -> P
     # Slices instead of indices: no copy of the inputs, for all pieces but the last of a series.
     if inside:
         future = np.stack([part.targets[at + k : at + k + length] for k in horizons], axis=1)
-        return part.inputs[at : at + length], future, valid, _rows(part.teacher_targets, rows)
+        return part.inputs[at : at + length], future, valid, _rows(part.strategy_columns, rows)
     last = part.samples - 1
     future = np.stack([part.targets[np.minimum(rows + k, last)] for k in horizons], axis=1)
-    return part.inputs[np.minimum(rows, last)], future, valid, _rows(part.teacher_targets, np.minimum(rows, last))
+    return part.inputs[np.minimum(rows, last)], future, valid, _rows(part.strategy_columns, np.minimum(rows, last))
 
 
-def _rows(teacher_targets: NDArray[np.float32] | None, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
-    return None if teacher_targets is None else teacher_targets[rows]
+def _rows(strategy_columns: NDArray[np.float32] | None, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
+    return None if strategy_columns is None else strategy_columns[rows]
 
 
 def _ticks(lane: list[tuple[int, int, int]]) -> int:
@@ -289,8 +289,8 @@ def _ticks(lane: list[tuple[int, int, int]]) -> int:
 
 def stack(rows: list[Piece], resets: list[bool]) -> Batch:
     """Pieces side by side."""
-    *columns, teacher_targets = zip(*rows, strict=True)
+    *columns, strategy_columns = zip(*rows, strict=True)
     inputs, future, valid = (np.stack(parts) for parts in columns)
     return Batch(
-        inputs, future, valid, np.array(resets), None if teacher_targets[0] is None else np.stack(teacher_targets)
+        inputs, future, valid, np.array(resets), None if strategy_columns[0] is None else np.stack(strategy_columns)
     )

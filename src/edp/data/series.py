@@ -15,7 +15,8 @@ class Series:
         name: the recording it comes from (with the row range when it is a part of one).
         inputs: float32 ``(time, input)``; row t is what is known at tick t.
         targets: float32 ``(time, target)``; row t is the target channel *at* t (a horizon k asks for row t + k).
-        teacher_targets: float32 ``(time, column)``, teacher predictions of tick t; None without a teacher.
+        strategy_columns: float32 ``(time, column)``, what a training strategy reads of tick t beside the targets:
+            teacher predictions, the number of a domain or machine; None where it reads nothing more.
         machine: which machine it was recorded on; empty where that is not known.
         recording: the recording that it is cut from; empty where that is not known.
     """
@@ -23,7 +24,7 @@ class Series:
     name: str
     inputs: FloatArray
     targets: FloatArray
-    teacher_targets: FloatArray | None = None
+    strategy_columns: FloatArray | None = None
     machine: str = ""
     recording: str = ""
 

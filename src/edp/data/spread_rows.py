@@ -26,9 +26,9 @@ def spread_series(series: Sequence[Series], length: int, most: int, on_disk: boo
 def _cut(part: Series, start: int, stop: int, on_disk: bool) -> Series:
     if (start, stop) == (0, part.samples):
         return part
-    teacher_targets = None if part.teacher_targets is None else part.teacher_targets[start:stop]
+    strategy_columns = None if part.strategy_columns is None else part.strategy_columns[start:stop]
     inputs, targets = (
         some_rows(values, start, stop) if on_disk else values[start:stop] for values in (part.inputs, part.targets)
     )
     name = f"{part.name}[{start}:{stop}]"
-    return replace(part, name=name, inputs=inputs, targets=targets, teacher_targets=teacher_targets)
+    return replace(part, name=name, inputs=inputs, targets=targets, strategy_columns=strategy_columns)

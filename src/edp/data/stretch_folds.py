@@ -68,11 +68,11 @@ def _part(whole: Series, start: int, stop: int) -> Series:
         offset = int(before)
     else:
         name = whole.name
-    taught = None if whole.teacher_targets is None else whole.teacher_targets[start:stop]
+    taught = None if whole.strategy_columns is None else whole.strategy_columns[start:stop]
     return replace(
         whole,
         name=f"{name}[{offset + start}:{offset + stop}]",
         inputs=whole.inputs[start:stop],
         targets=whole.targets[start:stop],
-        teacher_targets=taught,
+        strategy_columns=taught,
     )

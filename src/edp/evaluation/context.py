@@ -131,7 +131,7 @@ def _block_errors(
             part,
             inputs=part.inputs[at - context : at + size],
             targets=part.targets[at - context : at + size],
-            teacher_targets=None,
+            strategy_columns=None,
         )
         for part, at in blocks
     ]

@@ -258,18 +258,18 @@ class Loop:
         return self._fitted()
 
     def _update(self, batch: Batch, state: State | None) -> tuple[float, State]:
-        x = torch.from_numpy(batch.inputs).to(self.device)
-        reset = torch.from_numpy(batch.reset).to(self.device)
+        x, reset = (torch.from_numpy(part).to(self.device) for part in (batch.inputs, batch.reset))
         initial = self.net.initial_state(len(x), x)
-        anew = state is None or len(x) != self.spec.chunks.batch or self.spec.chunks.regime == "window"
-        state = initial if anew or state is None else reset_where(reset, initial, state)
+        goes_on = len(x) == self.spec.chunks.batch and self.spec.chunks.regime != "window"
+        state = reset_where(reset, initial, state) if state is not None and goes_on else initial
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * self._factor()
         future, valid = (torch.from_numpy(part).to(self.device) for part in (batch.future, batch.valid))
         if isinstance(self.strategy, EpisodicStrategy):
             loss = self.strategy.episode(self.net, self.objective, (x, future, valid))
         else:
-            taught = None if batch.teacher_targets is None else torch.from_numpy(batch.teacher_targets).to(self.device)
+            columns = batch.strategy_columns
+            taught = None if columns is None else torch.from_numpy(columns).to(self.device)
             if taught is not None and isinstance(self.strategy, StreamStrategy):
                 self.strategy.tell(self.net, taught, reset)
             answer, features, hidden, state = self.net.forward_features(x, state)
@@ -277,8 +277,8 @@ class Loop:
                 loss = self.objective.evaluate(answer, future, features, valid)
             else:
                 done = self.progress.updates / (self.updates * self.spec.epochs)
-                context = BatchContext(answer, future, features, hidden, valid, taught, done)
-                loss = self.strategy.loss(self.objective, context)
+                parts = BatchContext(answer, future, features, hidden, valid, taught, done)
+                loss = self.strategy.loss(self.objective, parts)
         self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):

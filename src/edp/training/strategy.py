@@ -29,7 +29,7 @@ class BatchContext:
         features: physical, ``(batch, time, feature)``.
         hidden: representation of the backbone, ``(batch, time, width)``.
         valid: ``(batch, time)``: ticks that count.
-        teacher_targets: ``(batch, time, column)``: teacher predictions and marks of these ticks.
+        strategy_columns: ``(batch, time, column)``: what `series` gave this strategy to read of these ticks.
         progress: share of the training that is done, from 0 to 1.
     """
 
@@ -38,7 +38,7 @@ class BatchContext:
     features: Tensor
     hidden: Tensor
     valid: Tensor
-    teacher_targets: Tensor
+    strategy_columns: Tensor
     progress: float = 0.0
 
 
@@ -48,7 +48,7 @@ class TrainingStrategy(Protocol):
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series with what is taught about them, and further series.
 
-        Either all of them have `teacher_targets` or none; where none has, `loss` is not asked.
+        Either all of them have `strategy_columns` or none; where none has, `loss` is not asked.
         """
         ...
 
@@ -73,7 +73,7 @@ class TrainingStrategy(Protocol):
 class StreamStrategy(TrainingStrategy, Protocol):
     """A training strategy that sets what the network is told of each stream before it runs along a chunk."""
 
-    def tell(self, net: Predictor, teacher_targets: Tensor, reset: Tensor) -> None:
+    def tell(self, net: Predictor, strategy_columns: Tensor, reset: Tensor) -> None:
         """Set it from ``(batch, time, column)`` and from which streams ``(batch,)`` start anew with this chunk."""
         ...
 

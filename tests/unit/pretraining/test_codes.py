@@ -99,7 +99,7 @@ def test_a_stream_has_the_code_of_its_machine_or_none_from_its_start_to_its_end(
     sampler = ChunkSampler(series, data.task.horizons, dataclasses.replace(experiment.training.chunks, carried=3), 0)
     unknown = None
     for batch in (batch for number in range(40) for batch in sampler.epoch(number)):
-        numbers, reset = torch.from_numpy(batch.teacher_targets), torch.from_numpy(batch.reset)
+        numbers, reset = torch.from_numpy(batch.strategy_columns), torch.from_numpy(batch.reset)
         assert (numbers == numbers[:, :1]).all()
         strategy.tell(network, numbers, reset)
         without = (block.lanes == 0).all(dim=1)

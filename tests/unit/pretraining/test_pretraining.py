@@ -296,4 +296,4 @@ def test_episodes_are_of_one_machine_each_and_share_no_tick(prepared_machines, e
     assert len(owners) == 2 * sampler.updates()
     again = [batch.inputs for batch in EpisodeSampler(parts, (2,), experiment.training.chunks, 2, 4).epoch(3)]
     assert all(np.array_equal(one, batch.inputs) for one, batch in zip(again, sampler.epoch(3), strict=True))
-    assert stack([(p.inputs, p.targets, p.targets, None) for p in parts[:1]], [True]).teacher_targets is None
+    assert stack([(p.inputs, p.targets, p.targets, None) for p in parts[:1]], [True]).strategy_columns is None

@@ -30,18 +30,18 @@ def test_both_domains_have_equal_shares_and_the_network_of_the_source_teaches_it
     ticks = {name: sum(p.samples for p in found if p.name.startswith("kept") == name) for name in (True, False)}
     assert max(ticks.values()) <= 1.5 * min(ticks.values())
     for part in found:
-        assert part.teacher_targets is not None
-        assert np.all(part.teacher_targets[:, 0] == (1.0 if part.name.startswith("kept") else 0.0))
-        assert part.teacher_targets.shape == (part.samples, 1 + 2 * 3)
+        assert part.strategy_columns is not None
+        assert np.all(part.strategy_columns[:, 0] == (1.0 if part.name.startswith("kept") else 0.0))
+        assert part.strategy_columns.shape == (part.samples, 1 + 2 * 3)
         if part.name.startswith("kept"):
             said = stream_predictions(start, [part])[0].reshape(part.samples, -1)
-            np.testing.assert_allclose(part.teacher_targets[:, 1:], said, atol=1e-6)
+            np.testing.assert_allclose(part.strategy_columns[:, 1:], said, atol=1e-6)
 
 
 def test_worlds_meet_in_a_batch(tiny, start, tiny_training):
     series = BothDomains(start, kept(tiny), BothSpec()).series(tiny.task, tiny.train)
     sampler = ChunkSampler(series, tiny.task.horizons, dataclasses.replace(tiny_training.chunks, carried=2), 0)
-    shares = [batch.teacher_targets[..., 0].mean() for batch in sampler.epoch(0) if batch.teacher_targets is not None]
+    shares = [batch.strategy_columns[..., 0].mean() for batch in sampler.epoch(0) if batch.strategy_columns is not None]
     assert 0.2 < np.mean(shares) < 0.8
 
 

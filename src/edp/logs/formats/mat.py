@@ -65,9 +65,9 @@ class MatFormat:
         )
         if signal_map.variable is not None:
             if signal_map.variable not in mat_variables.names:
-                known = (*mat_variables.names, *mat_variables.experiment_names[:_MOST_NAMED])
+                there = (*mat_variables.names, *mat_variables.experiment_names[:_MOST_NAMED])
                 raise DataError(
-                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, known)}; "
+                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, there)}; "
                     "set 'variable' in the signal map to an existing one"
                 )
             if signal_map.variable == TRUTH and edp_metadata.truth:

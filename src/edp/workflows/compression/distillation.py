@@ -149,10 +149,10 @@ class Distillation:
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
         """The dual objective of a batch; ticks without truth count for the teachers only."""
-        spec, teacher_targets = self.spec, batch_context.teacher_targets
+        spec, strategy_columns = self.spec, batch_context.strategy_columns
         # The mark is a number among the targets; half is its threshold.
-        labelled = batch_context.valid & (teacher_targets[..., 0] > 0.5)
-        teacher_predictions = teacher_targets[..., 1 : 1 + self.said].unflatten(-1, batch_context.future.shape[2:])
+        labelled = batch_context.valid & (strategy_columns[..., 0] > 0.5)
+        teacher_predictions = strategy_columns[..., 1 : 1 + self.said].unflatten(-1, batch_context.future.shape[2:])
         target = objective.code.encode(teacher_predictions, batch_context.features)
         loss = (1.0 - spec.truth) * masked_loss(
             spec.soft, batch_context.answer, target, batch_context.valid, objective.weights
@@ -163,7 +163,7 @@ class Distillation:
             )
         if spec.hint:
             loss = loss + spec.hint * hint_error(
-                batch_context.hidden, teacher_targets[..., 1 + self.said :], batch_context.valid
+                batch_context.hidden, strategy_columns[..., 1 + self.said :], batch_context.valid
             )
         return loss
 
@@ -184,7 +184,7 @@ class Distillation:
             columns.append(self.components.project(self._hidden(part)))
         # What stands in the place of targets without truth may be no number, and NaN times a mask of zero is NaN.
         targets = part.targets if truth else np.zeros_like(part.targets)
-        return replace(part, targets=targets, teacher_targets=np.concatenate(columns, axis=1).astype(np.float32))
+        return replace(part, targets=targets, strategy_columns=np.concatenate(columns, axis=1).astype(np.float32))
 
     def _hidden(self, part: Series) -> NDArray[np.float32]:
         # Side by side: hidden spaces of several teachers have no common axes to average over.

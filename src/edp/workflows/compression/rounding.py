@@ -125,7 +125,7 @@ class NetworkRounding:
                 self._watch(part)
             # The beginnings of all series give ranges of every kind of work at little cost.
             some = [
-                replace(one, inputs=one.inputs[:PIECE], targets=one.targets[:PIECE], teacher_targets=None)
+                replace(one, inputs=one.inputs[:PIECE], targets=one.targets[:PIECE], strategy_columns=None)
                 for one in series
             ]
             stream_predictions(self.network, some)

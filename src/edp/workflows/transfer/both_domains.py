@@ -97,7 +97,7 @@ class BothDomains:
 
     def loss(self, objective: Objective, batch: BatchContext) -> Tensor:
         """The loss of the target, that of the source, and that of the classifier with its gradient reversed."""
-        spec, domain = self.spec, batch.teacher_targets[..., 0]
+        spec, domain = self.spec, batch.strategy_columns[..., 0]
         # The domain is a number among the targets; half separates 0 from 1.
         here, there = batch.valid & (domain < 0.5), batch.valid & (domain > 0.5)
         loss = objective.evaluate(batch.answer, batch.future, batch.features, here)
@@ -105,7 +105,7 @@ class BothDomains:
             truth = objective.evaluate(batch.answer, batch.future, batch.features, there)
             loss = loss + spec.weight * (1 - spec.soft) * truth
         if spec.soft:
-            source_predictions = batch.teacher_targets[..., 1:].unflatten(-1, batch.future.shape[2:])
+            source_predictions = batch.strategy_columns[..., 1:].unflatten(-1, batch.future.shape[2:])
             goal = objective.code.encode(source_predictions, batch.features)
             soft = masked_loss(Huber(), batch.answer, goal, there, objective.weights)
             loss = loss + spec.weight * spec.soft * soft
@@ -140,7 +140,7 @@ class BothDomains:
                 else source_predictions.reshape(part.samples, -1)
             )
             columns.append(prediction_columns.astype(np.float32))
-        return replace(part, teacher_targets=np.concatenate(columns, axis=1))
+        return replace(part, strategy_columns=np.concatenate(columns, axis=1))
 
 
 class Classifier(nn.Module):

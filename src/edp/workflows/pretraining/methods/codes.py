@@ -62,12 +62,12 @@ class WithCodes(StreamStrategy):
         """Which streams have a code, and the mean square of the codes of the last chunk."""
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series, each with the number of its machine in place of a teacher."""
+        """The training series, each with the number of its machine as what the strategy reads."""
         owned = by_machine(own_series)
         self.machines = len(owned)
         numbers = {name: np.float32(number) for number, name in enumerate(owned)}
         return [
-            replace(part, teacher_targets=np.broadcast_to(numbers[part.machine], (part.samples, 1)))
+            replace(part, strategy_columns=np.broadcast_to(numbers[part.machine], (part.samples, 1)))
             for part in own_series
         ]
 
@@ -81,13 +81,13 @@ class WithCodes(StreamStrategy):
         block.table = nn.Parameter(SPREAD * draws)
         return self.start is not None
 
-    def tell(self, net: Predictor, teacher_targets: Tensor, reset: Tensor) -> None:
+    def tell(self, net: Predictor, strategy_columns: Tensor, reset: Tensor) -> None:
         """Give each stream the code of its machine, or from its start to its end none."""
         self.block = block = coded_block(net)
         drawn = (torch.rand(len(reset), 1, device=reset.device) >= UNKNOWN).float()
         # Of another size only before the first chunk, with which all streams begin.
         self.told = torch.where(reset[:, None], drawn, self.told) if len(self.told) == len(reset) else drawn
-        codes = block.table.view(self.machines, -1)[teacher_targets[:, 0, 0].long()]
+        codes = block.table.view(self.machines, -1)[strategy_columns[:, 0, 0].long()]
         block.lanes, self.size = codes * self.told, codes.square().mean()
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
