@@ -74,7 +74,7 @@ def main() -> None:
     made.add_argument("--work", type=Path, default=None, help="folder that keeps data and finished parts")
     arguments = made.parse_args()
     if arguments.quick:
-        arguments.minutes, arguments.budget = 2.0, 1.0
+        arguments.minutes, arguments.budget = 1.0, 0.5
     in_folder(arguments.work, lambda work: run(arguments, work))
 
 
