@@ -360,7 +360,8 @@ def judged_followers(found: dict[str, dict[str, float]], attainable: dict[str, f
             loss = ways["frozen"] - before["frozen"]
             for way in ("follower, adapted", "follower with thermometer, adapted"):
                 kept = loss - (ways[way] - before[way])
-                verdicts.append(verdict(f"{name}: {way}: of the change alone", kept, loss, ">= 0.5", "mm/s recovered", quick))
+                question = f"{name}: {way}: of the change alone"
+                verdicts.append(verdict(question, kept, loss, ">= 0.5", "mm/s recovered", quick))
         elif name in attainable:
             won = ways["frozen"] - ways["follower, adapted"]
             verdicts.append(verdict("clay: follower, adapted: over what training wins", won,

@@ -19,6 +19,7 @@ plan. Its step is compared with that of the controller in Python.
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import tempfile
 from dataclasses import replace

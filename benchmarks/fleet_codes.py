@@ -191,8 +191,8 @@ def judge_many(few: Fleet, many: Fleet) -> None:
 
 def published() -> float:
     """Return the error of the fully trained 400-machine network on C14 without logs, mm/s, from ``transfer.json``."""
-    verdicts = read_json(RESULTS / "transfer.json")["verdicts"]
-    return float(next(one["ours"] for one in verdicts if one["name"] == "network of many machines over direct transfer"))
+    verdicts, name = read_json(RESULTS / "transfer.json")["verdicts"], "network of many machines over direct transfer"
+    return float(next(one["ours"] for one in verdicts if one["name"] == name))
 
 
 def main() -> None:
