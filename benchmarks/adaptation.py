@@ -58,7 +58,7 @@ from twin import QUICK_FIT
 
 PROGRAMS = ("gcc", "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
 
-PROGRAMS = Path(__file__).parents[1] / "tests/export"
+DRIVERS = Path(__file__).parents[1] / "tests/export"
 DAY = 8_640_000
 Rows = NDArray[np.float64]
 
@@ -260,7 +260,7 @@ def attacked(bundle: Bundle, bank: NDArray[np.float32], ticks: int) -> list[floa
     flags = [f"-D{name}={value}" for name, value in named.items()]
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        built(bundle, folder, PROGRAMS / "adversary.c", *flags)
+        built(bundle, folder, DRIVERS / "adversary.c", *flags)
         feed = np.ascontiguousarray(bank, dtype=np.float32).tobytes()
         done = subprocess.run([folder / "program", str(ticks)], input=feed, check=True, capture_output=True)
     return [float(word) for word in done.stdout.split()]
@@ -287,7 +287,7 @@ def study(folder: Path, form: str, seed: int) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         program = Path(temporary) / "network"
         program.mkdir()
-        built(bundle, program, PROGRAMS / "adaptation_driver.c")
+        built(bundle, program, DRIVERS / "adaptation_driver.c")
         follower = Follower.built(grey, bundle, law, Path(temporary) / "follower")
         found = recovery(bundle, law, tests, program, follower, size.behind_s)
         cost = follower.cost()

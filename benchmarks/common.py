@@ -18,25 +18,11 @@ from edp.storage import make_folder, read_json, write_json
 from edp.storage.runs import command_line, environment
 
 RESULTS = Path(__file__).parent / "results"
-COSTS = frozenset(
-    {
-        "s",
-        "ms",
-        "us",
-        "s of motion",
-        "instructions",
-        "cycles",
-        "bytes",
-        "MB",
-        "mm",
-        "mm/s",
-        "m/s rms",
-        "deg",
-        "sigma",
-        "V",
-    }
-    | {"RMSE", "alarms", "networks", "starts", "raw"}
+TIMES, COUNTS = (
+    ("s", "ms", "us", "s of motion"),
+    ("instructions", "cycles", "bytes", "MB", "alarms", "networks", "starts"),
 )
+COSTS = frozenset({*TIMES, *COUNTS, "mm", "mm/s", "m/s rms", "deg", "sigma", "V", "raw", "RMSE"})
 """Units of which less is better."""
 
 
@@ -73,9 +59,7 @@ def verdict(name: str, ours: float, rival: float, goal: str, unit: str, quick: b
     """
     sign, bound = goal.split()
     if unit in COSTS and sign == ">=":
-        raise ValueError(
-            f"verdict {name!r}: goal '{goal}' of {unit}, of which less is better; interchange both figures"
-        )
+        raise ValueError(f"verdict {name!r}: got goal '{goal}', but less {unit} is better; interchange the figures")
     ratio = ours / rival if rival else float("inf")
     met = ratio <= float(bound) if sign == "<=" else ratio >= float(bound)
     return Verdict(name, ours, rival, ratio, goal, met, unit, quick)
