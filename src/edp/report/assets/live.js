@@ -8,7 +8,7 @@
   window.edpLive = stats; // what benchmarks and tests read
   let layout = null, store = null, charts = null, side = null, steered = false, socket = null, ended = "", asked = -1;
   let following = true, position = 0, playing = true, dirty = false, drawn = 0, stamp = 0, arrived = 0, retry = 500, closed = false;
-  let state = { paused: false, skipped: 0, late: 0, oldest: 0, viewers: 1 };
+  let state = { paused: false, skipped: 0, late: false, preparing: "", oldest: 0, viewers: 1 };
   let breaks = session.breaks || [];
   const chosen = new Set(), groups = new Map();
 
@@ -214,6 +214,7 @@
     else if (ended) parts.push(ended);
     else if (state.paused) parts.push("source paused");
     else if (arrived && Date.now() - arrived > 1500) parts.push(`no new values for ${Math.round((Date.now() - arrived) / 1000)} s`);
+    else if (!store.end) parts.push(state.preparing || "waiting for the first values");
     else parts.push(following ? "live" : "looking back");
     const lags = stats.lags.slice(-100).sort((a, b) => a - b);
     parts.push(`${layout.rate_hz} Hz`, `${layout.traces.length} channels`);
@@ -222,7 +223,7 @@
     const told = [];
     if (stats.dropped) told.push(`this page was too slow: ${stats.dropped} ticks were not sent to it (the source lost none)`);
     if (state.skipped) told.push(`${state.skipped} ticks of running ahead were sent to nobody`);
-    if (state.late) told.push(`the source fell behind ${state.late} times: its models take longer than real time`);
+    if (state.late && !ended) told.push(`the source is behind real time${layout.forecasts.length || layout.statistics.length ? ": its models take longer" : ""}`);
     notice.textContent = told.join("; "); notice.hidden = !told.length;
     const paused = session.mode === "saved" ? !playing : steered ? state.paused : !following;
     play.textContent = paused ? (session.mode === "saved" || steered ? "Play" : "Back to now") : "Pause";

@@ -23,7 +23,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from edp.errors import ConfigError
+from edp.errors import ConfigError, brief
 from edp.live.layout import LiveLayout
 from edp.live.session import LiveSession
 
@@ -97,9 +97,12 @@ class RerunMirror:
         self._files.close()
 
     def _follow(self) -> None:
-        while not self._over.wait(PIECE_S):
+        try:
+            while not self._over.wait(PIECE_S):
+                self._give()
             self._give()
-        self._give()
+        except Exception as error:  # Rerun's own errors have no common base
+            self._session.event("warning", f"Rerun shows nothing more ({brief(error)}); this page goes on")
 
     def _give(self) -> None:
         session, rerun = self._session, self._rerun
