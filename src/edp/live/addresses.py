@@ -52,16 +52,17 @@ def resolve_bind(host: str, option: str) -> BindAddress:
     Raises:
         ConfigError: `host` is empty, too long or not printable, or nothing is known by this name.
     """
+    what = f"{option}: got {brief(repr(host), 60)}"
     if not host.strip() or len(host) > MAX_HOST or not host.isprintable():
         raise ConfigError(
-            f"{option}: got {brief(repr(host), 60)}, expected an address or name of this computer; give {LOOPBACK} to keep other "
+            f"{what}, expected an address or name of this computer; give {LOOPBACK} to keep other "
             "computers out, or 0.0.0.0 to listen on all networks"
         )
     try:
         entries = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, ValueError) as error:  # ValueError: a name that no encoding of names takes
         raise ConfigError(
-            f"{option}: got {brief(repr(host), 60)}, which is not known as an address or name ({brief(error)}); give {LOOPBACK} "
+            f"{what}, which is not known as an address or name ({brief(error)}); give {LOOPBACK} "
             "or an address of this computer"
         ) from error
     # An IPv6 address may have a zone behind a percent sign.

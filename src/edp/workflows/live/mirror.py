@@ -143,7 +143,7 @@ def entities(layout: LiveLayout, escaped: Any = str) -> Mapping[str, tuple[int, 
         for end, at_column in ends.items():
             if at_column is not None:
                 path = f"predicted/{escaped(what + end)}"
-                paths[path] = (at_column, one.factor, 0.0, one.ticks / layout.rate_hz)
+                paths[path] = (at_column, one.factor, one.offset, one.ticks / layout.rate_hz)
     for name, at_column in (layout.statistics or {}).items():
         paths[f"monitor/{escaped(name)}"] = (at_column, 1.0, 0.0, 0.0)
     return paths
