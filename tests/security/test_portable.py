@@ -19,7 +19,7 @@ import pytest
 import edp
 from edp.cli.doctor import machine
 from edp.storage.portable import lock_region
-from edp.workflows.live.run_live import _interrupts
+from edp.workflows.live.serve_live import _interrupts
 
 HIDE = """
 import importlib, os, pathlib, sys

@@ -46,6 +46,7 @@ from edp.cli.console import run_app
 from edp.cli.ending import stop_on_request
 from edp.cli.slow import tell_of_missing_layers, tell_of_slow_logs
 from edp.cli.threads import use_one_blas_thread
+from edp.cli.unsealed import tell_of_unsealed_files
 
 app = typer.Typer(
     name="edp",
@@ -115,4 +116,6 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     tell_of_slow_logs()
     tell_of_missing_layers()
-    sys.exit(run_app(app))
+    code = run_app(app)
+    tell_of_unsealed_files()
+    sys.exit(code)

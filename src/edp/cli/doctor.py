@@ -20,6 +20,7 @@ import typer
 from edp import __version__
 from edp.cli.console import JsonFlag, emit, listing, out
 from edp.errors import EdpError
+from edp.storage.paths import is_folder_at
 
 BROKEN = 3
 """Exit code where something is missing or broken that edp cannot do without."""
@@ -144,7 +145,7 @@ def machine(folder: Path) -> list[InstallationCheck]:
         ),
         _size("memory", free_bytes(), _LEAST_MEMORY, "training; free now"),
     ]
-    there = next((path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir()), Path("/"))
+    there = next((path for path in (folder.absolute(), *folder.absolute().parents) if is_folder_at(path)), Path("/"))
     try:
         checks.append(_size("disk", shutil.disk_usage(there).free, _LEAST_DISK, f"runs below {there}"))
     except OSError as error:

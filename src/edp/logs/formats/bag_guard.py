@@ -19,6 +19,7 @@ from edp.errors import DataError, brief
 from edp.logs.formats.bag_memory import MemoryFile, NoFolder, place
 from edp.logs.formats.mcap_check import RATIO, SPARE, check_records
 from edp.storage.memory import check_memory
+from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.unpacking import open_zstd, unpack_to
 
 _LONGEST_METADATA = 4 << 20
@@ -71,9 +72,9 @@ def open_reader(path: Path) -> Any:
         DataError: a part that is no regular file, or whose sizes cannot be.
     """
     reader1, reader2 = _readers()
-    if path.is_dir():
+    if is_folder_at(path):
         _check_folder(path)
-    return reader1(path) if path.suffix.lower() == ".bag" and path.is_file() else reader2(path)
+    return reader1(path) if path.suffix.lower() == ".bag" and is_file_at(path) else reader2(path)
 
 
 @cache
