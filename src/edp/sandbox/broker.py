@@ -235,9 +235,9 @@ class _Opener:
             is_current = folder == _CURRENT_FOLDER & 0xFFFFFFFF
             base = os.readlink(f"{own}/cwd" if is_current else f"{own}/fd/{folder}")
             text = os.path.join(base, text)
-        for name, place in (("/proc/self", own), ("/proc/thread-self", f"{own}/task/{thread}")):
+        for name, real_name in (("/proc/self", own), ("/proc/thread-self", f"{own}/task/{thread}")):
             if text == name or text.startswith(f"{name}/"):
-                return place + text.removeprefix(name)
+                return real_name + text.removeprefix(name)
         return text
 
     def _text(self, address: int) -> str:
