@@ -204,3 +204,16 @@ def test_a_benchmark_ends_cleanly_without_its_programs(path, monkeypatch, capsys
         found.main()
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith(f"skipped: {found.PROGRAMS[0]}")
+
+
+SEPARATOR = re.compile(r"^\|[-:| ]+\|$", re.MULTILINE)
+
+
+def test_every_section_of_results_with_a_table_names_its_file_or_says_that_none_was_kept():
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    sections = [part for part in re.split(r"^(?=##)", page, flags=re.MULTILINE) if SEPARATOR.search(part)]
+    assert len(sections) > 20
+    for part in sections:
+        named = re.findall(r"benchmarks/results/(\w+)\.json", part)
+        assert named or "**Not kept**" in part, part.splitlines()[0]
+        assert [name for name in named if not (BENCHMARKS / "results" / f"{name}.json").is_file()] == []
