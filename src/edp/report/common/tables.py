@@ -152,7 +152,7 @@ class Check:
 def budget_checks(facts: Facts) -> list[Check]:
     """The footprint against each limit of the budget."""
     checks = []
-    for row in (facts.footprint or {}).get("verdict", []):
+    for row in facts.budget_rows:
         value, limit = row.get("value"), row.get("limit")
         # No share of a limit that is zero or unknown.
         share = value / limit if value is not None and limit else None

@@ -28,7 +28,7 @@ from edp.report.common.chart import (
     Range,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import short_label
+from edp.report.common.wording import label_by_name
 from edp.report.run import figures
 from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
 
@@ -56,7 +56,10 @@ def _place(facts: Facts, model: str) -> int:
 
 def name_of(facts: Facts, model: str) -> str:
     """A model in a legend."""
-    return "Measured" if model == TRUTH else short_label(label_of(facts, model))
+    if model == TRUTH:
+        return "Measured"
+    label = label_of(facts, model)
+    return label_by_name([*(label_of(facts, one) for one in facts.models), label])[label]
 
 
 def interval_name(facts: Facts) -> str:

@@ -83,7 +83,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "signals": signals_of(facts),
         **shown(chart for chart in (signal_chart(facts), *run_charts(facts), correlogram(facts)) if chart is not None),
         "checks": tables.budget_checks(facts),
-        "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
+        "budget": facts.budget_name,
         "parts": tables.parts_table(facts),
         "footprint": tables.footprint_rows(facts),
         "provenance": tables.provenance_rows(facts),
