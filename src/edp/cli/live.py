@@ -12,6 +12,7 @@ from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, err, out
 from edp.cli.train import MapOption
 from edp.errors import ConfigError
+from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
     from edp.live.server import LiveServer
@@ -119,9 +120,9 @@ def live(
     def show() -> None:
         out.print(f"{result.ticks:,} ticks, {result.alarms:,} alarms; {result.ended}")
         if result.saved is not None:
-            out.print(f"session: {result.saved.resolve()}")
+            out.print(f"session: {full_path(result.saved)}")
         if result.recorded is not None:
-            out.print(f"recording: {result.recorded.resolve()}")
+            out.print(f"recording: {full_path(result.recorded)}")
 
     emit(as_json, facts, show)
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.storage.paths import full_path
 
 
 def report(
@@ -38,7 +39,7 @@ def report(
         if budget is not None:
             raise ConfigError(f"--budget: '{run}' holds a twin, whose page has no footprint; use edp footprint")
         page = build_twin_report(run, output, title)
-        emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {page.resolve()}"))
+        emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {full_path(page)}"))
         return
     if budget is not None:
         from edp.evaluation.controller import load_budget
@@ -56,6 +57,6 @@ def report(
             out.print(judged)
         if least:
             out.print(least)
-        out.print(f"report: {page.resolve()}")
+        out.print(f"report: {full_path(page)}")
 
     emit(as_json, {"report": str(page), "headline": line, "tests": judged, "limit": least}, show)

@@ -21,6 +21,7 @@ from edp.report.run.residuals import correlogram, fit_table
 from edp.report.run.signals import signal_chart, signals_of
 from edp.report.run.situations import situation_sheet
 from edp.storage import write_bytes
+from edp.storage.paths import full_path
 
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
 """Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""
@@ -63,9 +64,9 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
     task = (facts.scores or {}).get("task", {})
     network = run.label_of(facts, run.NETWORK) if run.NETWORK in facts.models else ""
     return {
-        "title": title or task.get("name") or facts.folder.resolve().name,
+        "title": title or task.get("name") or full_path(facts.folder).name,
         "network": network,
-        "run_name": facts.folder.resolve().name,
+        "run_name": full_path(facts.folder).name,
         "created": moment((facts.provenance or {}).get("created")),
         "headline": unbroken(run.headline(facts)),
         "verdict": run.verdict_lines(facts),

@@ -20,6 +20,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import KINDS
 from edp.storage import check_writable, make_folder, object_with, read_object, write_bytes, write_json
 from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path
 from edp.training.bundle import load_bundle, save_bundle, weights_digest
 from edp.training.delta import DELTA_BYTES, SUFFIX, delta_from_bytes, delta_of, read_delta, with_delta
 from edp.workflows.executors import Workforce
@@ -111,8 +112,8 @@ def finetune_fleet(
         "schema": SCHEMA,
         "edp": __version__,
         "base": digest,
-        "source": str(Path(source).resolve()),
-        "store": str(Path(store).resolve()),
+        "source": str(full_path(Path(source))),
+        "store": str(full_path(Path(store))),
         "method": order.method,
         "most_bytes": order.most_bytes,
         "unit": _unit_of(base),
@@ -193,7 +194,7 @@ def _unit(machine: StoredMachine, digest: str, source: str | Path, store: str | 
         "changes": changes,
         "most_bytes": order.most_bytes,
     }
-    where = {"source": str(Path(source).resolve()), "store": str(Path(store).resolve())}
+    where = {"source": str(full_path(Path(source))), "store": str(full_path(Path(store)))}
     label = f"machine '{machine.name}'"
     return WorkUnit(f"{__name__}:tune_machine", label, arguments, " ".join(machine.digests), where)
 

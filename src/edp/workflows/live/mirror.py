@@ -26,6 +26,7 @@ import numpy as np
 from edp.errors import ConfigError, brief
 from edp.live.layout import LiveLayout
 from edp.live.session import LiveSession
+from edp.storage.paths import is_there
 
 LOOPBACK = "127.0.0.1"
 PIECE_S = 0.5
@@ -183,7 +184,7 @@ def _program() -> Path:
         raise ConfigError("rerun-sdk is installed without its command line; install it from its wheel")
     folder = Path(spec.origin).parent
     names = ("rerun.exe",) if sys.platform == "win32" else ("Rerun.app/Contents/MacOS/Rerun", "rerun")
-    return next((folder / name for name in names if (folder / name).exists()), folder / names[-1])
+    return next((folder / name for name in names if is_there(folder / name)), folder / names[-1])
 
 
 def _last(text: bytes) -> str:

@@ -17,6 +17,7 @@ from edp.live.saved import write_session_page
 from edp.live.session import HISTORY_BYTES, MOST_TEXT, LiveSession
 from edp.monitor.monitor_file import load_monitor
 from edp.settings.bounds import check_bounds, span
+from edp.storage.paths import full_path
 from edp.workflows.live.bounded import Repetition, RowBounds, bound_missed
 from edp.workflows.live.free_run import FREE_S, LiveTwin
 from edp.workflows.live.look_ahead import LiveNetwork
@@ -309,7 +310,7 @@ class LiveRun:
             geometry, angles = front.geometry, range(width, width + LiveFront.width)
             add(front)
         return parts, LiveLayout(
-            title=label(order.run.resolve().name if order.run is not None else source.text.split(",")[0]),
+            title=label(full_path(order.run).name if order.run is not None else source.text.split(",")[0]),
             source=label(source.text),
             rate_hz=source.rate_hz,
             width=width,
