@@ -78,13 +78,13 @@ def label_by_name(names: Iterable[str], most: int = MAX_LABEL) -> dict[str, str]
 
 
 def _labels(names: list[str], most: int) -> dict[str, str]:
-    labels = {name: _cut(name, 0, len(name), most) for name in names}
+    begin = _shared([name for name in names if len(name) > most]) if len(names) > 1 else 0
+    labels = {name: _without_begin(name, begin, most) for name in names}
     for label, count in Counter(labels.values()).items():
         alike = [name for name in names if labels[name] == label]
         if count > 1:
             start = _shared(alike)
-            behind = _shared([name[start:][::-1] for name in alike])
-            labels |= {name: _cut(name, start, len(name) - behind, most) for name in alike}
+            labels |= {name: _around(name, start, most) for name in alike}
     return labels
 
 
@@ -94,14 +94,26 @@ def _shared(texts: Sequence[str]) -> int:
     return sum(1 for _ in itertools.takewhile(bool, alike))
 
 
-def _cut(name: str, start: int, stop: int, most: int) -> str:
-    """Return a name in at most `most` characters, with as much as possible of the part from `start` to `stop`."""
+def _without_begin(name: str, begin: int, most: int) -> str:
+    """Return a name in at most `most` characters: without most of what all names begin with, or without its middle."""
     if len(name) <= most:
         return name
-    if (start, stop) == (0, len(name)):
-        end = most // 3 + 1
-        return f"{name[: most - 1 - end]}…{name[-end:]}"
-    # The part that differs, with some characters before it, between the first and the last ones.
+    head = most // 5
+    rest = name[max(begin - 3, 0) :]
+    if begin <= 2 * head or begin + head >= len(name):
+        return _without_middle(name, most)
+    return f"{name[:head]}…{_without_middle(rest, most - head - 1)}"
+
+
+def _without_middle(name: str, most: int) -> str:
+    end = most // 3 + 1
+    return name if len(name) <= most else f"{name[: most - 1 - end]}…{name[-end:]}"
+
+
+def _around(name: str, start: int, most: int) -> str:
+    """Return a name in at most `most` characters, with what follows from `start` on, where it differs from others."""
+    if len(name) <= most:
+        return name
     ends = most // 5
     start = max(start - ends // 2, 0)
     return f"{name[:ends]}…{name[start : start + most - 2 * ends - 2]}…{name[-ends:]}"

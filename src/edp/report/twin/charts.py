@@ -49,12 +49,16 @@ def twin_charts(facts: FreeRunFacts) -> list[Chart]:
     return [*runs, horizon_chart(facts), *([] if steps is None else [steps])]
 
 
+def _labels(facts: FreeRunFacts) -> dict[str, str]:
+    return label_by_name(channel["name"] for part in PARTS for channel in facts.channels(part))
+
+
 def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
     """What was measured and what the twin answered meanwhile, with its interval; a row for each channel of a part."""
     seconds, half = facts.shown["seconds"], facts.shown.get("half_width")
     # Shown runs are thinned out evenly, so a start and a step are all that a line needs.
     time_s = Evenly(round(float(seconds[0]), 6), round(float((seconds[-1] - seconds[0]) / (len(seconds) - 1)), 6))
-    panels, labels = [], label_by_name(channel["name"] for channel in facts.channels(part))
+    panels, labels = [], _labels(facts)
     for channel, column in zip(facts.channels(part), facts.columns(part), strict=True):
         marks: list[Mark] = []
         for name in facts.names:
@@ -85,7 +89,7 @@ def horizon_chart(facts: FreeRunFacts) -> Chart:
         marks: list[Mark] = []
         for model, scores in facts.models.items():
             by_horizon, when = scores["by_horizon"], {MODEL: model}
-            labels = label_by_name(by_horizon[part]["by_channel"])
+            labels = label_by_name(name for one in PARTS for name in by_horizon[one]["by_channel"])
             for index, (name, values) in enumerate(by_horizon[part]["by_channel"].items()):
                 label, colour = labels[name], MUTED[index % len(MUTED)]
                 errors = _short(np.array(values, dtype=np.float64))
