@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from browser import browser as browser
 from browser import check_page
 from typer.testing import CliRunner
 

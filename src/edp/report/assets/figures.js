@@ -15,12 +15,14 @@ const Figure = (function () {
 
   // As much of a text as fits, without its middle: names of one figure often begin alike, or end alike.
   function fitting(text, room, size) {
-    let [shown, kept] = [text, text.length];
-    while (kept > 4 && width(shown, size) > room) {
-      kept -= 1;
-      shown = text.slice(0, Math.ceil(kept / 2)) + "\u2026" + text.slice(text.length - Math.floor(kept / 2));
+    if (width(text, size) <= room) return text;
+    const cut = text.indexOf("\u2026"), middle = Math.ceil(text.length / 2);
+    let [begin, end] = cut < 0 ? [text.slice(0, middle), text.slice(middle)] : [text.slice(0, cut), text.slice(cut + 1)];
+    while (begin.length + end.length > 4 && width(`${begin}\u2026${end}`, size) > room) {
+      if (begin.length > end.length) begin = begin.slice(0, -1);
+      else end = end.slice(1);
     }
-    return shown;
+    return `${begin}\u2026${end}`;
   }
 
   // Texts of one axis: where the middle was what told them apart, what they begin with is left out instead.
@@ -281,7 +283,7 @@ const Figure = (function () {
       if (y.options.visible !== false) {
         const rows = y.ticks(bottom - top);
         const every = y.categories ? Math.ceil((rows.length * 13) / Math.max(bottom - top, 1)) : 1;
-        const named = fittingAll(rows.map((row) => row[1]), panel.pad.left + 4);
+        const named = fittingAll(rows.map((row) => row[1]), panel.pad.left - 8 - (y.options.title.text ? 20 : 0));
         rows.forEach(([at], i) => {
           const up = y.at(at);
           if (y.options.showgrid) line(`M${left} ${up.toFixed(1)}H${right}`, RULE);

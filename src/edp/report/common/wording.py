@@ -61,11 +61,11 @@ def short_labels(names: Iterable[str], most: int = MAX_LABEL) -> tuple[str, ...]
     Of long names that begin and end alike, the part that differs is kept. Equal names are numbered, and so are the few
     that differ in more places than a label holds.
     """
-    given = list(names)
-    labels = _labels(sorted(set(given)), most)
+    all_names = list(names)
+    labels = _labels(sorted(set(all_names)), most)
     seen: dict[str, int] = {}
     shown = []
-    for label in (labels[name] for name in given):
+    for label in (labels[name] for name in all_names):
         seen[label] = seen.get(label, 0) + 1
         shown.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
     return tuple(shown)

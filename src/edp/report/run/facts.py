@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError
-from edp.evaluation.controller import Budget
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, beaten_by
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
+from edp.report.run.budget import budget_name, budget_rows
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
 from edp.signals import display_offset
@@ -82,18 +82,6 @@ class Facts:
     absent: tuple[str, ...] = ()
     limit: Mapping[str, Any] | None = None
     foundation: Mapping[str, Any] | None = None
-
-    @property
-    def budget_name(self) -> str:
-        """Name of the controller that somebody stated for this run; empty without one."""
-        budget = (self.footprint or {}).get("budget")
-        # Earlier versions held every run against the thesis's controller.
-        return str(budget.get("name") or "") if isinstance(budget, Mapping) and budget != asdict(Budget()) else ""
-
-    @property
-    def budget_rows(self) -> list[Mapping[str, Any]]:
-        """Verdict by resource against the stated controller; empty without one."""
-        return list((self.footprint or {}).get("verdict", ())) if self.budget_name else []
 
     @property
     def targets(self) -> tuple[Target, ...]:
@@ -361,10 +349,10 @@ def verdict_lines(facts: Facts) -> list[str]:
     beyond = situation_line(facts.scores) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))
     lines += [line for line in (judged, beyond, limit) if line]
-    checks = facts.budget_rows
+    checks = budget_rows(facts.footprint)
     if checks:
         over = [str(check["what"]) for check in checks if not check["fits"]]
-        name = facts.budget_name or "the controller"
+        name = budget_name(facts.footprint) or "the controller"
         verdict = f"exceeded in {listed(over)}" if over else "met on every count"
         lines.append(f"Budget ({name}): {verdict}.")
     return lines
