@@ -204,3 +204,41 @@ def test_a_benchmark_ends_cleanly_without_its_programs(path, monkeypatch, capsys
         found.main()
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith(f"skipped: {found.PROGRAMS[0]}")
+
+
+DEFINITIONS = {
+    "adaptation": {"A grey box that follows the machine"},
+    "compress": {"Resource usage of a network"},
+    "control": {"Settings", "Learning"},
+    "environment": {"Settings"},
+    "monitor": {"On the machine"},
+    "simulator": {"Machines", "Excitation"},
+}
+"""Sections whose tables have numbers that define something and were not measured."""
+MEASURED_PAGES = (
+    "adaptation",
+    "compress",
+    "control",
+    "environment",
+    "live",
+    "monitor",
+    "mpc",
+    "simulator",
+    "statistics",
+    "twin",
+)
+
+
+def numeric_rows(part: str) -> list[str]:
+    return [row for row in re.findall(r"^\|.*\|$", part, flags=re.MULTILINE) if re.search(r"\| *-?\d+\.\d", row)]
+
+
+@pytest.mark.parametrize("page", ["results", *MEASURED_PAGES])
+def test_a_section_with_measured_tables_names_its_file_or_says_that_none_was_kept(page):
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    parts = [part for part in re.split(r"^(?=##)", text, flags=re.MULTILINE) if len(numeric_rows(part)) > 1]
+    for part in parts:
+        title = part.splitlines()[0]
+        named = re.findall(r"benchmarks/results/(\w+)\.json", part)
+        assert named or "Not kept**" in part or title.lstrip("# ") in DEFINITIONS.get(page, ()), f"{page}: {title}"
+        assert [name for name in named if not (BENCHMARKS / "results" / f"{name}.json").is_file()] == []
