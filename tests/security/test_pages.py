@@ -1,7 +1,9 @@
 """Pages run nothing but their own script and fetch nothing, whatever the names in them."""
 
+import ast
 import re
 from importlib import resources
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +13,7 @@ from edp.report.run import page
 
 ASSETS = resources.files("edp.report").joinpath("assets")
 PAGES = sorted(entry.name for entry in ASSETS.iterdir() if entry.name.endswith(".html.jinja"))
+TESTS = Path(__file__).parents[1]
 HOSTILE = ["</script><script>alert(1)</script>", "<!--<script>", "--></script>", "]]>", "&lt;/script&gt;"]
 
 
@@ -33,6 +36,20 @@ def test_the_head_has_a_policy_before_anything_that_runs():
     assert "http:" not in policy
     assert "https:" not in policy
     assert "a&lt;b" in policy
+
+
+def test_every_page_is_opened_in_a_browser():
+    """A template whose page no test opens in Chromium (`check_page`, `check_kind`) fails here."""
+    kinds = {
+        re.search(r'head\(\w+ ~ ": ([^"]+)"', ASSETS.joinpath(name).read_text(encoding="utf-8"))[1] for name in PAGES
+    }
+    opened = set()
+    for path in TESTS.rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("check_page", "check_kind"):
+                opened.add(node.args[-1].value)
+    assert len(kinds) == len(PAGES)
+    assert opened == kinds
 
 
 def test_all_pages_are_looked_at():

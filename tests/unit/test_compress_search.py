@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from browser import browser as browser
+from browser import check_page
 from typer.testing import CliRunner
 
 from edp.cli import app
@@ -190,6 +192,12 @@ def test_the_widest_network_fits_with_all_of_its_constants(run):
     fits = make_plan(teacher, Budget(parameter_bytes=need.parameter_bytes), formats=("w8a16",))
     short = make_plan(teacher, Budget(parameter_bytes=need.parameter_bytes - 1), formats=("w8a16",))
     assert max(short.orders) > max(fits.orders)  # the teacher itself is no order
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(done, browser):
+    folder, _ = done
+    check_page(browser, write_compression_page(folder, pictures=False), "compression")
 
 
 def test_report_tables_and_pictures(done):

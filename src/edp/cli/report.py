@@ -18,6 +18,9 @@ def report(
     limit: Annotated[
         Path | None, typer.Option(help="Limit of predictability (limit.json); default: beside the run's data.")
     ] = None,
+    budget: Annotated[
+        Path | None, typer.Option("--budget", help="Controller (TOML) against which the run's network is held.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Write one offline page: predictions, errors, baselines, footprint, settings; of a twin its free runs.
@@ -33,9 +36,16 @@ def report(
     if holds_free_runs(run):
         if limit is not None:
             raise ConfigError(f"--limit: '{run}' holds a twin, which looks no fixed time ahead; leave it out")
+        if budget is not None:
+            raise ConfigError(f"--budget: '{run}' holds a twin, whose page has no footprint; use edp footprint")
         page = build_twin_report(run, output, title)
         emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {full_path(page)}"))
         return
+    if budget is not None:
+        from edp.evaluation.controller import load_budget
+        from edp.workflows.deployment import state_budget
+
+        state_budget(run, load_budget(budget))
     page = build_report(run, output, title, limit)
     facts = read_facts(run, limit)
     line, least = headline(facts), limit_line(facts, main_horizon(facts))

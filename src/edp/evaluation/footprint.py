@@ -66,11 +66,11 @@ class Footprint:
                 return entry
         raise ExportError(self.refused[number_format])
 
-    def to_json(self, budget: Budget) -> dict[str, Any]:
-        """Plain values with the verdict against `budget`."""
+    def to_json(self, budget: Budget | None = None) -> dict[str, Any]:
+        """Return plain values, with the verdict against a budget where one is given."""
         plain = asdict(self)
         plain["rows"], plain["estimates"] = list(self.rows), [entry.to_json() for entry in self.estimates]
-        return plain | {"budget": asdict(budget), "verdict": self.verdict(budget)}
+        return plain if budget is None else plain | {"budget": asdict(budget), "verdict": self.verdict(budget)}
 
     def verdict(self, budget: Budget) -> list[dict[str, Any]]:
         """A row for each limit: value, limit, unit, whether it fits, and what the figure means."""

@@ -122,4 +122,5 @@ def sentence(text: str) -> str:
 def label(text: str) -> str:
     """A text of a file or a sender as a page may have it: of bounded length, and without invisible signs."""
     visible = sentence(text[: MOST_LABEL + 1])
-    return visible if len(visible) <= MOST_LABEL else visible[: MOST_LABEL - 1] + "…"
+    # The end is kept: names of one machine often begin alike.
+    return visible if len(visible) <= MOST_LABEL else f"{visible[: MOST_LABEL - 32]}…{sentence(text[-31:])}"

@@ -23,6 +23,7 @@ from edp.networks.integer import IntegerPredictor
 from edp.networks.narrow import student
 from edp.networks.predictor import ModelSpec, Predictor, build_model, describe
 from edp.networks.twin import IntegerTwinPlant, TwinPlant
+from edp.storage import write_json
 from edp.training import load_bundle
 from edp.training.bundle import Bundle, blank_scaler
 from edp.training.twin_bundle import holds_twin, load_twin, plant_bundle
@@ -43,6 +44,17 @@ def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footpr
         # One unit without blocks is the smallest network of these inputs: if it is too large, all are.
         check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
     return footprint(predictor, adaptation), name
+
+
+def state_budget(run: str | Path, budget: Budget) -> None:
+    """Hold the network of a run against a controller, and keep the verdict in the run's ``footprint.json``.
+
+    Raises:
+        EdpError: `run` is not a run of a network, no network of its inputs and targets meets the budget, or the file
+            cannot be written.
+    """
+    counts, _ = footprint_of(run, budget)
+    write_json(Path(run) / "footprint.json", counts.to_json(budget))
 
 
 def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:

@@ -18,7 +18,6 @@ from edp.data.prepared import Prepared, prepare
 from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
 from edp.evaluation.conditional import collinear
-from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, first_scored, judge, score_network
 from edp.evaluation.scores_file import earlier_scores
@@ -172,7 +171,7 @@ def keep_fitted(
 def _keep(run: RunFolder, fitted: Fitted, provenance: dict[str, Any], data: Prepared) -> Bundle:
     """Write what a training leaves: provenance, footprint and the bundle."""
     write_json(run.file("provenance.json"), provenance)
-    write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json(Budget()))
+    write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json())
     bundle = make_bundle(fitted.predictor, data, provenance)
     save_bundle(bundle, run.file("bundle"))
     return bundle

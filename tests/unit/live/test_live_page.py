@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import DESK, Browser, page_faults, serious_findings
+from browser import DESK, Browser, check_kind, page_faults, serious_findings
 
 from edp.live import Forecast, LiveLayout, LiveSession, LiveTrace, Pace, write_session_page
 from edp.live.server import LiveServer
@@ -177,6 +177,7 @@ def test_plots_do_not_overlap_at_any_width(browser, served, tmp_path):
             for dark in (False, True):
                 browser.size(width, 900, width < 500, dark)
                 assert page_faults(browser) == [], (address, width, dark)
+        check_kind(browser, "live view")
         # Plots follow their figures when others come and go.
         browser.size(1366, 900)
         for _ in range(2):

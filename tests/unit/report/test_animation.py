@@ -8,6 +8,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from browser import check_page
 from typer.testing import CliRunner
 
 from edp.cli import app
@@ -114,3 +115,8 @@ def test_the_command(recording, tmp_path):
     wrong = CliRunner().invoke(app, ["animate", str(log), "--out", str(tmp_path / "a.avi")])
     assert isinstance(wrong.exception, ConfigError)
     assert ".mp4" in str(wrong.exception)
+
+
+@pytest.mark.processes
+def test_the_page_in_a_browser(browser, recording, tmp_path):
+    check_page(browser, write_animation(scene_of(recording), tmp_path / "film.html"), "side view")

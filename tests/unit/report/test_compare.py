@@ -237,4 +237,4 @@ def test_costs_of_all_runs_are_listed(pair):
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, pair, tmp_path):
-    check_page(browser, write_compare_page(compare_runs(pair), tmp_path / "compare.html"))
+    check_page(browser, write_compare_page(compare_runs(pair), tmp_path / "compare.html"), "comparison")

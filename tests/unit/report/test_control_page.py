@@ -99,4 +99,4 @@ def test_names_stay_text(facts):
 def test_the_page_in_a_browser(browser, facts, tmp_path):
     page = tmp_path / "control.html"
     page.write_text(render(facts))
-    check_page(browser, page)
+    check_page(browser, page, "closed loops")

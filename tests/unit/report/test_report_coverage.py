@@ -61,7 +61,7 @@ def test_six_maps_show_every_cell_of_three_strokes():
     ("channels", "absent"),
     [
         ({"v": Kind.VELOCITY}, "No channel of these recordings is known to command"),
-        ({"u": Kind.VOLTAGE}, "hold neither strokes nor velocities"),
+        ({"u": Kind.VOLTAGE}, "Not examined"),
         ({"v": Kind.VELOCITY, "u": Kind.CURRENT, "x": Kind.POSITION}, "The full strokes are not known"),
         ({"a": Kind.VELOCITY, "b": Kind.VELOCITY, "</script>": Kind.RATIO}, "velocities were integrated"),
     ],
@@ -73,6 +73,16 @@ def test_what_a_recording_lacks_is_said_and_no_name_breaks_the_page(channels, ab
     assert absent in text
     assert figures_of(text)
     assert "nan" not in json.dumps(figures_of(text)).lower().replace("nanmax", "")
+
+
+def test_a_rig_without_strokes_has_no_sections_of_a_machine():
+    recording = Recording("rig", (Channel("valve", Kind.VOLTAGE),), machine_like().values[:, :1].copy(), 100.0)
+    text = render_coverage(cover([recording]), "rig").split("<script>")[0]
+    for section in ("poses", "joint", "events"):
+        assert f'id="{section}"' not in text
+        assert f'href="#{section}"' not in text
+    for word in ("Soil", "bucket", "Cavitation"):
+        assert word not in text
 
 
 def test_the_sentence_says_what_there_is():
@@ -88,4 +98,4 @@ def test_the_sentence_says_what_there_is():
 def test_the_page_in_a_browser(browser, tmp_path):
     recording = machine_like()
     found = cover([recording], split=ByTime().split([recording], 10))
-    check_page(browser, build_coverage_page(found, tmp_path / "coverage.html", "data"))
+    check_page(browser, build_coverage_page(found, tmp_path / "coverage.html", "data"), "coverage")

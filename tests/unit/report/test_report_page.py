@@ -145,7 +145,7 @@ def test_a_page_that_cannot_be_written_says_so(run_folder):
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, run_folder):
-    check_page(browser, build_report(run_folder))
+    check_page(browser, build_report(run_folder), "report")
 
 
 @pytest.mark.processes

@@ -203,4 +203,8 @@ def test_nothing_but_a_proposal_is_a_page_too():
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, tmp_path):
-    check_page(browser, build_screening_page(screening(), tmp_path / "report.html", "data", None, TRIALS, ["A note."]))
+    check_page(
+        browser,
+        build_screening_page(screening(), tmp_path / "report.html", "data", None, TRIALS, ["A note."]),
+        "screening",
+    )

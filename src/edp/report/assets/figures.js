@@ -13,11 +13,26 @@ const Figure = (function () {
     return ruler.measureText(text).width;
   }
 
-  // As much of a text as fits, its end cut.
+  // As much of a text as fits, without its middle: names of one figure often begin alike, or end alike.
   function fitting(text, room, size) {
-    let shown = text;
-    while (shown.length > 4 && width(shown, size) > room) shown = shown.slice(0, -2) + "\u2026";
-    return shown;
+    if (width(text, size) <= room) return text;
+    const cut = text.indexOf("\u2026"), middle = Math.ceil(text.length / 2);
+    let [begin, end] = cut < 0 ? [text.slice(0, middle), text.slice(middle)] : [text.slice(0, cut), text.slice(cut + 1)];
+    while (begin.length + end.length > 4 && width(`${begin}\u2026${end}`, size) > room) {
+      if (begin.length > end.length) begin = begin.slice(0, -1);
+      else end = end.slice(1);
+    }
+    return `${begin}\u2026${end}`;
+  }
+
+  // Texts of one axis: where the middle was what told them apart, what they begin with is left out instead.
+  function fittingAll(texts, room, size) {
+    const cut = texts.map((text) => fitting(text, room, size));
+    if (new Set(cut).size === new Set(texts).size) return cut;
+    const shared = texts.filter((text, i) => cut.some((other, k) => other === cut[i] && texts[k] !== text));
+    let same = 0;
+    while (shared.every((text) => text.length > same + 1 && text[same] === shared[0][same])) same += 1;
+    return texts.map((text, i) => (shared.includes(text) ? fitting("\u2026" + text.slice(Math.max(same - 2, 1)), room, size) : cut[i]));
   }
 
   function html(parent, name, attributes, text) {
@@ -268,10 +283,11 @@ const Figure = (function () {
       if (y.options.visible !== false) {
         const rows = y.ticks(bottom - top);
         const every = y.categories ? Math.ceil((rows.length * 13) / Math.max(bottom - top, 1)) : 1;
-        rows.forEach(([at, text], i) => {
+        const named = fittingAll(rows.map((row) => row[1]), panel.pad.left - 8 - (y.options.title.text ? 20 : 0));
+        rows.forEach(([at], i) => {
           const up = y.at(at);
           if (y.options.showgrid) line(`M${left} ${up.toFixed(1)}H${right}`, RULE);
-          if (panel.labels.y && i % every === 0) words(svg, left - 7, up + 4, fitting(text, panel.pad.left + 4), { colour: SOFT, size: 12, more: { "text-anchor": "end" } });
+          if (panel.labels.y && i % every === 0) words(svg, left - 7, up + 4, named[i], { colour: SOFT, size: 12, more: { "text-anchor": "end" } });
         });
         if (y.options.zeroline && y.low < 0 && y.high > 0) line(`M${left} ${y.at(0).toFixed(1)}H${right}`, y.options.zerolinecolor || SOFT);
         this.upright(svg, y.options.title.text, left - panel.pad.left + 11, (top + bottom) / 2, bottom - top);
@@ -285,13 +301,14 @@ const Figure = (function () {
       const rows = x.ticks(right - left);
       const longest = Math.max(1, ...rows.map((row) => width(row[1])));
       const every = Math.ceil((rows.length * (x.turned ? 15 : longest + 8)) / Math.max(right - left, 1));
-      rows.forEach(([at, text], i) => {
+      const named = fittingAll(rows.map((row) => row[1]), 130);
+      rows.forEach(([at], i) => {
         const across = x.at(at);
         if (x.options.showgrid) line(`M${across.toFixed(1)} ${top}V${bottom}`, RULE);
         line(`M${across.toFixed(1)} ${bottom}v4`, "#c4cbd2");
         if (!panel.labels.x || i % every) return;
         const turned = x.turned ? { "text-anchor": "end", transform: `rotate(-45 ${across.toFixed(1)} ${bottom + 14})` } : { "text-anchor": "middle" };
-        words(svg, across, bottom + (x.turned ? 14 : 17), fitting(text, 130), { colour: SOFT, size: 12, more: turned });
+        words(svg, across, bottom + (x.turned ? 14 : 17), named[i], { colour: SOFT, size: 12, more: turned });
       });
       if (x.options.zeroline && x.low < 0 && x.high > 0) line(`M${x.at(0).toFixed(1)} ${top}V${bottom}`, x.options.zerolinecolor || SOFT);
       const title = plain(x.options.title.text);

@@ -8,6 +8,7 @@ from typing import Any
 
 from edp.evaluation.guard import MEASURE, MEASURE_NAME
 from edp.report.common.wording import MISSING, count_text, decimals_for, duration, moment, number, percent
+from edp.report.run.budget import budget_rows
 from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
 
@@ -152,7 +153,7 @@ class Check:
 def budget_checks(facts: Facts) -> list[Check]:
     """The footprint against each limit of the budget."""
     checks = []
-    for row in (facts.footprint or {}).get("verdict", []):
+    for row in budget_rows(facts.footprint):
         value, limit = row.get("value"), row.get("limit")
         # No share of a limit that is zero or unknown.
         share = value / limit if value is not None and limit else None

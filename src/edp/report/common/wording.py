@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 
 MISSING = "–"
-LABEL_START, LABEL_END = 20, 11
-"""Characters of a long name that a picture shows around an ellipsis: 32 in all leave half of a panel to the drawing."""
+MAX_LABEL = 32
+"""Characters of a name in a picture: more leave too little of a panel to the drawing."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 """With what a spreadsheet takes a cell for a formula."""
 
@@ -53,21 +55,68 @@ def printable_lines(text: str) -> str:
     return "\n".join(map(printable, text.split("\n")))
 
 
-def short_label(name: str) -> str:
-    """A name as a picture shows it: at most 32 characters, the middle of a longer one left out."""
-    if len(name) <= LABEL_START + 1 + LABEL_END:
-        return name
-    return f"{name[:LABEL_START]}…{name[-LABEL_END:]}"
+def short_labels(names: Iterable[str], most: int = MAX_LABEL) -> tuple[str, ...]:
+    """Return the names of one picture in at most `most` characters each, different where the names differ.
 
-
-def short_labels(names: Iterable[str]) -> tuple[str, ...]:
-    """Short names of one picture, distinguished by a number where only the middle differed: axes go by their labels."""
+    Of long names that begin and end alike, the part that differs is kept. Equal names are numbered, and so are the few
+    that differ in more places than a label holds.
+    """
+    all_names = list(names)
+    labels = _labels(sorted(set(all_names)), most)
     seen: dict[str, int] = {}
-    labels = []
-    for label in map(short_label, names):
+    shown = []
+    for label in (labels[name] for name in all_names):
         seen[label] = seen.get(label, 0) + 1
-        labels.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
-    return tuple(labels)
+        shown.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
+    return tuple(shown)
+
+
+def label_by_name(names: Iterable[str], most: int = MAX_LABEL) -> dict[str, str]:
+    """Return `short_labels` by name."""
+    distinct = list(dict.fromkeys(names))
+    return dict(zip(distinct, short_labels(distinct, most), strict=True))
+
+
+def _labels(names: list[str], most: int) -> dict[str, str]:
+    begin = _shared([name for name in names if len(name) > most]) if len(names) > 1 else 0
+    labels = {name: _without_begin(name, begin, most) for name in names}
+    for label, count in Counter(labels.values()).items():
+        alike = [name for name in names if labels[name] == label]
+        if count > 1:
+            start = _shared(alike)
+            labels |= {name: _around(name, start, most) for name in alike}
+    return labels
+
+
+def _shared(texts: Sequence[str]) -> int:
+    """Return the number of characters with which all texts begin."""
+    alike = (len(set(letters)) == 1 for letters in zip(*texts, strict=False))
+    return sum(1 for _ in itertools.takewhile(bool, alike))
+
+
+def _without_begin(name: str, begin: int, most: int) -> str:
+    """Return a name in at most `most` characters: without most of what all names begin with, or without its middle."""
+    if len(name) <= most:
+        return name
+    head = most // 5
+    rest = name[max(begin - 3, 0) :]
+    if begin <= 2 * head or begin + head >= len(name):
+        return _without_middle(name, most)
+    return f"{name[:head]}…{_without_middle(rest, most - head - 1)}"
+
+
+def _without_middle(name: str, most: int) -> str:
+    end = most // 3 + 1
+    return name if len(name) <= most else f"{name[: most - 1 - end]}…{name[-end:]}"
+
+
+def _around(name: str, start: int, most: int) -> str:
+    """Return a name in at most `most` characters, with what follows from `start` on, where it differs from others."""
+    if len(name) <= most:
+        return name
+    ends = most // 5
+    start = max(start - ends // 2, 0)
+    return f"{name[:ends]}…{name[start : start + most - 2 * ends - 2]}…{name[-ends:]}"
 
 
 def in_cell(text: str) -> str:

@@ -24,7 +24,10 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
+from edp.report.common.wording import label_by_name
 
+MAX_AXIS = 22
+"""Characters of a name beside a panel, three of which stand in a row."""
 TINT = "#eef4fe"
 SCALE = (TINT, "#b7d0f7", "#6d9fec", "#2567d3", "#062c74")
 """One hue from the page's tint to dark: more samples, more ink; empty cells stay white."""
@@ -98,18 +101,17 @@ def occupancy_chart(occupancy: Occupancy | None) -> Chart | None:
     titles = (
         [f"{a:.2f} to {b:.2f} m" for a, b in itertools.pairwise(np.round(edges, 2) + 0.0)] if len(maps) > 1 else [""]
     )
+    names = label_by_name(occupancy.names, MAX_AXIS)
     if len(maps) > 1:
-        titles[0] = f"{_clipped(occupancy.names[0])}\n{titles[0]}"
+        titles[0] = f"{names[occupancy.names[0]]}\n{titles[0]}"
     upright = _centres(occupancy, -2) if samples.ndim > 1 else [0.0]
-    up = ChartAxis(
-        f"{_clipped(occupancy.names[-2])} [m]" if samples.ndim > 1 else "", grid=False, shown=samples.ndim > 1
-    )
+    up = ChartAxis(f"{names[occupancy.names[-2]]} [m]" if samples.ndim > 1 else "", grid=False, shown=samples.ndim > 1)
     fullest = int(np.argmax([share.max() for share in shares]))
     top = float(shares[fullest].max())
     panels = []
     for index, (title, share) in enumerate(zip(titles, shares, strict=False)):
         cells = _cells(_centres(occupancy, -1), upright, share, top, "% of the time", "{label:.2f} % of the time")
-        across = ChartAxis("" if index else f"{_clipped(occupancy.names[-1])} [m]")
+        across = ChartAxis("" if index else f"{names[occupancy.names[-1]]} [m]")
         barred = index == fullest
         panels.append(
             Panel((replace(cells, barred=barred, gap=True),), across, replace(up, title="") if index else up, title)
@@ -126,13 +128,14 @@ def joint_chart(coverage: Coverage, group: str) -> Chart | None:
     columns = min(len(joints), 3)
     shares = [100.0 * joint.counts.T / max(joint.counts.sum(), 1) for joint in joints]
     top = max(float(share.max()) for share in shares)
+    names = label_by_name((name for joint in joints for name in (joint.x, joint.y)), MAX_AXIS)
     panels: list[Panel] = []
     for joint, share in zip(joints, shares, strict=True):
         x, y = _middles(joint.x_range, share.shape[1]), _middles(joint.y_range, share.shape[0])
         cells = _cells(x, y, share, top, "% of the samples", "{x:.4g}, {y:.4g}: {label:.3f} %")
         panels.append(Panel(
-            (replace(cells, barred=len(panels) == 0),), ChartAxis(with_unit(_clipped(joint.x), joint.x_unit)),
-            ChartAxis(with_unit(_clipped(joint.y), joint.y_unit), grid=False), _title(joint),
+            (replace(cells, barred=len(panels) == 0),), ChartAxis(with_unit(names[joint.x], joint.x_unit)),
+            ChartAxis(with_unit(names[joint.y], joint.y_unit), grid=False), _title(joint),
         ))  # fmt: skip
     height = 60 + 270 * -(-len(joints) // columns)
     return Chart(GROUPS[group], tuple(panels), columns=columns, height=height, legend="none")
@@ -151,10 +154,6 @@ def _cells(x: list[float], y: list[float], share: NDArray[np.float64], top: floa
 
 def _title(joint: JointHistogram) -> str:
     return f"correlation {joint.correlation:.2f}, {joint.information:.2f} nat".replace("-", "−")
-
-
-def _clipped(name: str) -> str:
-    return name if len(name) <= 18 else name[:17] + "…"
 
 
 def _centres(occupancy: Occupancy, axis: int) -> list[float]:

@@ -83,7 +83,7 @@ def verdict(coverage: Coverage) -> list[str]:
             f"{number(max(inputs.drop_db), 0)} dB below their maximum: faster changes teach little here."
         )
     if coverage.occupancy is not None and coverage.occupancy.share < OCCUPANCY:
-        lines.append(f"Fewer than {percent(OCCUPANCY)} of the cells were visited; the white ones were never.")
+        lines.append(f"Fewer than {percent(OCCUPANCY)} of the cells were visited; the empty ones were never.")
     if coverage.constant:
         lines.append(f"{listed(coverage.constant)} never change{'s' * (len(coverage.constant) == 1)}.")
     return lines
@@ -144,13 +144,15 @@ def together_table(coverage: Coverage) -> TextTable | None:
     return TextTable("In use at once", (("Commanded", ""), ("Share", "of the time")), rows) if rows else None
 
 
-def events_table(coverage: Coverage) -> TextTable:
-    """Events, recorded or not."""
+def events_table(coverage: Coverage) -> TextTable | None:
+    """Return the events that the recordings tell of; None where their channels tell of none."""
     rows = tuple(
         (_first_up(event.name), count_text(event.count), percent(event.share), event.note or "recorded")
         for event in coverage.events
+        if event.count is not None
     )
-    return TextTable("How often", (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", "")), rows)
+    columns = (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", ""))
+    return TextTable("How often", columns, rows) if rows else None
 
 
 def joints_table(coverage: Coverage) -> TextTable | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.traces import RecordingTrace, pooled
 from edp.report.common.chart import BLUE, SHADES
-from edp.report.common.wording import number, short_label
+from edp.report.common.wording import label_by_name, number
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts, start_time
 
 FloatArray = NDArray[np.float32]
@@ -129,6 +129,7 @@ def overview(facts: MonitorFacts) -> Drawing:
     longest = max((len(trace.ratios) for trace in traces), default=1) * facts.traces.block_s
     across = _across(max(longest, 1e-9))
     boxes, labels, patches = [], [], []
+    names = label_by_name(trace.name for trace in traces)
     for n, trace in enumerate(traces):
         top = 4 + ROW * n
         worst = trace.ratios.max(axis=1, initial=0.0)[:, None]
@@ -138,7 +139,7 @@ def overview(facts: MonitorFacts) -> Drawing:
             if alarm.recording == trace.name:
                 at, text = across(min(alarm.raised_s, longest)), f"{alarm.severity}: {alarm.sentence}"
                 boxes.append(Box(at - 2.5, top - 1, 5.0, ROW - 1, MARKS[alarm.severity], text))
-        labels.append(Label(LEFT - 6, top + ROW - 6, short_label(trace.name), "end", "#26303a"))
+        labels.append(Label(LEFT - 6, top + ROW - 6, names[trace.name], "end", "#26303a"))
     bottom = 6 + ROW * len(traces)
     labels += _ticks(longest, across, bottom, None)
     return Drawing(bottom + TICKS_ROOM, "All recordings", tuple(boxes), tuple(patches), (), tuple(labels))
@@ -151,12 +152,13 @@ def evidence(alarm: AlarmFacts) -> Drawing:
     left, right = 260, 70
     middle, half = left + (WIDTH - left - right) / 2, (WIDTH - left - right) / 2
     boxes, labels = [Box(middle - 0.5, 2, 1.0, ROW * len(shown) + 2, "#c4cbd2")], []
+    names = label_by_name(name for name, _ in shown)
     for n, (name, value) in enumerate(shown):
         top, reach = 4 + ROW * n, half * abs(value) / most
         start = middle if value >= 0.0 else middle - reach
         text = f"{name}: {number(value, 1, signed=True)} standard deviations"
         boxes.append(Box(start, top, max(reach, 1.0), ROW - 5, BLUE if value >= 0.0 else "#c9892f", text))
-        labels.append(Label(left - 8, top + ROW - 7, short_label(name), "end", "#26303a"))
+        labels.append(Label(left - 8, top + ROW - 7, names[name], "end", "#26303a"))
         labels.append(Label(WIDTH - right + 8, top + ROW - 7, number(value, 1, signed=True)))
     return Drawing(ROW * len(shown) + 8, "Evidence", tuple(boxes), (), (), tuple(labels))
 
@@ -164,11 +166,12 @@ def evidence(alarm: AlarmFacts) -> Drawing:
 def _group_rows(trace: RecordingTrace, facts: MonitorFacts, across: Across) -> tuple[list[Patch], list[Label]]:
     patches: list[Patch] = []
     labels: list[Label] = []
+    names = label_by_name(facts.traces.groups)
     for n, name in enumerate(facts.traces.groups):
         top = PLOT_HEIGHT + 8 + ROW * n
         row = CellRow(top, facts.traces.block_s, across, name, CELLS)
         patches += _cells(trace.groups[:, n : n + 1], row, LEVEL_TEXTS)
-        labels.append(Label(LEFT - 6, top + ROW - 6, short_label(name), "end", "#26303a"))
+        labels.append(Label(LEFT - 6, top + ROW - 6, names[name], "end", "#26303a"))
     return patches, labels
 
 

@@ -14,7 +14,7 @@ from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.diagnosis.structure import Confusion
 from edp.monitor.traces import RecordingTrace, RunTraces
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import MISSING, count_text, listed, number, short_label
+from edp.report.common.wording import MISSING, count_text, label_by_name, listed, number, short_labels
 
 MOST_ALARMS = 40
 """With evidence each on a page, alarms that say the same as one; all of them stand in the log."""
@@ -140,7 +140,7 @@ def verdict(facts: MonitorFacts) -> list[str]:
         lines.append(f"Silent for want of channels in some recordings: {shown}; faults that only they show go unseen.")
     for remark, names in list(facts.remarks.items())[:MOST_REMARKS]:
         others = f" and {len(names) - 1} more" * (len(names) > 1)
-        lines.append(f"Of {short_label(names[0])}{others}: {remark}.")
+        lines.append(f"Of {short_labels(names)[0]}{others}: {remark}.")
     if facts.classes == 0 and facts.alarms:
         lines.append("The monitor has no dictionary of faults: alarms say which residuals changed, not why.")
     return [line for line in lines if line]
@@ -169,11 +169,12 @@ SEVERITIES = (("stop", "reasons to stop"), ("warning", "warnings"), ("note", "no
 def alarm_sheet(facts: MonitorFacts) -> Sheet:
     """A row an alarm."""
     rows: list[tuple[Value, ...]] = []
+    labels = label_by_name(alarm.recording for alarm in facts.alarms)
     for alarm in facts.alarms[: 10 * MOST_ALARMS]:
         start = facts.start_of(alarm.recording)
         first = alarm.causes[0] if alarm.causes else None
         rows.append((
-            short_label(alarm.recording), clock(alarm.since_s, start), clock(alarm.raised_s, start), alarm.severity,
+            labels[alarm.recording], clock(alarm.since_s, start), clock(alarm.raised_s, start), alarm.severity,
             first.words if first else MISSING, first.probability if first else None,
             alarm.statistic / alarm.limit if alarm.limit > 0.0 else None,
         ))  # fmt: skip

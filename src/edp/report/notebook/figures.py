@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, closest
 from edp.recording import Recording
 from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, with_unit
-from edp.report.common.wording import short_label
+from edp.report.common.wording import label_by_name, short_labels
 from edp.report.run.charts import horizon_chart
 from edp.report.run.facts import Facts
 from edp.report.run.figures import downsample
@@ -49,16 +49,16 @@ class BandLine:
 def recordings_figure(recording: Recording, channels: Sequence[str]) -> go.Figure:
     """Channels of a recording over time, a row each, in the units of reports."""
     columns = [recording.channels[recording.index(name)] for name in channels]
-    panels = []
+    panels, labels = [], label_by_name(channels)
     for channel in columns:
-        values = recording.column(channel.name)
-        panels.append(_row(channel, [_line(channel, values, recording.rate_hz, short_label(channel.name), BLUE, 1.4)]))
+        values, label = recording.column(channel.name), labels[channel.name]
+        panels.append(_row(channel, label, [_line(channel, values, recording.rate_hz, label, BLUE, 1.4)]))
     return _figure(replace(_rows("recordings", panels), legend="none"))
 
 
 def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> go.Figure:
     """Predictions over what was measured, a row a target, with the interval where there is one."""
-    panels = []
+    panels, labels = [], label_by_name(line.channel.name for line in lines)
     for line in lines:
         marks: list[Mark] = []
         if line.lower is not None and line.upper is not None:
@@ -69,8 +69,8 @@ def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> 
         if line.measured is not None:
             marks.append(_line(line.channel, line.measured, rate_hz, "Measured", GREY, 2.6))
         marks.append(_line(line.channel, line.predicted, rate_hz, "Predicted", BLUE, 1.5))
-        panels.append(_row(line.channel, marks))
-    return _figure(_rows("predictions", panels), title=short_label(title))
+        panels.append(_row(line.channel, labels[line.channel.name], marks))
+    return _figure(_rows("predictions", panels), title=short_labels([title])[0])
 
 
 def score_figure(facts: Facts) -> go.Figure:
@@ -102,10 +102,8 @@ def _rows(name: str, panels: Sequence[Panel]) -> Chart:
     return Chart(name, tuple(panels), height=height, together=True)
 
 
-def _row(channel: Channel, marks: Sequence[Mark]) -> Panel:
-    return Panel(
-        tuple(marks), ChartAxis("Time [s]"), title=with_unit(short_label(channel.name), KINDS[channel.kind].report_unit)
-    )
+def _row(channel: Channel, label: str, marks: Sequence[Mark]) -> Panel:
+    return Panel(tuple(marks), ChartAxis("Time [s]"), title=with_unit(label, KINDS[channel.kind].report_unit))
 
 
 def _line(channel: Channel, values: Array, rate_hz: float, name: str, colour: str, width: float) -> DataSeries:

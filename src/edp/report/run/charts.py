@@ -28,7 +28,7 @@ from edp.report.common.chart import (
     Range,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import short_label
+from edp.report.common.wording import label_by_name
 from edp.report.run import figures
 from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
 
@@ -56,7 +56,10 @@ def _place(facts: Facts, model: str) -> int:
 
 def name_of(facts: Facts, model: str) -> str:
     """A model in a legend."""
-    return "Measured" if model == TRUTH else short_label(label_of(facts, model))
+    if model == TRUTH:
+        return "Measured"
+    label = label_of(facts, model)
+    return label_by_name([*(label_of(facts, one) for one in facts.models), label])[label]
 
 
 def interval_name(facts: Facts) -> str:
@@ -184,6 +187,10 @@ def horizon_chart(facts: Facts) -> Chart | None:
     return Chart("horizon", (Panel(tuple(marks), across, _error_axis(facts)),), height=340, together=True)
 
 
+def _band(row: Mapping[str, Any]) -> str:
+    return f"{row['low']:.3g}–{row['high']:.3g}"
+
+
 def speed_chart(facts: Facts) -> Chart | None:
     """Error by speed band, over the share of samples in each band."""
     horizons = [k for k in figures.headline_first(facts) if figures.speed_bands(facts, k)]
@@ -194,12 +201,12 @@ def speed_chart(facts: Facts) -> Chart | None:
     for horizon in horizons:
         bands, when = figures.speed_bands(facts, horizon), {"horizon": str(horizon)}
         for name in _network_last(bands):
-            labels = [f"{row['low']:g}–{row['high']:g}" for row in bands[name]]
+            labels = [_band(row) for row in bands[name]]
             errors.append(DataSeries(x=labels, y=[row["mae"] for row in bands[name]], when=when, **_look(facts, name)))
         rows = next(iter(bands.values()))
         total = sum(row["count"] or 0 for row in rows) or 1
         counts.append(Bars(
-            positions=[f"{row['low']:g}–{row['high']:g}" for row in rows], colours=["#d3dae1"] * len(rows), when=when,
+            positions=[_band(row) for row in rows], colours=["#d3dae1"] * len(rows), when=when,
             values=[100 * (row["count"] or 0) / total for row in rows], hover="{y:.3g} % of the samples", remark="",
         ))  # fmt: skip
     across = ChartAxis(with_unit("Speed band", facts.unit), kind="names")

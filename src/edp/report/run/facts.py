@@ -15,6 +15,7 @@ from edp.errors import DataError, StorageError
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, beaten_by
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
+from edp.report.run.budget import budget_name, budget_rows
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
 from edp.signals import display_offset
@@ -348,10 +349,10 @@ def verdict_lines(facts: Facts) -> list[str]:
     beyond = situation_line(facts.scores) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))
     lines += [line for line in (judged, beyond, limit) if line]
-    checks = (facts.footprint or {}).get("verdict", [])
+    checks = budget_rows(facts.footprint)
     if checks:
         over = [str(check["what"]) for check in checks if not check["fits"]]
-        name = (facts.footprint or {}).get("budget", {}).get("name") or "the controller"
+        name = budget_name(facts.footprint) or "the controller"
         verdict = f"exceeded in {listed(over)}" if over else "met on every count"
         lines.append(f"Budget ({name}): {verdict}.")
     return lines

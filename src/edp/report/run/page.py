@@ -14,6 +14,7 @@ from edp.report.common.chart import Chart
 from edp.report.common.templates import asset, stylesheet, template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
+from edp.report.run.budget import budget_name
 from edp.report.run.charts import DOTS_AT_MOST, run_charts
 from edp.report.run.choice import candidates_table, model_tables, promise_line, promise_table, read_choice
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
@@ -84,7 +85,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "signals": signals_of(facts),
         **shown(chart for chart in (signal_chart(facts), *run_charts(facts), correlogram(facts)) if chart is not None),
         "checks": tables.budget_checks(facts),
-        "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
+        "budget": budget_name(facts.footprint),
         "parts": tables.parts_table(facts),
         "footprint": tables.footprint_rows(facts),
         "provenance": tables.provenance_rows(facts),

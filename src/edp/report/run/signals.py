@@ -27,11 +27,11 @@ def signal_chart(facts: Facts) -> Chart | None:
     for column, channel in enumerate(channels):
         # Numbers without a unit have no common axis: each stands alone.
         by_unit.setdefault(channel["unit"] if channel["unit"] != "1" else f"1 {column}", []).append(column)
-    panels = []
+    panels, names = [], short_labels(channel["name"] for channel in channels)
     for columns in list(by_unit.values())[:MOST_PANELS]:
         unit = channels[columns[0]]["unit"]
         marks: list[Mark] = []
-        labels = short_labels(channels[column]["name"] for column in columns[:MOST_SERIES])
+        labels = [names[column] for column in columns[:MOST_SERIES]]
         for label, column, colour in zip(labels, columns, (BLUE, *SHADES)):
             y = np.asarray(values[:, column] * channels[column]["factor"] + display_offset(unit), dtype=np.float32)
             selected = downsample(y, POINTS)

@@ -29,7 +29,7 @@ from edp.report.common.chart import (
     finite,
     with_unit,
 )
-from edp.report.common.wording import short_label
+from edp.report.common.wording import label_by_name
 from edp.report.screening.views import (
     METRICS,
     UNITS,
@@ -98,8 +98,9 @@ def lag_chart(views: Sequence[LagView], rate_hz: float) -> Chart | None:
         return None
     marks: list[Mark] = [GuideLine(x=0.0, dash="dot", colour=FRAME)]
     for view in views:
+        labels = label_by_name(curve.channel for curve in view.curves)
         for rank, curve in enumerate(view.curves):
-            label = f"{short_label(curve.channel)} ({curve.best:+d})".replace("-", "−")
+            label = f"{labels[curve.channel]} ({curve.best:+d})".replace("-", "−")
             best = f"{curve.channel}, best {curve.best}{'' if curve.certain else ', not certain'}"
             look: dict[str, Any] = {
                 "colour": LINES[rank % len(LINES)],
@@ -162,7 +163,7 @@ def bar_chart(name: str, views: Sequence[BarView]) -> Chart | None:
 
 def _targets(more: Mapping[str, int]) -> Control:
     """The choice of a target, by how many channels are not shown for it."""
-    names = {target: "mean of all targets" if target == "all" else short_label(target) for target in more}
+    names = {**label_by_name(more), **({"all": "mean of all targets"} if "all" in more else {})}
     options = tuple(
         (target, f"{text} (+ {more[target]} more)" if more[target] else text) for target, text in names.items()
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.report.common.wording import short_label, short_labels
+from edp.report.common.wording import short_labels
 
 if TYPE_CHECKING:
     from edp.data.screening import GroupImportance, LagCurve, ScreeningResult, Stability, Value
@@ -246,7 +246,7 @@ def value_views(screening: ScreeningResult) -> tuple[BarView, ...]:
 
 def joined(members: Sequence[str]) -> str:
     """A group by its first members."""
-    shown = ", ".join(map(short_label, members[:3]))
+    shown = ", ".join(short_labels(members)[:3])
     return shown if len(members) <= 3 else f"{shown} + {len(members) - 3}"
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import short_label
+from edp.report.common.wording import label_by_name
 from edp.report.transfer.facts import SOURCE, TARGET, Transfer
 from edp.signals import display_offset
 
@@ -59,6 +60,10 @@ def _horizons(facts: Transfer) -> Control:
     return Control(AHEAD, "Horizon", tuple((horizon, facts.ahead(horizon)) for horizon in facts.horizons))
 
 
+def _label(facts: Transfer, target: Mapping[str, Any]) -> str:
+    return label_by_name(facts.name(one) for one in facts.targets)[facts.name(target)]
+
+
 def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
     """Measured and predicted, a row for each target (figures 4.8 and 4.10)."""
     names = [key.removesuffix("/truth") for key in facts.shown if key.endswith("/truth")]
@@ -74,7 +79,7 @@ def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
                     values = (values + display_offset(target["unit"])).round(3)
                     when = {RECORDING: name, AHEAD: horizon}
                     marks.append(DataSeries(x=time_s, y=values, name=label, colour=colour, width=width, when=when))
-        title = with_unit(short_label(facts.name(target)), target["unit"])
+        title = with_unit(_label(facts, target), target["unit"])
         panels.append(Panel(tuple(marks), ChartAxis("Time in the test part [s]"), title=title))
     choice = Control(RECORDING, "Recording", tuple((name, name) for name in names), alone=True)
     return Chart(
@@ -108,7 +113,7 @@ def error_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
                     marks.append(Texts(x=[edges[0]], y=[0.92 * shares.max()], texts=[words], when=when))
         across = ChartAxis(with_unit("Error", target["unit"]))
         up = ChartAxis("" if panels else "Share of samples [%]", from_zero=True)
-        panels.append(Panel(tuple(marks), across, up, short_label(facts.name(target))))
+        panels.append(Panel(tuple(marks), across, up, _label(facts, target)))
     return Chart(
         "errors", tuple(panels), columns=len(panels), choices=(_horizons(facts),), height=340,
         inches=(2.8 * len(panels) + 0.6, 3.0),
@@ -127,7 +132,7 @@ def method_chart(facts: Transfer) -> Chart:
                 values = [facts.score(name, horizon, target["name"], domain)["mae"] for name in order]
                 marks.append(Bars(
                     positions=labels, values=values, colours=[MUTED[index % len(MUTED)]] * len(values),
-                    name=short_label(facts.name(target)), when={AHEAD: horizon},
+                    name=_label(facts, target), when={AHEAD: horizon},
                 ))  # fmt: skip
         up = ChartAxis(with_unit("Mean absolute error", facts.unit))
         panels.append(Panel(tuple(marks), ChartAxis(kind="names"), up, DOMAINS[domain]))

@@ -25,7 +25,7 @@ from edp.report.common.chart import (
     with_unit,
 )  # fmt: skip
 from edp.report.common.picture import write_pictures
-from edp.report.common.wording import short_label
+from edp.report.common.wording import label_by_name
 from edp.report.twin.facts import PARTS, TWIN, FreeRunFacts
 from edp.report.twin.steps import steps_chart
 from edp.signals import KINDS, Kind, display_offset
@@ -49,12 +49,16 @@ def twin_charts(facts: FreeRunFacts) -> list[Chart]:
     return [*runs, horizon_chart(facts), *([] if steps is None else [steps])]
 
 
+def _labels(facts: FreeRunFacts) -> dict[str, str]:
+    return label_by_name(channel["name"] for part in PARTS for channel in facts.channels(part))
+
+
 def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
     """What was measured and what the twin answered meanwhile, with its interval; a row for each channel of a part."""
     seconds, half = facts.shown["seconds"], facts.shown.get("half_width")
     # Shown runs are thinned out evenly, so a start and a step are all that a line needs.
     time_s = Evenly(round(float(seconds[0]), 6), round(float((seconds[-1] - seconds[0]) / (len(seconds) - 1)), 6))
-    panels = []
+    panels, labels = [], _labels(facts)
     for channel, column in zip(facts.channels(part), facts.columns(part), strict=True):
         marks: list[Mark] = []
         for name in facts.names:
@@ -68,7 +72,7 @@ def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
             marks.append(DataSeries(x=time_s, y=_short(truth), name="Measured", colour=GREY, width=2.6, when=when))
             label = "Twin, on commands alone"
             marks.append(DataSeries(x=time_s, y=_short(answers), name=label, width=1.4, when=when))
-        title = with_unit(short_label(channel["name"]), channel["unit"])
+        title = with_unit(labels[channel["name"]], channel["unit"])
         panels.append(Panel(tuple(marks), ChartAxis("Time since the last measured tick [s]"), title=title))
     choice = Control(RECORDING, "Recording", tuple((name, name) for name in facts.names))
     return Chart(f"runs_{part}", tuple(panels), choices=(choice,), height=90 + 190 * len(panels), together=True)
@@ -85,8 +89,9 @@ def horizon_chart(facts: FreeRunFacts) -> Chart:
         marks: list[Mark] = []
         for model, scores in facts.models.items():
             by_horizon, when = scores["by_horizon"], {MODEL: model}
+            labels = label_by_name(name for one in PARTS for name in by_horizon[one]["by_channel"])
             for index, (name, values) in enumerate(by_horizon[part]["by_channel"].items()):
-                label, colour = short_label(name), MUTED[index % len(MUTED)]
+                label, colour = labels[name], MUTED[index % len(MUTED)]
                 errors = _short(np.array(values, dtype=np.float64))
                 marks.append(DataSeries(
                     x=by_horizon["seconds"], y=errors, name=label, colour=colour, width=2, hover="{y:.3g}", when=when
@@ -141,7 +146,7 @@ def _rollout_chart(name: str, rollout: Recording, columns: list[str], suffix: st
     # Ends belong to the picture: how far a free run is off in the end is what it shows.
     at = np.unique(np.linspace(0, rollout.samples - 1, MOST_DRAWN).astype(int))
     time_s = start_s + at / rollout.rate_hz
-    panels = []
+    panels, labels = [], label_by_name(columns)
     for column in columns:
         facts = KINDS[rollout.channels[rollout.index(column)].kind]
         names = (column, f"{column}{suffix}", f"{column}{suffix}_low", f"{column}{suffix}_high")
@@ -151,7 +156,7 @@ def _rollout_chart(name: str, rollout: Recording, columns: list[str], suffix: st
             marks.append(Range(x=time_s, low=drawn[2], high=drawn[3], name="interval"))
         marks.append(DataSeries(x=time_s, y=drawn[0], name="measured", colour=DROPPED, width=3.6))
         marks.append(DataSeries(x=time_s, y=drawn[1], name="answered by the twin", colour=BLUE, width=1.4))
-        vertical = ChartAxis(with_unit(f"{short_label(column)}\n", facts.report_unit))
+        vertical = ChartAxis(with_unit(f"{labels[column]}\n", facts.report_unit))
         panels.append(Panel(tuple(marks), ChartAxis("Time in the log [s]"), vertical))
     size = (8.0, 1.3 * len(columns) + 0.9)
     return Chart(name, tuple(panels), file=name, inches=size, height=90 + 130 * len(columns), together=True)

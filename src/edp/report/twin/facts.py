@@ -27,7 +27,7 @@ from edp.evaluation.scores_file import (
     read_shaped,
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import listed, number, percent, short_label
+from edp.report.common.wording import listed, number, percent, short_labels
 from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.report.twin.ground import ground_line
@@ -231,7 +231,7 @@ def _plain_answers(facts: FreeRunFacts) -> str:
     """Names of the answers where they are numbers without a unit, whose integral is no stroke; else empty."""
     if facts.twin["velocity_mae"].get("unit") != PLAIN_UNIT or facts.twin["velocity_mae"]["mean"] is None:
         return ""
-    return listed(short_label(str(channel["name"])) for channel in facts.channels("velocities"))
+    return listed(short_labels(str(channel["name"]) for channel in facts.channels("velocities")))
 
 
 def verdict(facts: FreeRunFacts) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from edp.errors import StorageError
 from edp.evaluation.scores_file import COUNT, NAME, REAL, SIZE, KeyedObject, Listed, read_shaped
 from edp.report.common.chart import Chart, ChartAxis, Control, DataSeries, Mark, Panel, Range, with_unit
-from edp.report.common.wording import short_label
+from edp.report.common.wording import label_by_name
 from edp.storage.paths import is_file_at
 
 FILE, COMMAND = "step_response.json", "command"
@@ -53,6 +53,7 @@ def steps_chart(steps: Mapping[str, Any]) -> Chart | None:
     if not steps.get("steps"):
         return None
     seconds, panels = steps["seconds"], []
+    labels = label_by_name(answer["name"] for answer in steps["steps"][0]["answers"])
     for row, first in enumerate(steps["steps"][0]["answers"][:MOST_PANELS]):
         marks: list[Mark] = []
         for step in steps["steps"]:
@@ -60,7 +61,7 @@ def steps_chart(steps: Mapping[str, Any]) -> Chart | None:
             low, high = (np.array(answer[end]) for end in ("low", "high"))
             marks.append(Range(x=seconds, low=low, high=high, name="Middle 80 % of the moments", hover=None, when=when))
             marks.append(DataSeries(x=seconds, y=answer["median"], name="Median", width=1.8, when=when))
-        title = with_unit(short_label(first["name"]), first["unit"])
+        title = with_unit(labels[first["name"]], first["unit"])
         panels.append(Panel(tuple(marks), ChartAxis("Time since the step [s]"), title=title))
     options = tuple(
         (step["command"], f"{step['command']}, step of {step['size']:g} {step['unit']}") for step in steps["steps"]

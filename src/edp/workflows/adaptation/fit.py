@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.errors import ConfigError, ExportError
-from edp.evaluation.controller import Budget
 from edp.ir.rls import Adaptation, AdaptationSpec
 from edp.ir.rls.constants import FEATURE_LIMIT
 from edp.networks.predictor import Predictor
@@ -59,7 +58,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
         write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         # The footprint counts the adaptation too; the one of the source run would state too little.
-        write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json(Budget()))
+        write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json())
         facts = replay(bundle.predictor, adaptation, data.test).to_json(data.task, data.target_kinds)
         write_json(target.file("adaptation.json"), facts)
         target.write_status("finished")

@@ -12,7 +12,6 @@ from edp import __version__
 from edp.config.experiment import Experiment, experiment_toml
 from edp.data.frozen import ByFrozen, Session
 from edp.data.prepared import Prepared, prepare
-from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
@@ -109,7 +108,7 @@ def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: P
     with RunFolder(folder) as run:
         run.claim(key, experiment_toml(experiment))
         write_json(run.file("provenance.json"), facts)
-        write_json(run.file("footprint.json"), footprint(network).to_json(Budget()))
+        write_json(run.file("footprint.json"), footprint(network).to_json())
         save_bundle(make_bundle(network, data, facts), run.file("bundle"))
         run.write_status("finished")
 

@@ -306,4 +306,4 @@ def damage(value, rng):
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, sound, tmp_path):
-    check_page(browser, write_study_page(sound, tmp_path, pictures=False).page)
+    check_page(browser, write_study_page(sound, tmp_path, pictures=False).page, "model search")

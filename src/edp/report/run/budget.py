@@ -1,0 +1,21 @@
+"""The controller that somebody stated for a run, and what the run's network takes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from edp.evaluation.controller import Budget
+
+
+def budget_name(footprint: Mapping[str, Any] | None) -> str:
+    """Return the name of the stated controller in a run's ``footprint.json``; empty without one."""
+    budget = (footprint or {}).get("budget")
+    # Earlier versions held every run against the thesis's controller.
+    return str(budget.get("name") or "") if isinstance(budget, Mapping) and budget != asdict(Budget()) else ""
+
+
+def budget_rows(footprint: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
+    """Return the verdict by resource against the stated controller; empty without one."""
+    return list((footprint or {}).get("verdict", ())) if budget_name(footprint) else []
