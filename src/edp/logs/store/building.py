@@ -35,6 +35,7 @@ from edp.logs.store.index import (
     plain_index,
     read_index,
     rows_path,
+    stamped,
     without_seal,
     write_plain,
 )
@@ -289,14 +290,7 @@ def store_batch(batch: LogBatch) -> dict[str, Any]:
             index = replace(index, lists=tuple(lists), recordings=(*index.recordings, entry))
             first += entry.samples * len(channels)
     if index.recordings:
-        status = status_of(path)
-        file = RowsFile(
-            key=batch.key,
-            bytes=status.st_size,
-            written_ns=status.st_mtime_ns,
-            changed_ns=status.st_ctime_ns,
-        )
-        index = replace(index, files=(file,))
+        index = replace(index, files=(stamped(batch.folder, RowsFile(key=batch.key)),))
     else:
         path.unlink()
     record = plain_index(index)

@@ -16,7 +16,7 @@ from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel
 from edp.storage import object_with, parse_json, read_text, write_bytes
-from edp.storage.paths import is_file_at, is_folder_at
+from edp.storage.paths import is_file_at, is_folder_at, status_of
 from edp.storage.seals import HASH, sealed, unsealed
 
 INDEX, ROWS, LOCK = "store.json", "rows", ".lock"
@@ -81,8 +81,8 @@ class RowsFile:
     """
 
     key: str
-    bytes: int
-    written_ns: int
+    bytes: int = 0
+    written_ns: int = 0
     changed_ns: int = 0
 
     def is_unchanged(self, status: os.stat_result) -> bool:
@@ -132,6 +132,12 @@ def is_store(path: str | Path) -> bool:
 def rows_path(folder: Path, key: str) -> Path:
     """The file of samples with this key."""
     return folder / ROWS / f"{key}.f32"
+
+
+def stamped(folder: Path, file: RowsFile) -> RowsFile:
+    """Return a file whose samples were compared with their hashes, with its size and times as they are now."""
+    status = status_of(rows_path(folder, file.key))
+    return replace(file, bytes=status.st_size, written_ns=status.st_mtime_ns, changed_ns=status.st_ctime_ns)
 
 
 def read_index(folder: str | Path) -> StoreIndex:

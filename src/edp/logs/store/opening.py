@@ -21,6 +21,7 @@ from edp.logs.store.index import (
     plain_index,
     read_index,
     rows_path,
+    stamped,
     write_plain,
 )
 from edp.recording import FloatArray, Recording
@@ -72,16 +73,11 @@ def check_store(folder: str | Path) -> StoreIndex:
     index = read_index(top)
     files = {file.key: _mapped(top, file) for file in index.files}
     _refuse_changed(top, index, files, {file.key for file in index.files})
-    fresh = tuple(_stamped(top, file) for file in index.files)
+    fresh = tuple(stamped(top, file) for file in index.files)
     if fresh != index.files:
         index = replace(index, files=fresh)
         write_plain(top / INDEX, plain_index(index))
     return index
-
-
-def _stamped(folder: Path, file: RowsFile) -> RowsFile:
-    status = _status(folder, file)
-    return replace(file, written_ns=status.st_mtime_ns, changed_ns=status.st_ctime_ns)
 
 
 def _mapped(folder: Path, file: RowsFile) -> FloatArray:
