@@ -15,7 +15,7 @@ from functools import cache, partial
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -27,6 +27,8 @@ from edp.errors import ConfigError, EdpError
 # Scripts can tell a network that should not be used without reading JSON.
 BEATEN = 6
 """Exit code where a baseline has less error than the network, or a floor less than the twin."""
+UNFOLDED_COLUMNS = 100_000
+"""Width of output that is not a terminal."""
 KEPT_BREAK = re.compile(r"\n(?=  - )")
 """The line break that messages list several things with; any other may come from a name."""
 
@@ -54,6 +56,20 @@ class Terminal(Console):
     def __init__(self, stderr: bool = False) -> None:
         # Names of channels may look like markup.
         super().__init__(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True)
+
+    @property
+    def size(self) -> ConsoleDimensions:
+        """Size of the terminal; the size of a pipe or file is `COLUMNS` if set, otherwise wide enough for any row.
+
+        A row that is folded in a file can no longer be searched or cut into columns.
+        """
+        if self.is_terminal or "COLUMNS" in os.environ:
+            return super().size
+        return ConsoleDimensions(UNFOLDED_COLUMNS, 25)
+
+    @size.setter
+    def size(self, dimensions: tuple[int, int]) -> None:
+        self._width, self._height = dimensions
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print text, or a renderable of this module."""

@@ -200,6 +200,7 @@ def _serve(serve: Serve, pipes: tuple[int, int], inherited: list[int], worker: i
         nothing = os.open(os.devnull, os.O_RDWR)
         for handle in (0, 1, 2):
             os.dup2(nothing, handle)
+        os.close(nothing)
         serve(*pipes)
         code = 0
     except BaseException:

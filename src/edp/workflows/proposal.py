@@ -284,7 +284,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
         notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")
     roles = {guess.role for guess in proposal.columns}
     notes += ["labels: those that are known while the machine works may be features"] * ("label" in roles)
-    notes += [f"not readable: {reason[:300]}" for reason in list(broken.values())[:3]]
+    notes += [f"not readable: {reason}" for reason in list(broken.values())[:3]]
     if len(broken) > 3:
         notes.append(f"{len(broken) - 3} more logs are not readable")
     return notes

@@ -17,6 +17,7 @@ from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
+from edp.signals import display_offset
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
@@ -42,12 +43,20 @@ METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 @dataclass(frozen=True)
 class Target:
-    """One output of the model: `factor` takes its SI value to `unit`, the unit of the report."""
+    """One output of the model.
+
+    Values in `unit` are SI values times `factor` plus `offset`; differences have no offset.
+    """
 
     name: str
     description: str
     unit: str
     factor: float
+
+    @property
+    def offset(self) -> float:
+        """See `edp.signals.display_offset`."""
+        return display_offset(self.unit)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from markupsafe import Markup
 
 from edp.report.common import tables
 from edp.report.common.chart import Chart
-from edp.report.common.templates import template
+from edp.report.common.templates import asset, stylesheet, template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
 from edp.report.run.charts import DOTS_AT_MOST, run_charts
@@ -135,15 +134,10 @@ def shown(charts: Iterable[Chart]) -> dict[str, Any]:
     return {
         "plots": drawn,
         "specs": script_json([plot.spec() for plot in drawn.values()]),
-        "style": Markup(asset("page.css")),
+        "style": Markup(stylesheet("page.css")),
         "script": Markup(asset("page.js")),
         "drawing": Markup("\n".join(asset(name) for name in DRAWING)),
     }
-
-
-def asset(name: str) -> str:
-    """A file of the page's own, as text."""
-    return resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def script_json(value: Any) -> Markup:
