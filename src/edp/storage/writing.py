@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
-from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at
+from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_at
 from edp.storage.portable import BINARY, NO_LINK, QUIETLY, hold_handle, lock_handle
 from edp.storage.seals import sealed
 
@@ -83,7 +83,8 @@ def _remove_left(folder: Path) -> None:
             if TEMPORARY.fullmatch(rest.name) is None or is_link_at(rest):
                 continue
             with contextlib.suppress(OSError):
-                if time.time() - os.lstat(rest).st_mtime < LEFT_AFTER_S:
+                status = status_at(rest, follow=False)
+                if status is None or time.time() - status.st_mtime < LEFT_AFTER_S:
                     continue
                 handle = os.open(rest, os.O_RDONLY | QUIETLY | NO_LINK)
                 try:
