@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from edp.errors import StorageError, brief
-from edp.storage.study_file import read_study
+from edp.errors import StorageError
+from edp.storage.study_file import read_study, reading_parts
 from edp.workflows.search.plan import space_of
 from edp.workflows.search.space import Choice, Range, Space
 from edp.workflows.search.study import FinishedStudy, FinishedTrial, write_journal
@@ -31,13 +31,8 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     """
     content = read_study(folder)
     file = Path(folder, JOURNAL) if path is None else Path(path)
-    try:
+    with reading_parts(folder):
         studies = ended_studies(content)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise StorageError(
-            f"'{folder}' is damaged: its study.json lacks a part or holds another kind of value ({brief(error)}); call "
-            "`edp search` on the study again, which writes it anew"
-        ) from error
     if not studies:
         raise StorageError(
             f"'{folder}' has asked no questions yet: phase 1 (calibration) has not ended; go on with edp search, then "
