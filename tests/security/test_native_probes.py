@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(not LINUX, reason="the kernel's layers are Linux
 HERE = Path(__file__).parent
 SECRET = "AWS_SECRET_ACCESS_KEY"
 ALL = ("files", "process", "sockets", "kernel")
-LACKING = ("Landlock", "system-call filter", "limits")
+LACKING = ("file rules", "system-call filter", "limits")
 """Layers that a test can take away from the kernel; the audit hook is Python's."""
 
 
@@ -70,12 +70,21 @@ def assert_told(found, layer):
     assert "EDP_SANDBOX=require" in said
 
 
-def test_without_landlock_native_code_can_read_and_nothing_else(tmp_path):
+def test_without_landlock_another_process_opens_files_and_native_code_reaches_nothing(tmp_path):
     found = probed("Landlock", tmp_path)
+    assert found["layers"] == {layer.name: "" for layer in layers.LAYERS}
+    assert found["tried"] > 500
+    assert found["reached"] == {}
+    assert_untouched(found)
+    assert found["warned"] == []
+
+
+def test_without_file_rules_native_code_can_read_and_nothing_else(tmp_path):
+    found = probed("file rules", tmp_path)
     reading = ("open outside", "open by a handle", "folder ", "passwd", "/proc")
     assert [probe for probe in found["reached"] if not probe.startswith(reading)] == []
     assert_untouched(found)
-    assert_told(found, "Landlock")
+    assert_told(found, "file rules")
 
 
 def test_without_the_filter_landlock_still_holds_files_and_somebody_is_told(tmp_path):
@@ -110,22 +119,25 @@ def test_where_a_layer_is_missing_logs_are_refused_if_all_are_required(layer, tm
 def test_commands_say_once_which_layer_is_missing(layer, tmp_path):
     for name in ("a", "b", "c"):
         write_recording(recording(), tmp_path / f"{name}.csv")
-    for options in ((), ("--json",)):
-        done = without(layer, "-m", "edp", "inspect", tmp_path, *options)
-        assert done.stderr.count("warning: logs are read with less protection") == bool(layer)
-        assert f"'{layer}'" in done.stderr or not layer
-        if options:
-            json.loads(done.stdout)
-        silent = without(layer, "-m", "edp", "inspect", tmp_path, *options, EDP_SANDBOX="accept")
-        assert "protection" not in silent.stderr
-        assert silent.returncode == done.returncode
-    refused = without(layer, "-m", "edp", "inspect", tmp_path / "a.csv", EDP_SANDBOX="require")
-    assert ("is not read" in refused.stderr + refused.stdout) == bool(layer)
+    # As a document for programs where a layer is missing, which the warning must not get into.
+    done = without(layer, "-m", "edp", "inspect", tmp_path, *(["--json"] if layer else []))
+    assert done.stderr.count("warning: logs are read with less protection") == bool(layer)
+    if layer:
+        assert f"'{layer}'" in done.stderr
+        json.loads(done.stdout)
+
+
+def test_a_missing_layer_can_be_accepted_and_can_be_a_reason_to_end(tmp_path):
+    path = write_recording(recording(), tmp_path / "a.csv")
+    silent = without("file rules", "-m", "edp", "inspect", path, EDP_SANDBOX="accept")
+    assert "protection" not in silent.stderr
+    refused = without("file rules", "-m", "edp", "inspect", path, EDP_SANDBOX="require")
+    assert "is not read: the layer 'file rules'" in " ".join((refused.stderr + refused.stdout).split())
     assert "Traceback" not in refused.stderr
+    assert refused.returncode != 0
 
 
-@pytest.mark.parametrize("layer", ["", *LACKING])
-@pytest.mark.parametrize("wish", ["", "require"])
+@pytest.mark.parametrize(("layer", "wish"), [*((layer, "") for layer in ("", *LACKING)), ("file rules", "require")])
 def test_doctor_shows_every_layer(layer, wish, tmp_path):
     done = without(layer, "-m", "edp", "doctor", tmp_path, "--json", EDP_SANDBOX=wish)
     checks = {check["what"]: check for check in json.loads(done.stdout)["checks"]}
@@ -182,7 +194,7 @@ def test_exported_code_that_is_run_sees_only_listed_variables(tmp_path, monkeypa
 
 
 def test_a_reader_that_says_nothing_of_its_layers_is_not_believed(tmp_path):
-    for stated in (None, {}, [], {"Landlock": ""}, {layer.name: "" for layer in layers.LAYERS[1:]}):
+    for stated in (None, {}, [], {"file rules": ""}, {layer.name: "" for layer in layers.LAYERS[1:]}):
         with pytest.raises(DataError, match="does not state the layers"):
             layers.note_layers(tmp_path, stated)
 
@@ -197,11 +209,63 @@ def test_a_word_that_the_setting_does_not_know_is_refused_before_anything_is_rea
 def test_python_can_require_the_layers(monkeypatch, tmp_path):
     monkeypatch.setattr(layers, "_state", layers._State())
     monkeypatch.delenv(layers.VARIABLE, raising=False)
-    stated = {layer.name: "" for layer in layers.LAYERS} | {"Landlock": "no such call"}
-    with pytest.warns(layers.SandboxWarning, match="'Landlock'"):
+    stated = {layer.name: "" for layer in layers.LAYERS} | {"file rules": "no such call"}
+    with pytest.warns(layers.SandboxWarning, match="'file rules'"):
         layers.note_layers(tmp_path, stated)
     layers.require_layers()
     with pytest.raises(DataError, match=r"require_layers\(\) asks for all layers"):
         layers.note_layers(tmp_path, stated)
     layers.require_layers(False)
     layers.note_layers(tmp_path, stated)  # announced already
+
+
+WITHOUT_LANDLOCK = """
+import os, sys, time
+from pathlib import Path
+import hostile_format
+from edp.errors import EdpError
+from edp.logs import read_recording
+from edp.sandbox import end
+
+folder = Path(sys.argv[1])
+for path in sorted(folder.glob("log.*")):
+    print("read", path.suffix, read_recording(path).samples)
+for each in ("crash|11", "crash|6", "exit|3", "exit|0", "fail|x", "loop|", "layers|"):
+    log = folder / "x.hostile"
+    log.write_text(f"{each}|open")
+    try:
+        read_recording(log)
+    except EdpError as error:
+        print("said", each, error)
+end()
+for _ in range(3000):
+    left = []
+    for name in os.listdir("/proc"):
+        try:
+            own = Path("/proc", name, "environ").read_bytes() if name.isdigit() and int(name) != os.getpid() else b""
+        except OSError:
+            continue
+        if f"EDP_TEST_MARK={folder}".encode() in own:
+            left.append(name)
+    if not left:
+        break
+    time.sleep(0.01)
+print("left", left)
+"""
+
+
+def test_without_landlock_every_format_is_read_and_every_end_of_a_reader_is_told(tmp_path):
+    from edp.logs import FORMATS
+
+    suffixes = sorted(part.suffixes[0] for name, part in FORMATS.items() if name != "hostile")
+    for suffix in suffixes:
+        write_recording(recording(), tmp_path / f"log{suffix}")
+    done = without("Landlock", "-c", WITHOUT_LANDLOCK, tmp_path, EDP_TEST_START_S="0.2", EDP_TEST_MARK=str(tmp_path))
+    lines = done.stdout.splitlines()
+    assert [line for line in lines if line.startswith("read")] == [f"read {suffix} 20" for suffix in suffixes]
+    said = "\n".join(lines)
+    for text in ("signal 11", "signal 6", "exit code 3", "exit code 0", "KeyError", "more processor time"):
+        assert text in said
+    assert "file rules and system-call filter and limits and audit hook" in said
+    assert lines[-1] == "left []"
+    assert done.stderr == ""

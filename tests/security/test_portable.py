@@ -138,6 +138,7 @@ GUARDED = {
     "cli/doctor.py": "hasattr",
     "data/screening/compiled.py": "hasattr",
     "sandbox/allowance.py": "an import that may fail, hasattr, and /proc, which is read first",
+    "sandbox/broker.py": "Linux only, by sys.platform",
     "sandbox/landlock.py": "Linux only, by sys.platform",
     "sandbox/lockdown.py": "an import that may fail",
     "sandbox/processes.py": "Linux only, by sys.platform",

@@ -211,7 +211,7 @@ def test_what_no_reader_needs_is_refused(hostile, tmp_path, deed, argument, when
 
 @linux
 def test_all_layers_hold_here_and_threads_still_run(hostile):
-    with pytest.raises(DataError, match="Landlock and system-call filter and limits and audit hook"):
+    with pytest.raises(DataError, match="file rules and system-call filter and limits and audit hook"):
         read_recording(hostile("layers"))
     with pytest.raises(DataError, match="4 threads ran"):
         read_recording(hostile("threads"))

@@ -358,9 +358,9 @@ def _say_system(error: OSError) -> int:
         # As of a program that SIGPIPE ends: who reads the output, such as `head`, wants no more of it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return CLOSED_PIPE
-    file = f"'{os.fsdecode(error.filename)}'" if isinstance(error.filename, str | bytes) else "a file or the output"
+    where = f"'{os.fsdecode(error.filename)}'" if isinstance(error.filename, str | bytes) else "a file or the output"
     _say_error(
-        f"cannot read or write {file}: {error.strerror or error}; free space, or give a place that you may read and "
+        f"cannot read or write {where}: {error.strerror or error}; free space, or give a place that you may read and "
         "write"
     )
     return 1

@@ -44,7 +44,7 @@ def restrict(readable: Iterable[Path]) -> None:
         raise OSError(errno.ENOSYS, "exists on Linux only")
     libc = ctypes.CDLL(None, use_errno=True)
     # Asked first: each version knows more rights, and a kernel refuses bits that it does not know.
-    version = libc.syscall(_CREATE, None, ctypes.c_size_t(0), ctypes.c_uint(_VERSION))
+    version = _version(libc)
     if version < 1:
         raise _failure("be asked for")
     rights = (1 << max(count for since, count in _FILE_RIGHTS.items() if since <= version)) - 1
@@ -71,6 +71,15 @@ def restrict(readable: Iterable[Path]) -> None:
         return
     os.close(handle)
     raise OSError("the kernel took the rules and does not obey them")
+
+
+def is_available() -> bool:
+    """Whether the kernel has Landlock."""
+    return sys.platform.startswith("linux") and _version(ctypes.CDLL(None, use_errno=True)) >= 1
+
+
+def _version(libc: ctypes.CDLL) -> int:
+    return int(libc.syscall(_CREATE, None, ctypes.c_size_t(0), ctypes.c_uint(_VERSION)))
 
 
 def _allow(libc: ctypes.CDLL, rules: int, path: Path) -> None:

@@ -39,12 +39,12 @@ class SandboxLayer:
     advice: str
 
 
-LANDLOCK = SandboxLayer(
-    "Landlock",
+FILE_RULES = SandboxLayer(
+    "file rules",
     "reading other files that you can read",
-    "Linux 5.13 and later",
+    "Linux 5.13 (Landlock) or 5.9 (files opened by another process)",
     "take such a kernel with CONFIG_SECURITY_LANDLOCK and 'landlock' in its parameter lsm=, or a container that "
-    "passes on the calls landlock_*",
+    "passes on the calls landlock_* or seccomp",
 )
 SYSTEM_CALLS = SandboxLayer(
     "system-call filter",
@@ -54,7 +54,7 @@ SYSTEM_CALLS = SandboxLayer(
 )
 LIMITS = SandboxLayer("limits", "unbounded memory and processor time", "POSIX systems", "use Linux, macOS or WSL")
 AUDIT_HOOK = SandboxLayer("audit hook", "the same from Python code", "every system", "use CPython")
-LAYERS = (LANDLOCK, SYSTEM_CALLS, LIMITS, AUDIT_HOOK)
+LAYERS = (FILE_RULES, SYSTEM_CALLS, LIMITS, AUDIT_HOOK)
 
 
 class SandboxWarning(UserWarning):

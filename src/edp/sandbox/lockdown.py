@@ -1,7 +1,8 @@
 """What a process may no longer do once it reads a log, and which layer sees to it.
 
-* **Landlock** (`edp.sandbox.landlock`, Linux 5.13): opens nothing for writing and, for reading, only the log and the
-  folders of Python and its libraries; from 6.7 no TCP, from 6.12 no signals to other processes.
+* **File rules** (`edp.sandbox.landlock`, Linux 5.13): opens nothing for writing and, for reading, only the log and the
+  folders of Python and its libraries; from 6.7 no TCP, from 6.12 no signals to other processes. Where Landlock is
+  missing, another process opens files by the same list (`edp.sandbox.broker`, Linux 5.9).
 * **System calls** (`edp.sandbox.syscalls`, Linux on x86_64 and aarch64): the calls that reading needs, and no others.
 * **Limits** (`edp.sandbox.allowance`, POSIX): memory, processor time, no file grows, no core file. The number of
   processes is not limited: that limit counts all processes and threads of the user.
@@ -15,11 +16,11 @@ from __future__ import annotations
 import os
 import sys
 import sysconfig
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from edp.sandbox import audit, landlock, syscalls
-from edp.sandbox.layers import AUDIT_HOOK, LANDLOCK, LIMITS, SYSTEM_CALLS
+from edp.sandbox import audit, broker, landlock, syscalls
+from edp.sandbox.layers import AUDIT_HOOK, FILE_RULES, LIMITS, SYSTEM_CALLS
 
 try:
     import resource
@@ -75,11 +76,21 @@ def lock_down(readable: Iterable[Path]) -> dict[str, str]:
     # Landlock before the filter, which refuses the calls that make Landlock's rules. The hook comes last: it cannot be
     # removed, and would decide about what the other layers open as well.
     return {
-        LANDLOCK.name: _missing(lambda: landlock.restrict(allowed)),
+        FILE_RULES.name: _missing(lambda: _restrict_files(allowed)),
         SYSTEM_CALLS.name: _missing(syscalls.restrict),
         LIMITS.name: _missing(_check_limits),
         AUDIT_HOOK.name: _missing(lambda: audit.restrict(allowed)),
     }
+
+
+def _restrict_files(readable: Sequence[Path]) -> None:
+    try:
+        landlock.restrict(readable)
+    except OSError as error:
+        try:
+            broker.restrict(readable)
+        except OSError as other:
+            raise OSError(f"{error.strerror or error}, and {other.strerror or other}") from other
 
 
 def _missing(put_in_force: Callable[[], None]) -> str:

@@ -61,9 +61,9 @@ def choose_socket_folder() -> None:
     if len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER:
         return
     short = next((folder for folder in SHORT_FOLDERS if os.access(folder, os.W_OK | os.X_OK)), None)
-    given = tempfile.tempdir
+    previous = tempfile.tempdir
     try:
         tempfile.tempdir = short
         util.get_temp_dir()  # made once a process, and removed at its end
     finally:
-        tempfile.tempdir = given
+        tempfile.tempdir = previous

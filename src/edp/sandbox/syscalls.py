@@ -64,7 +64,7 @@ _ABSENT: dict[str, Numbers] = {
     "futex_wake": (454, 454), "futex_wait": (455, 455), "futex_requeue": (456, 456),
 }  # fmt: skip
 _WORD = 0xFFFFFFFF
-_NOT_READING = (
+NOT_READING = (
     os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
     # O_TMPFILE: a file without a name; O_PATH: a handle of any path, which Landlock does not check.
     | 0o20000000 | 0o10000000
@@ -132,8 +132,8 @@ def call_forms(own_pid: int) -> dict[str, CallForm]:
     """
     own, own_or_zero = Condition(0, _WORD, (own_pid,)), Condition(0, _WORD, (0, own_pid))
     return {
-        "open": CallForm((2, None), [[Condition(1, _NOT_READING, (0,))]]),
-        "openat": CallForm((257, 56), [[Condition(2, _NOT_READING, (0,))]]),
+        "open": CallForm((2, None), [[Condition(1, NOT_READING, (0,))]]),
+        "openat": CallForm((257, 56), [[Condition(2, NOT_READING, (0,))]]),
         "clone": CallForm((56, 220), [[Condition(0, _WORD & ~_THREAD_OPTIONS, (_THREAD,))]]),
         # A library that gives up ends its own process so (tkill: musl, main thread).
         "kill": CallForm((62, 129), [[own]]),

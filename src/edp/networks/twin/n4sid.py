@@ -230,10 +230,10 @@ class _Projections:
             )
         # Windows repeat the constant and, where a lever is held, its command: dependent columns leave directions in the
         # triangle that are rounding errors only, so each block is reduced to the directions above `SMALL`.
-        freed = _without(triangle[:, future:], _directions(triangle[:, :future]))
-        own, wanted = freed[:, :past], freed[:, past:]
-        left, sizes, _ = np.linalg.svd((_directions(own).T @ wanted).T, full_matrices=False)
-        by_past = np.asarray(np.linalg.lstsq(own, wanted, rcond=SMALL)[0].T, dtype=np.float64)
+        without_future = _without(triangle[:, future:], _directions(triangle[:, :future]))
+        own, across = without_future[:, :past], without_future[:, past:]
+        left, sizes, _ = np.linalg.svd((_directions(own).T @ across).T, full_matrices=False)
+        by_past = np.asarray(np.linalg.lstsq(own, across, rcond=SMALL)[0].T, dtype=np.float64)
         return _Projections(horizon, tuple(pairs), left, sizes, by_past)
 
     def model(self, order: int) -> dict[str, Doubles]:
