@@ -31,6 +31,7 @@ READERS = {
     "storage/ledger/store.py": "a round through JSON before a comparison",
     "sim/data_set.py": "a round through JSON before a comparison",
     "testing/networks.py": "a round through JSON before a comparison",
+    "sandbox/broker.py": "messages between processes",
     "sandbox/protocol.py": "messages between processes",
     "sandbox/sandbox.py": "messages between processes",
     "sandbox/sandbox_worker.py": "messages between processes",
