@@ -125,10 +125,12 @@ def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
 
     Example: `edp search status studies/first`
     """
+    from edp.storage.study_file import reading_parts
     from edp.workflows.search.study_log import look_at
 
     progress = look_at(study)
-    emit(as_json, progress, lambda: _show_status(progress))
+    with reading_parts(study):
+        emit(as_json, progress, lambda: _show_status(progress))
 
 
 @app.command("report")

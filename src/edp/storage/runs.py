@@ -18,6 +18,7 @@ from typing import Any
 
 from edp import __version__
 from edp.errors import BusyError, StorageError
+from edp.storage.folders import check_kind
 from edp.storage.locks import check_held, hold
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
 from edp.storage.reading import object_with, read_object
@@ -60,10 +61,11 @@ class RunFolder:
 
     Raises:
         BusyError: another process holds it.
-        StorageError: the folder cannot be made.
+        StorageError: the folder cannot be made, or is one of another kind, such as a store.
     """
 
     def __init__(self, path: str | Path) -> None:
+        check_kind(path, "run", "study", "fleet", what="a run")
         self.path = make_folder(path)
         try:
             self._lock = hold(self.path / ".lock")

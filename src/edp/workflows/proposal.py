@@ -22,6 +22,7 @@ from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.signals import Kind
 from edp.storage import make_folder, write_bytes
+from edp.storage.folders import check_kind
 from edp.storage.paths import is_file_at, is_link_at, is_there, status_of
 from edp.workflows.proposal_files import (
     DATA,
@@ -245,6 +246,7 @@ def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool =
         StorageError: one is there already and may not be replaced, or cannot be written.
     """
     out = Path(folder)
+    check_kind(out, what="edp init")
     paths = [out / name for name in proposal.files]
     there = [path for path in paths if is_there(path) or is_link_at(path)]
     if there and not overwrite:

@@ -28,7 +28,9 @@ from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.recording import Recording
 from edp.sandbox.helpers import Helpers
 from edp.signals import Channel
-from edp.storage import check_writable, write_bytes
+from edp.storage import check_writable, remove_unfinished, write_bytes
+from edp.storage.folders import check_kind
+from edp.storage.locks import holding
 from edp.storage.paths import is_there
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
@@ -88,20 +90,23 @@ def fit_monitor(
     Raises:
         EdpError: runs or logs that cannot be used, or too few hours for the promise, or a process died.
     """
+    check_kind(out, "monitor", what="edp monitor fit")
     check_writable(out)
-    bundles = [_network_of(run) for run in runs]
-    recordings = source.read()
-    with Helpers(workers or os.cpu_count() or 1, _died) as helpers:
+    with holding(Path(out) / ".lock", f"monitor folder '{out}'"):
+        remove_unfinished(Path(out))
+        bundles = [_network_of(run) for run in runs]
+        recordings = source.read()
+        with Helpers(workers or os.cpu_count() or 1, _died) as helpers:
 
-        def side_by_side(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
-            return helpers.ordered(partial(_in_one_thread, function), jobs)
+            def side_by_side(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
+                return helpers.ordered(partial(_in_one_thread, function), jobs)
 
-        fitted = fit_to_recordings(
-            recordings, experiment, bundles, note, side_by_side=map if helpers.workers == 1 else side_by_side
-        )
-    folder = save_monitor(fitted.monitor, out)
-    write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
-    return replace(fitted, folder=folder)
+            fitted = fit_to_recordings(
+                recordings, experiment, bundles, note, side_by_side=map if helpers.workers == 1 else side_by_side
+            )
+        folder = save_monitor(fitted.monitor, out)
+        write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
+        return replace(fitted, folder=folder)
 
 
 def _in_one_thread(function: Callable[[Any], Any], job: Any) -> Any:
