@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 from rich.console import Console, ConsoleDimensions
@@ -21,6 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from edp.cli.ending import memory_message, out_of_memory, stopped_code
+from edp.cli.options import check_belonging
 from edp.cli.settings import setting_of
 from edp.errors import ConfigError, EdpError
 
@@ -333,8 +334,23 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
 @cache
 def _command(app: typer.Typer) -> Callable[..., Any]:
     """The commands with their options, read from the functions' signatures once a process."""
-    command: Callable[..., Any] = typer.main.get_command(app)
-    return command
+    command: Any = typer.main.get_command(app)
+    _check_options_of(command)
+    return cast(Callable[..., Any], command)
+
+
+def _check_options_of(command: Any) -> None:
+    """Let every command below a group refuse options without effect before it begins."""
+    for inner in getattr(command, "commands", {}).values():
+        _check_options_of(inner)
+    if not hasattr(command, "commands"):
+        run = command.invoke
+
+        def invoke(context: typer.Context) -> Any:
+            check_belonging(context)
+            return run(context)
+
+        command.invoke = invoke
 
 
 def refuse_empty(words: Sequence[str]) -> None:

@@ -10,13 +10,15 @@ import typer
 
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
+from edp.cli.options import MOST_LOOPS
 from edp.storage.paths import full_path
 
 TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
 MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
 ControllerOption = Annotated[str, typer.Option("--controller", help="What moves the levers, such as pi or inversion.")]
 SeedsOption = Annotated[
-    int | None, typer.Option("--seeds", min=1, help="Number of loops, each along a reference of its own; default: 6.")
+    int | None,
+    typer.Option("--seeds", min=1, max=MOST_LOOPS, help="Number of loops, each of a reference of its own; default: 6."),
 ]
 PlantOption = Annotated[
     Path | None, typer.Option("--plant", help="Run folder of a twin, or an FMU (.fmu), that is the plant instead.")
@@ -94,8 +96,8 @@ def tune(
     plant: PlantOption = None,
     twin: TwinOption = None,
     predictor: PredictorOption = None,
-    trials: Annotated[int, typer.Option(min=1, help="Settings of the gains to try.")] = 40,
-    loops: Annotated[int, typer.Option(min=1, help="References that each of them is run along.")] = 4,
+    trials: Annotated[int, typer.Option(min=1, max=MOST_LOOPS, help="Settings of the gains to try.")] = 40,
+    loops: Annotated[int, typer.Option(min=1, max=MOST_LOOPS, help="References that each of them is run along.")] = 4,
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
     yes: YesOption = False,

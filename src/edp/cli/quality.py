@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import Steps, out, table
+from edp.cli.options import MOST_HOURS, within
+from edp.settings.bounds import above
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
 AtMostOption = Annotated[
     float | None,
     typer.Option(
-        "--at-most", help="Of a store, look at evenly spread stretches of at most so many hours, about; default: all."
+        "--at-most",
+        callback=within(above(0.0, MOST_HOURS)),
+        help="Of a store, look at evenly spread stretches of at most so many hours, about; default: all.",
     ),
 ]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
-from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 
 if TYPE_CHECKING:
     from edp.sim.data_set import Simulated, SimulationOrder
@@ -57,7 +57,7 @@ def simulate(
         list[str],
         typer.Option("--set", help="One key of a scenario file, such as masses=[12,30] or files.layout=speedgoat."),
     ] = [],  # noqa: B006
-    workers: Annotated[int, typer.Option(help="Number of processes; 0: one for each core.")] = 0,
+    workers: WorkersOption = 0,
     limit: Annotated[
         bool, typer.Option("--limit", help="Also compute the limit of predictability: limit.json.")
     ] = False,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
+from edp.cli.options import MOST_WORKERS
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def train(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     workers: Annotated[
-        int, typer.Option(min=0, help="Of the preset auto: parallel trainings; 0: one for each core.")
+        int, typer.Option(min=0, max=MOST_WORKERS, help="Of the preset auto: parallel trainings; 0: one for each core.")
     ] = 0,
     as_json: JsonFlag = False,
 ) -> None:

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import BEATEN, JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, within
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.settings.bounds import MIN_MINUTES, above, span
 from edp.storage.paths import full_path, is_file_at
 
 if TYPE_CHECKING:
@@ -26,10 +28,15 @@ def twin(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     start: Annotated[Path | None, typer.Option(help="Run folder of a twin that goes on with these recordings.")] = None,
-    workers: Annotated[int, typer.Option(min=0, help="Parallel trainings; 0: one for each core.")] = 0,
+    workers: Annotated[
+        int, typer.Option(min=0, max=MOST_WORKERS, help="Parallel trainings; 0: one for each core.")
+    ] = 0,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Of a choice without twin.kind: processor time of its networks at most; default: no bound."),
+        typer.Option(
+            callback=within(span(MIN_MINUTES, MOST_MINUTES)),
+            help="Of a choice without twin.kind: processor time of its networks at most; default: no bound.",
+        ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -102,9 +109,16 @@ def show_trained(trained: TrainedTwin) -> None:
 def rollout(
     run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
     log: Annotated[Path, typer.Argument(help="One log.")],
-    seconds: Annotated[float, typer.Option(help="Length of the free run.")] = 60.0,
+    seconds: Annotated[
+        float, typer.Option(callback=within(above(0.0, MOST_SECONDS)), help="Length of the free run.")
+    ] = 60.0,
     start_s: Annotated[
-        float | None, typer.Option("--from", help="Start in the log, in seconds; default: as early as possible.")
+        float | None,
+        typer.Option(
+            "--from",
+            callback=within(span(0.0, MOST_SECONDS)),
+            help="Start in the log, in seconds; default: as early as possible.",
+        ),
     ] = None,
     measured: Annotated[list[str], typer.Option(help="A channel that stays measured; give it again for more.")] = [],  # noqa: B006
     file: Annotated[
