@@ -32,6 +32,7 @@ from edp.networks.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, read_json, write_bytes, write_json
 from edp.storage.headers import ARRAYS_BYTES, HASH, arrays_digest, header_digest
+from edp.storage.runs import unfinished_text
 
 SCHEMA = 8
 INTEGER_SCHEMA = 9
@@ -230,9 +231,8 @@ def _bundle_folder(folder: str | Path) -> Path:
     if os.path.lexists(path / "twin" / "twin.json"):
         raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
     if not os.path.lexists(path / HEADER):
-        if (Path(path) / "run.json").is_file():
-            raise BundleError(f"'{path}' holds a training that is not finished; give the same edp train again to go on")
-        raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
+        missing = f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote"
+        raise BundleError(unfinished_text(path) or missing)
     return path
 
 

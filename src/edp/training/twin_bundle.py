@@ -23,6 +23,7 @@ from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_json, write_json
 from edp.storage.headers import HASH, header_digest
 from edp.storage.memory import check_setting
+from edp.storage.runs import unfinished_text
 from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, write_arrays
 
 SCHEMA = 2
@@ -150,7 +151,8 @@ def load_twin(folder: str | Path) -> TwinBundle:
     """
     path = _twin_folder(folder)
     if not os.path.lexists(path / HEADER):
-        raise BundleError(f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote")
+        missing = f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote"
+        raise BundleError(unfinished_text(path) or missing)
     with as_damage(path):
         header = object_with(read_json(path / HEADER), ("schema",), f"'{path / HEADER}'")
         schema = header["schema"]

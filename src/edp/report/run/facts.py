@@ -18,6 +18,7 @@ from edp.report.common.wording import decimals_for, listed, number, percent
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
+from edp.storage.runs import unfinished_text
 
 NETWORK = "network"
 TRUTH = "truth"
@@ -298,7 +299,8 @@ def headline(facts: Facts) -> str:
     samples = main_horizon(facts)
     rows = comparison_rows(facts)
     if samples is None or not any(row["is_network"] for row in rows):
-        return f"This run has no scores yet; `edp evaluate {facts.folder}` makes them."
+        missing = f"This run has no scores yet; `edp evaluate {facts.folder}` makes them"
+        return f"{unfinished_text(facts.folder) or missing}."
     beaten = beaten_by(facts.scores, minutes_of(facts.folder)) if facts.scores else None
     if beaten is not None:
         return beaten.sentence()

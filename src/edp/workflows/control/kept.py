@@ -33,6 +33,7 @@ from edp.sim.machine.machine_checks import MACHINE_FILE
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, object_with, read_json, write_bytes, write_json
 from edp.storage.headers import HASH, header_digest
+from edp.storage.runs import unfinished_text
 from edp.training.bundle import as_damage, check_hash, read_arrays, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
@@ -128,7 +129,8 @@ def load_kept(run: str | Path) -> KeptController:
     folder = path / KEPT
     if not (folder / HEADER).is_file():
         raise StorageError(
-            f"'{path}' has no {KEPT}/{HEADER}: it is no finished run of edp control, or one of an earlier version; run "
+            unfinished_text(path)
+            or f"'{path}' has no {KEPT}/{HEADER}: it is not a run of edp control, or one of an earlier version; run "
             "edp control again, in a new folder"
         )
     with as_damage(folder):
