@@ -24,7 +24,7 @@ from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_json, write_json
-from edp.storage.headers import HASH, header_digest
+from edp.storage.headers import HASH
 from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
     Bundle,
@@ -33,6 +33,7 @@ from edp.training.bundle import (
     load_bundle,
     read_arrays,
     save_bundle,
+    sealed,
     write_arrays,
 )
 from edp.training.twin_bundle import HEADER as TWIN_HEADER
@@ -87,7 +88,7 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         remove_dictionary(path)
     else:
         save_dictionary(monitor.diagnosis, path)
-    write_json(path / HEADER, header | {HASH: header_digest(header)})
+    write_json(path / HEADER, sealed(header))
     _remove_old(path, entry["file"], written)
     return path
 

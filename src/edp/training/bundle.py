@@ -27,8 +27,9 @@ from edp.ir.rls import Adaptation
 from edp.ir.w8a16 import Formats
 from edp.ir.w8a16.quantise import weights_of
 from edp.networks.integer import IntegerPredictor
-from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain
+from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain, unknown_parts
 from edp.networks.predictor import Predictor
+from edp.registry import missing_parts, origins_in
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, read_json, write_bytes, write_json
 from edp.storage.headers import ARRAYS_BYTES, HASH, arrays_digest, header_digest
@@ -43,7 +44,7 @@ UNHASHED = {2: SCHEMA, 3: INTEGER_SCHEMA, 4: ADAPTED_SCHEMA}
 """Schemas from before the header had a hash, and what they became."""
 REWORDED = {5: SCHEMA, 6: INTEGER_SCHEMA, 7: ADAPTED_SCHEMA}
 """Schemas with the keys `lesson` for ``strategy`` and `rest` for ``dead_zone``, and what they became."""
-HEADER = "bundle.json"
+HEADER, PLUGINS = "bundle.json", "plugins"
 ARRAYS = ("weights", "integers", "adaptation")
 """Beginnings of the names of a bundle's files of arrays."""
 MOST_RATE_HZ, MOST_BITS = 1e6, 64
@@ -145,7 +146,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
-    write_json(path / HEADER, header | {HASH: header_digest(header)})
+    write_json(path / HEADER, sealed(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken bundle.
     for old in (file for what in ("weights", "integers", "adaptation") for file in path.glob(f"{what}-*.safetensors")):
         if old.name not in referenced:
@@ -178,14 +179,32 @@ def load_bundle(folder: str | Path) -> Bundle:
         header = _read_header(path)
         _check_schema(header, path)
         check_hash(header, path / HEADER)
+        unknown = unknown_parts(header["model"])
+        if unknown:
+            raise BundleError(f"bundle '{path}': {'; '.join(unknown)}")
         return _assembled(header, path)
 
 
+def sealed(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a header with the plug-ins whose parts it names, and with its hash."""
+    plugins = origins_in(header)
+    complete = {**header, PLUGINS: plugins} if plugins else dict(header)
+    return complete | {HASH: header_digest(complete)}
+
+
 def check_hash(header: Mapping[str, Any], file: Path) -> None:
-    """Refuse a header that its hash does not fit."""
+    """Refuse a header that its hash does not fit, and one with parts of plug-ins that are not registered here.
+
+    Raises:
+        BundleError: one of both; the message names the package of a part.
+    """
     # The hash protects against damage and stray edits, not against an attacker: it has no key.
     if header.get(HASH) != header_digest(header):
         raise BundleError(f"'{file}' does not match its hash: it was cut off or changed by hand; restore the bundle")
+    built = {key: value for key, value in header.items() if key not in ("provenance", "scores")}
+    missing = missing_parts(header.get(PLUGINS), built)
+    if missing:
+        raise BundleError(f"'{file}': {'; '.join(missing)}")
 
 
 def upgrade_bundle(folder: str | Path) -> Path:
@@ -207,7 +226,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
         upgraded = _reworded(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
         _assembled(upgraded, path)
-    write_json(path / HEADER, upgraded | {HASH: header_digest(upgraded)})
+    write_json(path / HEADER, sealed(upgraded))
     return path
 
 

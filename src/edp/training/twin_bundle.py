@@ -21,10 +21,10 @@ from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_json, write_json
-from edp.storage.headers import HASH, header_digest
+from edp.storage.headers import HASH
 from edp.storage.memory import check_setting
 from edp.storage.runs import unfinished_text
-from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, write_arrays
+from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, sealed, write_arrays
 
 SCHEMA = 2
 GROUNDED = 3
@@ -105,7 +105,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     }
     if bundle.ground is not None:
         header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
-    write_json(path / HEADER, header | {HASH: header_digest(header)})
+    write_json(path / HEADER, sealed(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken twin.
     for old in path.glob("weights-*.safetensors"):
         if old.name != entry["file"]:

@@ -32,9 +32,8 @@ from edp.sim.environment import NominalMachine
 from edp.sim.machine.machine_checks import MACHINE_FILE
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, object_with, read_json, write_bytes, write_json
-from edp.storage.headers import HASH, header_digest
 from edp.storage.runs import unfinished_text
-from edp.training.bundle import as_damage, check_hash, read_arrays, write_arrays
+from edp.training.bundle import as_damage, check_hash, read_arrays, sealed, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 KEPT, HEADER, MACHINE, TWIN = "controller", "controller.json", "machine.toml", "twin"
@@ -110,7 +109,7 @@ def keep_controller(
         "twin": twin is not None,
         "arrays": write_arrays(folder, "arrays", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()})),
     }
-    write_json(folder / HEADER, header | {HASH: header_digest(header)})
+    write_json(folder / HEADER, sealed(header))
     for old in folder.glob("arrays-*.safetensors"):
         if old.name != header["arrays"]["file"]:  # type: ignore[index]
             old.unlink(missing_ok=True)
