@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import BEATEN, JsonFlag, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, end_with, out, progress, show_verdict, table, verdict_facts
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.twin import FitDisplay, score_table
 
@@ -39,7 +39,7 @@ def identify(
     Example: `edp identify logs --out mine.toml --machine measured.toml`
     """
     from edp.config.twin import load_twin_experiment
-    from edp.evaluation.guard import machine_beaten_by
+    from edp.evaluation.guard import machine_verdict
     from edp.workflows.identify import identify as run_identify
 
     experiment = None
@@ -52,15 +52,14 @@ def identify(
             source_of(data, signal_map, repair), file, machine, experiment, run, display.on_event, display.on_step
         )
     numbers = [row.plain() for row in result.rows]
-    beaten = machine_beaten_by(result.scores)
+    verdict = machine_verdict(result.scores)
     facts = {
         "machine": str(file), "numbers": numbers, "models": result.scores, "notes": result.notes,
-        "beaten_by": None if beaten is None else beaten.label,
+        **verdict_facts(verdict),
     }  # fmt: skip
 
     def show() -> None:
-        if beaten is not None:
-            out.print(beaten.sentence(), style="bold red")
+        show_verdict(verdict)
         number_table(result)
         score_table(result.scores)
         for note in result.notes:
@@ -69,8 +68,7 @@ def identify(
         out.print(f"next: edp simulate data/mine --machine {file}")
 
     emit(as_json, facts, show)
-    if beaten is not None:
-        raise typer.Exit(BEATEN)
+    end_with(verdict)
 
 
 def number_table(result: Identified) -> None:

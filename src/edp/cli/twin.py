@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import BEATEN, JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, duration, emit, end_with, out, progress, show_verdict, table, verdict_facts
 from edp.cli.train import MapOption, RepairOption, source_of
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def twin(
     Example: `edp twin data/m22 --out runs/twin`
     """
     from edp.config.twin import load_twin_experiment, with_budget
-    from edp.evaluation.guard import twin_beaten_by
+    from edp.evaluation.guard import twin_verdict
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
 
@@ -57,17 +57,16 @@ def twin(
         source = source_of(data, signal_map, repair)
         trained = train_twin(source, experiment, folder, display.on_event, display.on_step, workers, start)
     seconds = trained.bundle.provenance["seconds"]
-    beaten = twin_beaten_by(trained.scores)
+    verdict = twin_verdict(trained.scores)
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
-    facts["beaten_by"] = None if beaten is None else beaten.label
+    facts |= verdict_facts(verdict)
     facts["candidates"] = candidates = read_candidates(folder)
 
     if trained.bundle.ground is not None:
         facts["ground"] = trained.bundle.provenance.get("ground")
 
     def show() -> None:
-        if beaten is not None:
-            out.print(beaten.sentence(), style="bold red")
+        show_verdict(verdict)
         if candidates:
             candidate_table(candidates)
             out.print(f"chosen: {choice_sentence(candidates)}")
@@ -78,8 +77,7 @@ def twin(
         out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
 
     emit(as_json, facts, show)
-    if beaten is not None:
-        raise typer.Exit(BEATEN)
+    end_with(verdict)
 
 
 def show_trained(trained: TrainedTwin) -> None:
