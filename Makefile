@@ -78,7 +78,7 @@ bench: $(READY) ## every benchmark, quick
 system-packages: ## packages of the system that only some checks need: chromium for pages, ffmpeg for films, octave for MAT fixtures and MATLAB code, compilers, QEMU and Wine for exported code
 	-$(if $(filter 0,$(shell id -u)),,sudo) apt-get update --quiet --quiet
 	$(if $(filter 0,$(shell id -u)),,sudo) apt-get install --yes --no-install-recommends chromium ffmpeg octave octave-dev wine \
-		gcc libc6-dev clang libclang-rt-dev cmake cppcheck gcc-mingw-w64-x86-64 wine64 gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
+		gcc libc6-dev valgrind clang libclang-rt-dev cmake cppcheck gcc-mingw-w64-x86-64 wine64 gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 
 clean: ## remove .venv and caches; runs, data and demo stay
 	rm -rf .venv .venv-docs build dist site src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shutil
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +18,12 @@ from edp.storage import make_folder, read_json, write_json
 from edp.storage.runs import command_line, environment
 
 RESULTS = Path(__file__).parent / "results"
+TIMES, COUNTS = (
+    ("s", "ms", "us", "s of motion"),
+    ("instructions", "cycles", "bytes", "MB", "alarms", "networks", "starts"),
+)
+COSTS = frozenset({*TIMES, *COUNTS, "mm", "mm/s", "m/s rms", "deg", "sigma", "V", "raw", "RMSE"})
+"""Units of which less is better."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +52,43 @@ class Verdict:
 
 
 def verdict(name: str, ours: float, rival: float, goal: str, unit: str, quick: bool) -> Verdict:
-    """Judge ``ours / rival`` against `goal`, for example ``<= 0.6``."""
+    """Compare ``ours / rival`` with `goal`, for example ``<= 0.6``.
+
+    Raises:
+        ValueError: the goal asks for more of a cost; then `ours` and `rival` are interchanged.
+    """
     sign, bound = goal.split()
+    if unit in COSTS and sign == ">=":
+        raise ValueError(f"verdict {name!r}: got goal '{goal}', but less {unit} is better; interchange the figures")
     ratio = ours / rival if rival else float("inf")
     met = ratio <= float(bound) if sign == "<=" else ratio >= float(bound)
     return Verdict(name, ours, rival, ratio, goal, met, unit, quick)
 
 
-def parser(description: str) -> argparse.ArgumentParser:
-    """Arguments that every benchmark takes."""
-    made = argparse.ArgumentParser(description=description)
+class BenchmarkParser(argparse.ArgumentParser):
+    """Parser of the arguments of a benchmark that runs programs of the system.
+
+    Args:
+        description: text of ``--help``.
+        programs: names of the programs; without one of them the benchmark ends before it begins.
+    """
+
+    def __init__(self, description: str, programs: Sequence[str] = ()) -> None:
+        super().__init__(description=description)
+        self.programs = tuple(programs)
+
+    def parse_args(self, *given: Any, **options: Any) -> Any:
+        """Return the arguments, or end with exit code 0 and a message that names the missing programs."""
+        arguments = super().parse_args(*given, **options)
+        if missing := [program for program in self.programs if shutil.which(program) is None]:
+            print(f"skipped: {', '.join(missing)} not found; `make system-packages` installs the programs")
+            raise SystemExit(0)
+        return arguments
+
+
+def parser(description: str, programs: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Return a parser with the arguments of every benchmark; see `BenchmarkParser`."""
+    made = BenchmarkParser(description, programs)
     made.add_argument("--quick", action="store_true", help="under a minute; figures are only indicative")
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--data", type=Path, default=None, help="folder for simulated data, kept between runs")
@@ -88,12 +123,24 @@ def finish(script: str, verdicts: Sequence[Verdict], seed: int, details: object 
             "command": command_line(),
             "date": time.strftime("%Y-%m-%d"),
             "seed": seed,
+            "commit": commit(),
             "environment": environment(0),
             "verdicts": plain,
             "details": details,
         }
         write_json(RESULTS / f"{script}.json", kept)
     print(json.dumps(plain if len(plain) != 1 else plain[0]), flush=True)
+
+
+def commit() -> str:
+    """Return the commit of the sources, with ``+`` if files differ from it, or an empty text outside a checkout."""
+    try:
+        given = {"cwd": RESULTS, "check": True, "capture_output": True, "text": True}
+        name = subprocess.run(["git", "rev-parse", "HEAD"], **given).stdout.strip()
+        changed = subprocess.run(["git", "status", "--porcelain", "--", "..", "../../src"], **given).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return name + ("+" if changed else "")
 
 
 def finite(value: Any) -> Any:

@@ -35,6 +35,8 @@ from edp.signals import TABLE_A1, Kind
 from edp.training.bundle import Bundle
 from embedded_step import BOARD, M4, make, on_board, sources_of, whole
 
+PROGRAMS = ("arm-none-eabi-gcc", "arm-none-eabi-objdump", "qemu-system-arm")
+
 QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting-config", "enable=on,target=native")
 TRACE = ("-singlestep", "-d", "exec,nochain", "-D", "/dev/stderr")
 PROGRAM = """
@@ -215,7 +217,7 @@ def parts_of(bundle: Bundle) -> tuple[int, int]:
 
 
 def main() -> None:
-    made = parser(__doc__ or "")
+    made = parser(__doc__ or "", PROGRAMS)
     made.add_argument("--fit", action="store_true", help="print two numbers of each format, fitted")
     arguments = made.parse_args()
     rows, ratios = [], collections.defaultdict(list)

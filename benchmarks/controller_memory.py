@@ -18,6 +18,8 @@ from edp.export.c.target import CTarget
 from edp.training.bundle import Bundle
 from embedded_step import on_board, sources_of, whole
 
+PROGRAMS = ("arm-none-eabi-gcc", "qemu-system-arm")
+
 PROGRAM = """
 #include <stdint.h>
 #include <stdio.h>
@@ -64,7 +66,7 @@ def measured(bundle: Bundle) -> tuple[int, int]:
 
 
 def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
+    arguments = parser(__doc__ or "", PROGRAMS).parse_args()
     rows = []
     for name, bundle in networks(arguments.quick, arguments.seed).items():
         counts = footprint(bundle.predictor)

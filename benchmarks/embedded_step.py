@@ -33,6 +33,8 @@ from edp.networks.integer import IntegerPredictor
 from edp.signals import TABLE_A1, Kind
 from edp.training.bundle import Bundle
 
+PROGRAMS = ("gcc", "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
+
 BOARD = Path(__file__).parents[1] / "tests/export/board"
 M4 = ("-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "--specs=rdimon.specs", "-nostartfiles")
 QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-icount", "shift=0")
@@ -134,7 +136,7 @@ def torch_us(bundle: Bundle, ticks: int) -> float:
 
 
 def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
+    arguments = parser(__doc__ or "", PROGRAMS).parse_args()
     sizes = SIZES[:1] if arguments.quick else SIZES
     rows, whole_rows, verdicts = [], [], []
     versions: dict[str, object] = {}

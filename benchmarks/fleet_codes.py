@@ -25,10 +25,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from common import Verdict, finish, in_folder, kept, parser, table, verdict
+from common import RESULTS, Verdict, finish, in_folder, kept, parser, table, verdict
 from edp.config.experiment import Experiment
 from edp.logs.store import is_store
 from edp.sim.machine.family import member_mass
+from edp.storage import read_json
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.personal import PersonalOrder, finetune_fleet
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set
@@ -181,9 +182,17 @@ def judge_many(few: Fleet, many: Fleet) -> None:
                 quick),
         verdict(f"no logs of C14, {many.machines} machines with codes / {few.machines} without", before["codes"],
                 before["family"], "<= 1", "mm/s", quick),
+        verdict(named.format(f"{last} min of C14, ") + " of transfer.json", errors["codes, code"][last], published(),
+                "<= 0.85", "mm/s", quick),
     ]  # fmt: skip
     spent = {f"{bench.machines}": kept(bench.work / f"trained_{name}.json", dict) for bench, name in networks}
     finish("fleet_codes_many", verdicts, few.seed, errors | {"spent": spent})
+
+
+def published() -> float:
+    """Return the error of the fully trained 400-machine network on C14 without logs, mm/s, from ``transfer.json``."""
+    verdicts, name = read_json(RESULTS / "transfer.json")["verdicts"], "network of many machines over direct transfer"
+    return float(next(one["ours"] for one in verdicts if one["name"] == name))
 
 
 def main() -> None:

@@ -38,6 +38,8 @@ from edp.networks.streaming import reset_where
 from edp.signals import TABLE_A1, Kind
 from edp.training.bundle import Bundle
 
+PROGRAMS = ("gcc",)
+
 PIECE = 1_000
 DAY = 8_640
 """Pieces of a day at 100 Hz."""
@@ -199,7 +201,7 @@ def make(seed: int) -> Bundle:
 
 
 def main() -> None:
-    options = parser(__doc__ or "")
+    options = parser(__doc__ or "", PROGRAMS)
     options.add_argument("--format", choices=list(FORMATS), default="float32")
     arguments = options.parse_args()
     pieces, lanes = (64, 8) if arguments.quick else (DAY, 64)

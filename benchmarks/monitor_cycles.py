@@ -35,6 +35,8 @@ from edp.export.monitor import (
 from edp.signals import Channel, Kind
 from embedded_step import BOARD, M4, instructions, run
 
+PROGRAMS = ("arm-none-eabi-gcc", "qemu-system-arm")
+
 BLOCK, SETTLE = 100, 1
 FITTED = (
     *((6, 30, 25, 20, 0), (12, 30, 25, 40, 3), (24, 30, 25, 60, 0), (24, 12, 8, 120, 1), (40, 40, 12, 60, 0)),
@@ -85,7 +87,7 @@ int main(void) {
 
 
 def main() -> None:
-    given = parser(__doc__ or "")
+    given = parser(__doc__ or "", PROGRAMS)
     given.add_argument("--fit", action="store_true", help="print cycles fitted to what was counted")
     arguments = given.parse_args()
     quick, seed = arguments.quick, arguments.seed

@@ -204,10 +204,10 @@ def show(rig: dict[str, Any], sets: dict[str, Any], quick: bool) -> list[Verdict
             keys = list(next(iter(rig.values()))[what])
             table(["detector", *keys], [[name, *(row[what][key] for key in keys)] for name, row in rig.items()])
         for fault, goal in GOALS.items():
-            ours = lowest(rig["edp.monitor"]["area"], fault)
-            result.append(verdict(f"rig, {fault}: lowest area of a grade", ours, goal, ">= 1", "area", quick))
-            ours = lowest(rig["edp.monitor"]["control"], fault)
-            result.append(verdict(f"rig, {fault}: against other times", ours, goal, ">= 1", "area", quick))
+            # An area that healthy cycles of other times reach, too, shows the time of recording, not the fault.
+            ours = min(lowest(rig["edp.monitor"][what], fault) for what in ("area", "control"))
+            name = f"rig, {fault}: lowest area of a grade, healthy cycles of the same and of other times"
+            result.append(verdict(name, ours, goal, ">= 1", "area", quick))
     for name, row in sets.items():
         detectors = [key for key in row if isinstance(row[key], dict)]
         keys = list(row["edp.monitor"]["found"])

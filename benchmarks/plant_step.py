@@ -31,6 +31,8 @@ from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import TwinBundle, plant_bundle
 
+PROGRAMS = ("gcc", "valgrind")
+
 RATE_HZ, UNITS = 100.0, 96
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-tree-loop-vectorize")
 WARM, COUNTED = 50, 200
@@ -57,7 +59,7 @@ int main(int argc, char **argv) {
 
 
 def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
+    arguments = parser(__doc__ or "", PROGRAMS).parse_args()
     channels = m22_channels()
     rows, found = [], {}
     for name, bundle in {"twin": twin(channels, arguments.seed), "predictor": rival(channels, arguments.seed)}.items():

@@ -40,6 +40,8 @@ from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 from embedded_step import whole
 
+PROGRAMS = ("arm-none-eabi-gcc", "arm-none-eabi-nm", "arm-none-eabi-readelf")
+
 ROOT = Path(__file__).parents[1]
 PLUGINS = ROOT / "tests" / "plugins"
 KERNELS = ROOT / "src/edp/export/c/kernels.toml"
@@ -193,7 +195,7 @@ def write_kernels() -> None:
 
 
 def main() -> None:
-    made = parser(__doc__ or "")
+    made = parser(__doc__ or "", PROGRAMS)
     made.add_argument("--fit", action="store_true", help="measure the runtime anew, and fit the model's own code")
     arguments = made.parse_args()
     if arguments.fit:

@@ -48,7 +48,7 @@ from edp.workflows.train_evaluate import SimulationOrder, simulate_data_set
 
 RECORDINGS = 12
 CHANNELS = 120
-SECONDS, MEGABYTES, FASTER = 180.0, 4096.0, 5.0
+SECONDS, MEGABYTES, SHARE = 180.0, 4096.0, "<= 0.2"
 Call = Callable[[], float]
 
 
@@ -271,7 +271,7 @@ def main() -> None:
         [
             verdict(f"whole screening of {size}", wall, SECONDS, "<= 1", "s", chosen.quick),
             verdict("peak memory", peak, MEGABYTES, "<= 1", "MB", chosen.quick),
-            verdict("processor time: plain loop over ours", rival.seconds, busy, f">= {FASTER:g}", "s", chosen.quick),
+            verdict("processor time against a plain loop", busy, rival.seconds, SHARE, "s", chosen.quick),
         ],
         chosen.seed,
         {"stages_s": told["found"]["seconds"], "rival": rival.rows, "processor_s": busy},

@@ -105,6 +105,8 @@ SETS = {
     "emps.toml": LeagueSet("u", "q", "", "stroke", 20, AXIS),
     "sjoberg.toml": LeagueSet("u", "", "p", "velocity", 10),
 }
+GOALS = {"tanks.toml": 0.25, "emps.toml": 3.0, "sjoberg.toml": 0.55}
+"""Largest free-run error that was asked for, in the unit of the league (medians of five seeds)."""
 OUTSIDE = {
     "drive": OutsideSet(LeagueSet("u1", "", "z1", "velocity", 10), "coupled electric drives", "V", 0.02, (250, 500)),
     "ballbeam": OutsideSet(LeagueSet("X", "y", "", "stroke", 10), "ball on a beam", "m", 0.1, (500, 1000)),
@@ -272,6 +274,11 @@ def show(title: str, found: dict[str, Any], published: dict[str, float]) -> None
         print(f"seed {seed}: {found['ours'][seed]:.4g}; {row['chosen']}; intervals of 90 % hold {held}")
 
 
+def against_goal(title: str, data: str, found: dict[str, Any], unit: str, quick: bool) -> Verdict:
+    """Compare the median error with the goal that was set for this data set."""
+    return verdict(f"{title}: twin against its goal", found["median"], GOALS[data], "<= 1", unit, quick)
+
+
 def against_rivals(title: str, found: dict[str, Any], unit: str, quick: bool) -> Verdict:
     """The twin beside the best of its rivals."""
     best = min(found["rivals"], key=lambda rival: float(found["rivals"][rival]))
@@ -317,6 +324,7 @@ def run(given: Any, work: Path) -> None:
         found = summary(judged, seeds, factor, given.quick, work, name)
         show(entry["title"], found, entry["published"])
         verdicts += [*verdicts_of(entry, found, given.quick, ", twin"),
+                     against_goal(entry["title"], entry["data"], found, entry["unit"], given.quick),
                      against_rivals(entry["title"], found, entry["unit"], given.quick)]  # fmt: skip
         details[entry["title"]] = found
     for name, which in OUTSIDE.items() if given.outside else ():

@@ -7,9 +7,15 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import shown
+
+Number = TypeVar("Number", float, NDArray[np.floating])
 
 
 class Kind(StrEnum):
@@ -34,7 +40,11 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class KindFacts:
-    """SI unit, unit of reports with its factor (report = SI * factor), plausible SI limits, nominal SI size."""
+    """SI unit, unit of reports with its factor, plausible SI limits, nominal SI size.
+
+    Values (`to_report`) have the offset of the unit of reports, such as that of degrees Celsius. Differences have none:
+    errors, standard deviations, noise and widths of intervals are multiplied by `report_factor` alone.
+    """
 
     si_unit: str
     report_unit: str
@@ -42,6 +52,19 @@ class KindFacts:
     plausible: tuple[float, float]
     nominal: float
     bounded: bool = False
+
+    @property
+    def report_offset(self) -> float:
+        """Offset of the unit of reports, see `display_offset`."""
+        return display_offset(self.report_unit)
+
+    def to_report(self, value: Number) -> Number:
+        """Return a value, not a difference, in the unit of reports; `value` is in SI units."""
+        return value * self.report_factor + self.report_offset
+
+    def from_report(self, value: Number) -> Number:
+        """Return a value, not a difference, in SI units; `value` is in the unit of reports."""
+        return (value - self.report_offset) / self.report_factor
 
 
 _INF = float("inf")
@@ -115,6 +138,12 @@ UNITS: Mapping[str, Unit] = {
     "1": Unit((Kind.RATIO, Kind.GENERIC), 1.0),
     "%": Unit((Kind.RATIO,), 1e-2),
 }
+
+
+def display_offset(unit: str) -> float:
+    """Return what is added to a value (SI value * factor) of a unit that pages show: -273.15 for degrees Celsius."""
+    of_logs = UNITS.get(unit)
+    return -of_logs.offset / of_logs.factor if of_logs is not None and of_logs.offset else 0.0
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from edp.networks.predictor import ModelSpec, build_model
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
 from edp.storage import parse_toml
-from edp.training.bundle import HASH, HEADER, Bundle, blank_scaler, header_digest, save_bundle
+from edp.training.bundle import HASH, HEADER, Bundle, blank_scaler, content_digest, save_bundle
 
 Rng = np.random.Generator
 TIME = np.arange(60) / 100
@@ -357,7 +357,7 @@ def bundle(rng: Rng, folder: Path) -> Path:
         new = changed(header, rng)
         if isinstance(new, dict) and rng.integers(6):
             try:
-                new[HASH] = header_digest(new)
+                new[HASH] = content_digest(new)
             except ValueError:
                 new[HASH] = "0"
         (path / HEADER).write_text(json.dumps(new))

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import nct, norm, t
 
 from edp.stats import benjamini_hochberg, printed_p, thesis_plan, thesis_power, thesis_splits_analytical
 
@@ -69,6 +70,15 @@ def test_splits_are_capped_at_25_and_rounded_up():
     assert hard.analytical > 100
     mild = thesis_plan(1.694, 0.037, 1)
     assert mild.splits == max(mild.simulated, math.ceil(mild.analytical)) == 8
+
+
+@pytest.mark.parametrize(("splits", "delta"), [(2, 0.866), (3, 0.5), (10, 0.3)])
+def test_simulated_power_is_that_of_a_noncentral_t_variable_above_a_normal_quantile(splits, delta):
+    expected = nct.sf(1.644854, splits - 1, math.sqrt(splits) * delta)
+    assert thesis_power(splits, delta, 1.0, 1, experiments=40_000) == pytest.approx(expected, abs=0.01)
+    if splits == 2:
+        assert (expected, t.sf(1.644854, 1)) == pytest.approx((0.50, 0.17), abs=0.005)
+        assert norm.sf(1.644854 - math.sqrt(2) * delta) == pytest.approx(0.34, abs=0.005)
 
 
 def test_simulated_power_is_the_normal_one_where_the_deviation_is_known_well():

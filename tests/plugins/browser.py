@@ -6,6 +6,7 @@ Chromium is driven by its own protocol over two pipes, so that no further packag
 from __future__ import annotations
 
 import base64
+import importlib.util
 import itertools
 import json
 import os
@@ -176,8 +177,7 @@ class Browser:
 PAGE_BYTES = 3_000_000
 CHECKS = Path(__file__).with_name("page_checks.js")
 AXE = "EDP_AXE"
-"""Variable that names ``axe.min.js`` of axe-core; without it that of the site's builder, which `make docs` installs."""
-ROOT = Path(__file__).parents[2]
+"""Variable that names ``axe.min.js`` of axe-core; without it that of the package axe-core-python."""
 
 
 def check_page(browser: Browser, page: Path, calls: int = 0) -> None:
@@ -189,15 +189,16 @@ def check_page(browser: Browser, page: Path, calls: int = 0) -> None:
         calls: how many requests it may make; pages make none.
     """
     assert page.stat().st_size < PAGE_BYTES
+    faults = []
     for size, phone in ((DESK, False), (PHONE, True)):
         browser.open(page, size, phone)
         browser.run("window.dispatchEvent(new Event('beforeprint'))")
+        for dark in (False, True):
+            browser.size(*size, phone, dark)
+            faults += [f"{size[0]} px{', dark' if dark else ''}: {fault}" for fault in page_faults(browser)]
         assert browser.complaints() == []
         assert len(browser.requests()) == calls
-        assert browser.run("document.documentElement.scrollWidth <= document.documentElement.clientWidth"), size
-        faults = browser.run(CHECKS.read_text())
-        faults += serious_findings(browser)
-        assert not faults, "\n".join(faults)
+    assert not faults, "\n".join(faults)
     browser.open(page)
     links = browser.run("document.querySelectorAll('nav a').length")
     browser.press("Tab")
@@ -206,12 +207,25 @@ def check_page(browser: Browser, page: Path, calls: int = 0) -> None:
         assert browser.run("getComputedStyle(document.activeElement).outlineStyle !== 'none'"), "focus is not seen"
 
 
+def page_faults(browser: Browser) -> list[str]:
+    """Faults of the open page as it is shown now: those of ``page_checks.js``, and serious findings of axe-core."""
+    browser.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+    faults: list[str] = browser.run(CHECKS.read_text())
+    wide = browser.run("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+    if wide > 0:
+        wider = "[...document.body.querySelectorAll('*')].filter(n => n.scrollWidth > n.clientWidth + 1)"
+        node = browser.run(f"({wider}.pop() || document.body).outerHTML.slice(0, 120)")
+        faults.append(f"the page is {wide} px too wide: {node}")
+    return faults + serious_findings(browser)
+
+
 def serious_findings(browser: Browser) -> list[str]:
     """Serious and critical findings of axe-core on the open page, a sentence each; none where it is not installed."""
     script = axe_core()
     if script is None:
         return []
-    browser.run(script.read_text(encoding="utf-8") + "\n;true")
+    if not browser.run("'axe' in window"):
+        browser.run(script.read_text(encoding="utf-8") + "\n;true")
     found = browser.run("axe.run().then(result => JSON.stringify(result.violations))")
     return [
         f"{rule['id']} ({rule['impact']}): {rule['nodes'][0]['html'][:160]}"
@@ -223,7 +237,8 @@ def serious_findings(browser: Browser) -> list[str]:
 def axe_core() -> Path | None:
     """The script of axe-core; None where there is none."""
     named = os.environ.get(AXE)
-    return Path(named) if named else next((ROOT / ".venv-docs").rglob("axe.min.js"), None)
+    package = importlib.util.find_spec("axe_core_python")
+    return Path(named) if named else package and next(Path(str(package.origin)).parent.rglob("axe.min.js"), None)
 
 
 def chromium() -> str | None:

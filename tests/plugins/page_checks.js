@@ -2,7 +2,7 @@
 (() => {
   const faults = [];
   const say = (what, node) => faults.push(node ? `${what}: ${node.outerHTML.slice(0, 120)}` : what);
-  const shown = (node) => node.getClientRects().length > 0 && getComputedStyle(node).visibility !== "hidden";
+  const shown = (node) => node.getClientRects().length > 0 && node.checkVisibility({ visibilityProperty: true });
 
   if (!document.documentElement.lang) say("no language");
   if (!document.title.trim()) say("no title");
@@ -61,11 +61,54 @@
     if (drawing && node.closest("g[clip-path]")) continue; // words on cells, whose ground is not the page's
     const style = getComputedStyle(node);
     const ink = numbers(drawing ? style.fill : style.color);
-    const [a, b] = [light(ink), light(drawing ? [255, 255, 255] : ground(node))];
+    const [a, b] = [light(ink), light(ground(drawing || node))];
     const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
     const large = parseFloat(style.fontSize) >= 24 || (parseFloat(style.fontSize) >= 18.6 && Number(style.fontWeight) >= 600);
     const key = `${ink}/${node.className}`;
     if (ratio < (large ? 3 : 4.5) && !said.has(key)) { said.add(key); say(`contrast ${ratio.toFixed(2)}`, node); }
   }
+  // What is drawn or written at one place is not at another's: boxes, as far as their containers show them.
+  const visible = (node) => {
+    let { left, top, right, bottom } = node.getBoundingClientRect();
+    for (let at = node.parentElement; at; at = at.parentElement) {
+      if (getComputedStyle(at).overflow === "visible") continue;
+      const edge = at.getBoundingClientRect();
+      [left, top, right, bottom] = [Math.max(left, edge.left), Math.max(top, edge.top), Math.min(right, edge.right), Math.min(bottom, edge.bottom)];
+    }
+    return { left, top, right, bottom };
+  };
+  const lifted = (node) => {
+    for (let at = node; at && at !== document.body; at = at.parentElement) {
+      if (/absolute|fixed|sticky/.test(getComputedStyle(at).position)) return true;
+    }
+    return false;
+  };
+  const parts = [...document.querySelectorAll("figure, .figure, .wide, canvas, svg, table, button, select, input, output, h1, h2, h3, p, li, dt, dd, figcaption, legend, nav a, summary, pre, meter")]
+    .filter((node) => shown(node) && !node.closest("svg svg") && !lifted(node))
+    .map((node) => ({ node, box: visible(node) })).filter(({ box }) => box.right - box.left > 1 && box.bottom - box.top > 1);
+  parts.forEach((one, i) => parts.slice(i + 1).forEach((other) => {
+    if (one.node.contains(other.node) || other.node.contains(one.node)) return;
+    const across = Math.min(one.box.right, other.box.right) - Math.max(one.box.left, other.box.left);
+    const down = Math.min(one.box.bottom, other.box.bottom) - Math.max(one.box.top, other.box.top);
+    if (across > 1.5 && down > 1.5) say(`overlap of ${Math.round(across)} x ${Math.round(down)} with ${other.node.outerHTML.slice(0, 80)}`, one.node);
+  }));
+  // Drawings of plots have canvases that lie absolutely within them: each stays within its figure.
+  document.querySelectorAll("figure canvas, .figure svg[role=img]").forEach((node) => {
+    const [inner, outer] = [node.getBoundingClientRect(), node.closest("figure, .figure").getBoundingClientRect()];
+    if (shown(node) && (inner.right > outer.right + 1.5 || inner.left < outer.left - 1.5 || inner.bottom > outer.bottom + 1.5)) say("drawing leaves its figure", node);
+  });
+  // Words of a drawing that lie level do not cover each other.
+  document.querySelectorAll("svg[role=img]").forEach((drawing) => {
+    const level = [...drawing.querySelectorAll("text")].filter((text) => shown(text) && !text.hasAttribute("transform") && text.textContent.trim() && !text.closest("g[clip-path]"))
+      .map((text) => ({ text, box: text.getBoundingClientRect() }));
+    level.forEach((one, i) => level.slice(i + 1).forEach((other) => {
+      const across = Math.min(one.box.right, other.box.right) - Math.max(one.box.left, other.box.left);
+      const down = Math.min(one.box.bottom, other.box.bottom) - Math.max(one.box.top, other.box.top);
+      if (across > 3 && down > 5) say(`words "${one.text.textContent}" and "${other.text.textContent}" overlap`, drawing);
+    }));
+  });
+  document.querySelectorAll("td, th").forEach((cell) => {
+    if (shown(cell) && cell.textContent.trim().length > 3 && cell.getBoundingClientRect().width < 24) say("narrow cell", cell);
+  });
   return faults;
 })()

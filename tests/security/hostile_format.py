@@ -5,6 +5,7 @@ The sandbox's worker imports this module as it imports any registered format's.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -13,6 +14,7 @@ import sys
 import threading
 from pathlib import Path
 
+import native_probes
 import numpy as np
 
 from edp.logs.formats.base import FORMATS, RawLog, RawSignal
@@ -44,6 +46,17 @@ def _announced(megabytes: str) -> None:
     _allocate(megabytes)
 
 
+def handles() -> dict[str, str]:
+    """What each open handle of this process leads to."""
+    found = {}
+    for number in os.listdir("/proc/self/fd"):
+        try:
+            found[number] = os.readlink(f"/proc/self/fd/{number}")
+        except OSError:  # that of the listing itself
+            continue
+    return found
+
+
 def _threads(_: str) -> None:
     done = []
     threads = [threading.Thread(target=done.append, args=(k,)) for k in range(4)]
@@ -55,7 +68,7 @@ def _threads(_: str) -> None:
 
 
 def _layers(_: str) -> None:
-    raise ValueError(" and ".join(LAYERS))
+    raise ValueError(" and ".join(name for name, missing in LAYERS.items() if not missing))
 
 
 DEEDS = {
@@ -88,7 +101,7 @@ DEEDS = {
     "fail": lambda text: (_ for _ in ()).throw(KeyError(text)),
     "recursion": lambda text: _deep(text),
 }
-LAYERS: list[str] = []
+LAYERS: dict[str, str] = {}
 _lock_down = lockdown.lock_down
 
 
@@ -96,8 +109,8 @@ def _deep(text: str) -> None:
     _deep(text)
 
 
-def _note(*arguments: object) -> list[str]:
-    LAYERS[:] = _lock_down(*arguments)
+def _note(*arguments: object) -> dict[str, str]:
+    LAYERS.update(_lock_down(*arguments))
     return LAYERS
 
 
@@ -113,7 +126,7 @@ class HostileFormat:
 
     def read(self, path, signal_map):
         deed, argument, when = path.read_text().split("|")
-        if when == "open":
+        if when == "open" and deed in DEEDS:
             DEEDS[deed](argument)
 
         def load():
@@ -121,13 +134,21 @@ class HostileFormat:
                 DEEDS[deed](argument)
             return np.full(9, float(os.getpid()))
 
-        return RawLog(path, {"BmUp": RawSignal("BmUp", load, 9)}, rate_hz=100.0)
+        meta = {}
+        if deed == "probe":
+            order = json.loads(argument)
+            meta = native_probes.run(native_probes.Aims(**order["aims"]), tuple(order["groups"]))
+        if deed == "look":
+            variables = Path("/proc/self/environ").read_text()
+            meta = {"environment": dict(os.environ), "handles": handles(), "proc": variables}
+        return RawLog(path, {"BmUp": RawSignal("BmUp", load, 9)}, rate_hz=100.0, meta=meta)
 
     def write(self, recording, path, options):
         raise NotImplementedError
 
 
-FORMATS.register("hostile")(HostileFormat())
+PART = HostileFormat()
+FORMATS.register("hostile")(PART)
 if os.environ.get("EDP_TEST_START_S"):
     from edp.sandbox import allowance
 

@@ -25,7 +25,7 @@ from edp.training.bundle import (
     UNHASHED,
     Bundle,
     blank_scaler,
-    header_digest,
+    content_digest,
     load_bundle,
     save_bundle,
     upgrade_bundle,
@@ -57,7 +57,7 @@ def changed(folder, change, hashed):
     """Change a header in place; with `hashed` the hash is made to fit, as somebody who means it would do."""
     header = header_of(folder)
     change(header)
-    (folder / HEADER).write_text(json.dumps(header | ({HASH: header_digest(header)} if hashed else {})))
+    (folder / HEADER).write_text(json.dumps(header | ({HASH: content_digest(header)} if hashed else {})))
 
 
 def refused(folder, match):

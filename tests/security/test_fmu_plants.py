@@ -236,8 +236,8 @@ def test_too_many_variables_are_refused():
         (VARIABLES.replace('name="CylVels_2"', 'name="Other"'), "has no CylVels_2"),
         (VARIABLES.replace('name="CylStroke_3"', 'name="CylStrok_3"'), "has no CylStroke_3"),
         (VARIABLES.replace('name="BmUp"', 'name="BmUpp"'), "BmUp"),
-        (VARIABLES.replace('unit="Pa"', 'unit="bar"'), "'BmUp' is in bar; Pa must hold"),
-        (VARIABLES.replace('unit="m/s"', 'unit="mm/s"', 1), "'CylVels_1' is in mm/s; m/s must hold"),
+        (VARIABLES.replace('unit="Pa"', 'unit="bar"'), "'BmUp' is in bar; expected Pa"),
+        (VARIABLES.replace('unit="m/s"', 'unit="mm/s"', 1), "'CylVels_1' is in mm/s; expected m/s"),
         (VARIABLES.replace("<Real", "<Integer"), "real"),
     ],
 )
@@ -291,7 +291,7 @@ def test_the_commands_ask_first(edp, tmp_path, command):
     assert "nothing was run" in ended.said
     assert not (tmp_path / "run").exists()
     ended = edp(command, tmp_path / "run", option, path, "--yes")
-    assert "no archive" in ended.said
+    assert "is not a ZIP archive" in ended.said
     assert ended.code == 1
 
 

@@ -20,9 +20,9 @@ from rosbags.rosbag2 import Reader
 from edp.errors import DataError
 from edp.logs import read_recording, write_recording
 from edp.logs.formats.bag_guard import definitions_of
-from edp.logs.formats.unpack import unpack_to, unpacked_size
 from edp.recording import Recording
 from edp.signals import TABLE_A1
+from edp.storage.unpacking import unpack_to, unpacked_size
 
 BOMB = 1 << 32
 

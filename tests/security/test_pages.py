@@ -1,10 +1,12 @@
 """Pages run nothing but their own script and fetch nothing, whatever the names in them."""
 
+import re
 from importlib import resources
 
 import pytest
 
 from edp.report.animation import page as animation
+from edp.report.common.templates import template
 from edp.report.run import page
 
 ASSETS = resources.files("edp.report").joinpath("assets")
@@ -13,14 +15,24 @@ HOSTILE = ["</script><script>alert(1)</script>", "<!--<script>", "--></script>",
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_every_page_has_a_policy_before_anything_that_runs(name):
-    text = resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
-    head = text[: text.index("<style")]
-    assert 'http-equiv="Content-Security-Policy"' in head
+def test_every_page_begins_with_the_head_of_all_pages(name):
+    text = ASSETS.joinpath(name).read_text(encoding="utf-8")
+    begin = re.search(r"\{(?:\{|% call) head\(", text)
+    assert begin is not None
+    assert "<" not in re.sub(r"\{% macro .*?\{% endmacro %\}", "", text[: begin.start()], flags=re.DOTALL)
+    assert "<head>" not in text
+    assert "http-equiv" not in text
+
+
+def test_the_head_has_a_policy_before_anything_that_runs():
+    head = str(template("macros.jinja").module.head("a<b", "p{}"))
+    policy = head[: head.index("<style")]
+    assert 'http-equiv="Content-Security-Policy"' in policy
     for rule in ("default-src 'none'", "form-action 'none'", "base-uri 'none'", "img-src data:"):
-        assert rule in head
-    assert "http:" not in head
-    assert "https:" not in head
+        assert rule in policy
+    assert "http:" not in policy
+    assert "https:" not in policy
+    assert "a&lt;b" in policy
 
 
 def test_all_pages_are_looked_at():

@@ -19,7 +19,7 @@ import pytest
 import edp
 from edp.cli.doctor import machine
 from edp.storage.portable import lock_region
-from edp.workflows.live.run_live import _interrupts
+from edp.workflows.live.serve_live import _interrupts
 
 HIDE = """
 import importlib, os, pathlib, sys
@@ -138,7 +138,9 @@ GUARDED = {
     "cli/doctor.py": "hasattr",
     "data/screening/compiled.py": "hasattr",
     "sandbox/allowance.py": "an import that may fail, hasattr, and /proc, which is read first",
+    "sandbox/broker.py": "Linux only, by sys.platform",
     "sandbox/landlock.py": "Linux only, by sys.platform",
+    "sandbox/lockdown.py": "an import that may fail",
     "sandbox/processes.py": "Linux only, by sys.platform",
     "sandbox/sandbox.py": "hasattr; without forks a log has a process of its own",
     "sandbox/sandbox_worker.py": "the worker that forks, which is not started without forks",

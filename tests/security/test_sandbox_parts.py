@@ -15,7 +15,7 @@ from edp.logs import FORMATS, WriteOptions, read_recording, write_recording
 from edp.logs.sandboxed import plain_map
 from edp.logs.served import map_of
 from edp.recording import Recording
-from edp.sandbox import sandbox, syscalls, watch
+from edp.sandbox import sandbox, watch
 from edp.sandbox.audit import hook
 from edp.sandbox.protocol import HEADER_BYTES, packed, receive
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
@@ -94,19 +94,6 @@ def feed(data):
 def test_messages_beyond_their_bounds_are_refused(message):
     with pytest.raises(ValueError):  # noqa: PT011 - of many kinds
         receive(feed(message + bytes(64)), 16)
-
-
-def test_the_filter_fits_both_architectures():
-    for column, architecture in syscalls._ARCHITECTURES.values():
-        program = syscalls.filter_program(column, architecture, 77)
-        assert len(program) < 4096
-        for place, (code, true, false, _) in enumerate(program):
-            if code != syscalls._RETURN and code != syscalls._LOAD:
-                assert max(true, false) + place + 1 < len(program)
-    tables = (syscalls._NETWORK, syscalls._PROGRAMS, syscalls._SYSTEM, syscalls._FILES, syscalls._UNSEEN)
-    for column in (0, 1):
-        numbers = [entry[column] for table in tables for entry in table.values() if entry[column] is not None]
-        assert len(numbers) == len(set(numbers))
 
 
 def test_the_audit_hook_alone_refuses(tmp_path):

@@ -10,7 +10,7 @@ from edp.errors import BundleError
 from edp.networks.twin import TWINS
 from edp.networks.twin.recurrent import Recurrent
 from edp.testing.twins import sample_twin
-from edp.training.bundle import HASH, header_digest, write_arrays
+from edp.training.bundle import HASH, content_digest, write_arrays
 from edp.training.twin_bundle import HEADER, TwinBundle, load_twin, save_twin
 
 SPEC = Recurrent(units=4, prefix_ticks=5)
@@ -29,7 +29,7 @@ def changed(folder, change, hashed=True):
     """Change a header in place; with `hashed` the hash is made to fit, as somebody who means it would do."""
     header = header_of(folder)
     change(header)
-    (folder / HEADER).write_text(json.dumps(header | ({HASH: header_digest(header)} if hashed else {})))
+    (folder / HEADER).write_text(json.dumps(header | ({HASH: content_digest(header)} if hashed else {})))
 
 
 def refused(folder, match):

@@ -184,7 +184,7 @@ def test_the_leaderboard_has_every_question_of_every_result(staged):
 def test_a_result_that_lacks_something_is_refused(tmp_path):
     (tmp_path / "a.json").write_text('{"command": "a.py", "date": "2026-01-01", "seed": 0}', encoding="utf-8")
     with pytest.raises(ValueError, match=r"a\.json has no 'verdicts'"):
-        results.results_page(tmp_path)
+        results.results_page(tmp_path, [])
 
 
 def test_links_that_lead_nowhere_are_told(tmp_path):

@@ -21,7 +21,7 @@ from edp.networks.twin.greybox import GreyBox
 from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
 from edp.training import load_bundle, save_bundle, upgrade_bundle
-from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
+from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, content_digest
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.adaptation import adapt, fit_adaptation, replay, replay_run
 from edp.workflows.adaptation.with_twin import TwinMoves, correction_of, tuned_spec
@@ -88,7 +88,7 @@ def test_a_bundle_keeps_it_and_a_damaged_one_is_refused(run, adapted, tmp_path):
     save_bundle(bundle, copy)
     held = read_json(copy / "bundle.json")
     held["adaptation"]["horizons"] = [3]
-    write_json(copy / "bundle.json", held | {HASH: header_digest(held)})
+    write_json(copy / "bundle.json", held | {HASH: content_digest(held)})
     with pytest.raises(BundleError, match="another task"):
         load_bundle(copy)
     save_bundle(dataclasses.replace(bundle, adaptation=None), copy)
@@ -101,7 +101,7 @@ def test_an_adapted_bundle_of_the_former_words_is_upgraded_and_keeps_its_digest(
     held = read_json(copy / "bundle.json") | {"schema": 7}
     spec = held["adaptation"]["spec"]
     spec["rest"] = spec.pop("dead_zone")
-    write_json(copy / "bundle.json", held | {HASH: header_digest(held)})
+    write_json(copy / "bundle.json", held | {HASH: content_digest(held)})
     with pytest.raises(BundleError, match=r"schema 7, .*upgrade_bundle"):
         load_bundle(copy)
     upgrade_bundle(copy)

@@ -15,6 +15,7 @@ from edp.report import build_report
 from edp.report.common.wording import MISSING
 from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
+from edp.storage import read_json, write_json
 from edp.training import load_bundle
 from edp.workflows.auto import load_auto, train_auto
 from edp.workflows.auto.candidates import CANDIDATES, Amount, RecurrentTrial, spans_of, tree_plan
@@ -74,7 +75,7 @@ def test_the_promise_is_kept_on_the_test_part(result):
 def test_a_finished_run_is_read_again_and_another_one_refused(result):
     source, folder, _ = result
     before = (folder / "auto.json").read_bytes()
-    assert train_auto(source, load_auto(None, SET), folder).facts == json.loads(before)
+    assert train_auto(source, load_auto(None, SET), folder).facts == read_json(folder / "auto.json")
     with pytest.raises(StorageError, match="another run"):
         train_auto(source, load_auto(None, [*SET, "auto.seed=1"]), folder)
     assert (folder / "auto.json").read_bytes() == before
@@ -127,7 +128,7 @@ def test_a_changed_file_is_refused(result, tmp_path, change):
     source, folder, _ = result
     copied = shutil.copytree(folder, tmp_path / "run")
     facts = json.loads((copied / "auto.json").read_text())
-    (copied / "auto.json").write_text(json.dumps(facts | change))
+    write_json(copied / "auto.json", facts | change)
     with pytest.raises(StorageError, match=r"auto\.json"):
         train_auto(source, load_auto(None, SET), copied)
     with pytest.raises(StorageError, match=r"auto\.json"):
@@ -186,7 +187,7 @@ def test_candidates_side_by_side_give_the_same_bits(tmp_path, monkeypatch):
         left = sorted(path.name for path in (folder / "candidates").iterdir())
         assert left == ["recurrent"]  # whose checkpoint a stopped run goes on from
         assert not (folder / "candidates" / "recurrent" / "progress.json").exists()
-    facts = [json.loads((folder / "auto.json").read_text()) for folder in runs]
+    facts = [read_json(folder / "auto.json") for folder in runs]
     for each in facts:
         for candidate in each["candidates"].values():
             del candidate["seconds"]

@@ -18,7 +18,7 @@ from edp.training.bundle import (
     HASH,
     HEADER,
     Bundle,
-    header_digest,
+    content_digest,
     load_bundle,
     make_bundle,
     save_bundle,
@@ -98,7 +98,7 @@ def test_saving_again_replaces_header_and_weights(folder, tiny, tiny_bypass):
 
 def edit(folder, **changes):
     header = json.loads((folder / HEADER).read_text()) | changes
-    (folder / HEADER).write_text(json.dumps(header | {HASH: header_digest(header)}))
+    (folder / HEADER).write_text(json.dumps(header | {HASH: content_digest(header)}))
 
 
 def test_a_newer_schema_is_refused(folder):

@@ -53,7 +53,7 @@ def test_json_round_trip_and_refusals(tmp_path):
     write_json(path, {"a": [1, 2.5, None, "é"]})
     assert read_json(path) == {"a": [1, 2.5, None, "é"]}
     with pytest.raises(ValueError, match="JSON compliant"):
-        write_json(path, float("nan"))
+        write_json(path, {"a": float("nan")})
     assert read_json(path) == {"a": [1, 2.5, None, "é"]}
     path.write_text('{"a": [1, ')
     with pytest.raises(StorageError, match="not valid JSON"):

@@ -3,18 +3,46 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 _FIELDS = ("name", "ours", "rival", "ratio", "goal", "met", "unit")
 
 
-def results_page(folder: Path) -> str:
-    """A table a benchmark, with its command and date; no figure is typed by hand.
+@dataclass(frozen=True)
+class Goal:
+    """Goal that was asked of EDP.
+
+    Attributes:
+        asked: the goal in words.
+        result: name of the kept result, or an empty text if none answers it.
+        verdicts: names of the verdicts that answer it.
+        measured: why no kept verdict answers it.
+        test: test that holds it.
+    """
+
+    asked: str
+    result: str = ""
+    verdicts: tuple[str, ...] = ()
+    measured: str = ""
+    test: str = ""
+
+
+def read_goals(path: Path) -> list[Goal]:
+    """Return the goals of ``benchmarks/goals.toml``."""
+    rows = tomllib.loads(path.read_text(encoding="utf-8"))["goal"]
+    return [Goal(**row | {"verdicts": tuple(row.get("verdicts", ()))}) for row in rows]
+
+
+def results_page(folder: Path, goals: Sequence[Goal]) -> str:
+    """Return a page with one table per benchmark, its command and its date; no figure is typed by hand.
 
     Args:
-        folder: of the JSON files that benchmarks write.
+        folder: folder of the JSON files that benchmarks write.
+        goals: goals that were asked; a table of them comes first.
 
     Raises:
         ValueError: a file lacks what every result has.
@@ -34,6 +62,7 @@ def results_page(folder: Path) -> str:
         f"{len(files)} files, {len(verdicts)} questions, {met} goals met, {len(verdicts) - met} missed. Files of one "
         "benchmark with other arguments repeat questions, so the count is no score.",
         "",
+        *_goals(goals, {path.stem: result["verdicts"] for path, result in results}),
         "| Benchmark | Questions | Met | Date |",
         "|---|---:|---:|---|",
     ]
@@ -56,6 +85,20 @@ def results_page(folder: Path) -> str:
         ]
         lines += _table(result["verdicts"])
     return "\n".join(lines) + "\n"
+
+
+def _goals(goals: Sequence[Goal], kept: Mapping[str, list[Mapping[str, Any]]]) -> list[str]:
+    rows = ["| Goal that was asked | Outcome | Measured by |", "|---|---|---|"]
+    for goal in goals:
+        outcomes = [one["met"] for one in kept.get(goal.result, []) if one["name"] in goal.verdicts]
+        if goal.result:
+            outcome = "met" if all(outcomes) else "**missed**"
+            outcome += f" ({sum(outcomes)} of {len(outcomes)})" if 0 < sum(outcomes) < len(outcomes) else ""
+            source = f"[{goal.result}](#{goal.result})"
+        else:
+            outcome, source = ("held by a test", f"`{goal.test}`") if goal.test else ("not kept", goal.measured)
+        rows.append(f"| {goal.asked} | {outcome} | {source} |")
+    return [*rows, ""]
 
 
 def _checked(path: Path) -> Mapping[str, Any]:

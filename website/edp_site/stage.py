@@ -65,7 +65,9 @@ def _made(root: Path) -> dict[str, Callable[[], str]]:
         "reference/parts.md": parts.parts_page,
         "reference/formats.md": formats.formats_page,
         "reference/c.md": formats.c_page,
-        "leaderboard.md": lambda: results.results_page(root / "benchmarks" / "results"),
+        "leaderboard.md": lambda: results.results_page(
+            root / "benchmarks" / "results", results.read_goals(root / "benchmarks" / "goals.toml")
+        ),
         "decisions/index.md": lambda: decisions_page(root / "docs" / "decisions"),
     }
 

@@ -44,8 +44,9 @@ from edp.cli import (
 )
 from edp.cli.console import err, run_app
 from edp.cli.ending import stop_on_request
-from edp.cli.slow import tell_of_slow_logs
+from edp.cli.slow import tell_of_missing_layers, tell_of_slow_logs
 from edp.cli.threads import use_one_blas_thread
+from edp.cli.unsealed import tell_of_unsealed_files
 from edp.workflows import load_plugins
 
 app = typer.Typer(
@@ -117,4 +118,7 @@ def main() -> None:
         # An old terminal must not end a training because of a Greek letter.
         sys.stdout.reconfigure(errors="backslashreplace")
     tell_of_slow_logs()
-    sys.exit(run_app(app))
+    tell_of_missing_layers()
+    code = run_app(app)
+    tell_of_unsealed_files()
+    sys.exit(code)

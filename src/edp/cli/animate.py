@@ -11,6 +11,7 @@ import typer
 from edp.cli.console import JsonFlag, emit, out
 from edp.cli.train import MapOption
 from edp.errors import ConfigError
+from edp.storage.paths import full_path
 
 PAGES = (".html", ".htm")
 
@@ -67,7 +68,7 @@ def animate(
     (write_film if film else write_animation)(scene, target)
 
     def show() -> None:
-        out.print(f"animation: {target.resolve()}")
+        out.print(f"animation: {full_path(target)}")
 
     emit(as_json, {"animation": str(target)}, show)
 

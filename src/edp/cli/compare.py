@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.storage.paths import full_path
 
 TABLES = 4
 """Errors whose tables the terminal shows; the page has all."""
@@ -38,7 +39,7 @@ def compare(
             table(sheet.caption, sheet.heads(), sheet.texts())
         if len(comparison.measures) > TABLES:
             out.print(f"and {len(comparison.measures) - TABLES} more errors on the page")
-        out.print(f"page: {page.resolve()}")
+        out.print(f"page: {full_path(page)}")
 
     emit(as_json, {"page": str(page), **facts_of(comparison)}, show)
 

@@ -9,6 +9,7 @@ import typer
 
 from edp.cli.console import err
 from edp.errors import ConfigError
+from edp.storage.paths import is_there
 
 FMU_CODE = "An FMU holds native code, which edp loads and runs on this computer with your rights"
 
@@ -37,5 +38,5 @@ def ask_for_fmus(yes: bool, *plants: Path | None) -> None:
 
     for plant in plants:
         # Whether one that is not there may run is no question; what reads it says that it is missing.
-        if plant is not None and is_fmu(plant) and plant.exists() and not yes:
+        if plant is not None and is_fmu(plant) and is_there(plant) and not yes:
             ask(f"'{plant}': {FMU_CODE}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 import threading
@@ -14,7 +15,7 @@ from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -26,6 +27,8 @@ from edp.errors import ConfigError, EdpError
 if TYPE_CHECKING:
     from edp.evaluation.guard import ErrorVerdict
 
+UNFOLDED_COLUMNS = 100_000
+"""Width of output that is not a terminal."""
 KEPT_BREAK = re.compile(r"\n(?=  - )")
 """The line break that messages list several things with; any other may come from a name."""
 
@@ -54,6 +57,20 @@ class Terminal(Console):
         # Names of channels may look like markup.
         super().__init__(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
+    @property
+    def size(self) -> ConsoleDimensions:
+        """Size of the terminal; the size of a pipe or file is `COLUMNS` if set, otherwise wide enough for any row.
+
+        A row that is folded in a file can no longer be searched or cut into columns.
+        """
+        if self.is_terminal or "COLUMNS" in os.environ:
+            return super().size
+        return ConsoleDimensions(UNFOLDED_COLUMNS, 25)
+
+    @size.setter
+    def size(self, dimensions: tuple[int, int]) -> None:
+        self._width, self._height = dimensions
+
     def print(self, *objects: Any, **options: Any) -> None:
         """Print text, or a renderable of this module."""
         super().print(*(_shown(part) if isinstance(part, str) else part for part in objects), **options)
@@ -68,6 +85,8 @@ err = Terminal(stderr=True)
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON document to standard output and nothing else.")]
 INTERRUPTED = 130
+CLOSED_PIPE = 141
+"""Exit code where nobody reads the output any more: 128 and SIGPIPE."""
 _GAP = 2
 """Blanks between two columns of a table."""
 PATH_OPTIONS = frozenset(
@@ -308,6 +327,7 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
         command = partial(_command(app), prog_name="edp") if isinstance(app, typer.Typer) else app
         # The code of a command that raised typer.Exit; 130 after Ctrl-C; else None.
         code = command(standalone_mode=False)
+        sys.stdout.flush()  # a full disk or a closed pipe is told here, not by Python at its end
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:
@@ -318,6 +338,8 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         err.print("stopped; what was finished is on disk: give the same command again to go on")
         return stopped_code(INTERRUPTED)
+    except OSError as error:
+        return _say_system(error)
     except Exception as error:
         if out_of_memory(error):
             _say_error(memory_message(error))
@@ -350,6 +372,20 @@ def refuse_empty(words: Sequence[str]) -> None:
         if (not word and not behind_option) or (sign and not value and option in PATH_OPTIONS):
             what = option or (before if before in PATH_OPTIONS else "an argument")
             raise ConfigError(f"{what} is empty; give a path (. is the folder that you are in)")
+
+
+def _say_system(error: OSError) -> int:
+    """Say what the system refused, where no part of EDP has said it better, and return the exit code."""
+    if isinstance(error, BrokenPipeError):
+        # As of a program that SIGPIPE ends: who reads the output, such as `head`, wants no more of it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CLOSED_PIPE
+    where = f"'{os.fsdecode(error.filename)}'" if isinstance(error.filename, str | bytes) else "a file or the output"
+    _say_error(
+        f"cannot read or write {where}: {error.strerror or error}; free space, or give a place that you may read and "
+        "write"
+    )
+    return 1
 
 
 def _say_error(text: str) -> None:

@@ -10,6 +10,7 @@ import typer
 
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
+from edp.storage.paths import full_path
 
 TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
 MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
@@ -78,7 +79,7 @@ def control(
         for loop in run.content["loops"]:
             for warning in loop["warnings"]:
                 out.print(f"{loop['name']}: monitor from tick {warning['tick']}: {warning['text']}")
-        out.print(f"page: {run.page.resolve()}")
+        out.print(f"page: {full_path(run.page)}")
 
     emit(as_json, {"run": str(folder), "page": str(run.page), **run.content}, show)
 

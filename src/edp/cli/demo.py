@@ -12,6 +12,7 @@ from edp.cli import evaluate as evaluate_command
 from edp.cli import simulate as simulate_command
 from edp.cli import train as train_command
 from edp.cli.console import JsonFlag, duration, emit, out
+from edp.storage.paths import full_path
 
 # 180 min in 60 recordings: with 75 min the network's lead over ridge ARX was smaller (docs/findings.md).
 MINUTES = 180.0
@@ -48,7 +49,7 @@ def demo(
     def show() -> None:
         evaluate_command.score_table(scores)
         out.print(line)
-        out.print(f"done in {duration(seconds)}; open the report: {page.resolve()}")
+        out.print(f"done in {duration(seconds)}; open the report: {full_path(page)}")
         out.print(
             f"next: edp train YOUR_LOGS --map your_map.toml --out runs/first   (the bundle is in {run / 'bundle'})"
         )

@@ -20,6 +20,7 @@ import typer
 from edp import __version__
 from edp.cli.console import JsonFlag, emit, listing, out
 from edp.errors import EdpError
+from edp.storage.paths import is_folder_at
 
 BROKEN = 3
 """Exit code where something is missing or broken that edp cannot do without."""
@@ -77,13 +78,13 @@ def doctor(
     folder: Annotated[Path, typer.Argument(help="Where runs are to be written; its disk is looked at.")] = Path(),
     as_json: JsonFlag = False,
 ) -> None:
-    """Look at versions, optional parts, compilers, disk, memory and threads; say what is missing and what for.
+    """Look at versions, optional parts, the sandbox, compilers, disk, memory and threads; say what is missing.
 
     Runs none of the programs it looks for. Ends with exit code 3 where something is broken that edp cannot do without.
 
     Example: `edp doctor`
     """
-    checks = [*packages(), *machine(folder), reading(), *extras(), *programs()]
+    checks = [*packages(), *machine(folder), reading(), *sandbox_layers(), *extras(), *programs()]
     broken = [check for check in checks if check.state == "broken"]
 
     def show() -> None:
@@ -144,7 +145,7 @@ def machine(folder: Path) -> list[InstallationCheck]:
         ),
         _size("memory", free_bytes(), _LEAST_MEMORY, "training; free now"),
     ]
-    there = next((path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir()), Path("/"))
+    there = next((path for path in (folder.absolute(), *folder.absolute().parents) if is_folder_at(path)), Path("/"))
     try:
         checks.append(_size("disk", shutil.disk_usage(there).free, _LEAST_DISK, f"runs below {there}"))
     except OSError as error:
@@ -177,6 +178,23 @@ def reading() -> InstallationCheck:
         )
     state = "ok" if samples == 3 else "broken"
     return InstallationCheck("reading of logs", state, "a log was read apart", "everything that reads logs")
+
+
+def sandbox_layers() -> list[InstallationCheck]:
+    """State each layer of the sandbox that the reader of the last log found: in force, or why it is missing.
+
+    Looks at nothing by itself: `reading` reads a log.
+    """
+    from edp.sandbox.layers import LAYERS, seen_layers
+
+    seen = seen_layers()
+    checks = []
+    for layer in LAYERS:
+        reason = "not tried: no log was read" if seen is None else seen[layer.name]
+        needed_for = f"stops {layer.stops}" + (f"; {layer.needs}: {layer.advice}" if reason else "")
+        state = "missing" if reason else "ok"
+        checks.append(InstallationCheck(f"sandbox: {layer.name}", state, reason or "in force", needed_for))
+    return checks
 
 
 def extras() -> list[InstallationCheck]:

@@ -10,6 +10,7 @@ import typer
 from edp.cli.console import JsonFlag, emit, out, waiting
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.errors import ConfigError
+from edp.storage.paths import full_path, is_file_at
 
 
 def _list_forms(listing_asked: bool) -> None:
@@ -78,8 +79,8 @@ def export(
             out.print(str(file))
         if exported.without_adaptation:
             out.print(f"note: the form '{to}' holds the network alone; its adaptation is held by c")
-        out.print(f"written: {first.parent.resolve()}; read {first.name} first")
-        if (first.parent / "CMakeLists.txt").is_file():
+        out.print(f"written: {full_path(first.parent)}; read {first.name} first")
+        if is_file_at(first.parent / "CMakeLists.txt"):
             where, build = first.parent, first.parent / "build"
             out.print(f"next: cmake -S {where} -B {build} && cmake --build {build} && ctest --test-dir {build}")
 

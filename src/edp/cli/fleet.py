@@ -9,6 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.storage.paths import full_path
 
 app = typer.Typer(
     name="fleet",
@@ -43,7 +44,7 @@ def report(
     with progress(as_json) as shown:
         on_machine = MachineDisplay(shown, Steps(as_json), "judge").on_machine
         facts = report_fleet(workforce_of(workers, cluster, open_cluster), question, folder, on_machine)
-    page = (folder / PAGE).resolve()
+    page = full_path(folder / PAGE)
 
     def show() -> None:
         for sheet in (worst_sheet(facts), machine_sheet(facts)) if facts.rows else ():

@@ -13,6 +13,7 @@ from edp.cli.quality import AtMostOption, LogDisplay, show_between, show_lines, 
 from edp.cli.train import MapOption
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import DataError, EdpError
+from edp.storage.paths import full_path, is_file_at
 
 if TYPE_CHECKING:
     from edp.data.coverage import Coverage
@@ -90,7 +91,7 @@ def inspect(
     if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
 
-        build_coverage_page(coverage_facts, page, data.resolve().stem, quality)
+        build_coverage_page(coverage_facts, page, full_path(data).stem, quality)
 
     def show() -> None:
         few = len(quality.reports) == 1 and len(quality.reports[0].channels) <= MOST_CHANNELS
@@ -106,7 +107,7 @@ def inspect(
         elif why and covered:
             out.print(f"coverage: {why}")
         if coverage_facts is not None and page is not None:
-            out.print(f"page: {page.resolve()}")
+            out.print(f"page: {full_path(page)}")
         out.print(verdict_text(quality))
         if quality.proposed or (errors and signal_map is None and _undescribed(quality)):
             out.print(f"next: edp init {data}, which writes a signal map and settings; then edp train with both")
@@ -134,7 +135,7 @@ def _training(data: Path, signal_map: Path | None) -> str:
     described = signal_map or (data if data.suffix == ".toml" else None)
     settings = None if described is None else described.parent / SETTINGS
     mapped = "" if signal_map is None else f" --map {signal_map}"
-    if settings is None or not settings.is_file():
+    if settings is None or not is_file_at(settings):
         return f"edp train {data}{mapped} --out runs/first"
     return f"edp train {data}{mapped} --config {settings} --out {settings.parent / 'runs' / 'first'}"
 

@@ -12,6 +12,7 @@ from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, err, out
 from edp.cli.train import MapOption
 from edp.errors import ConfigError
+from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
     from edp.live.server import LiveServer
@@ -33,7 +34,9 @@ def live(
     ] = None,
     ros2: Annotated[bool, typer.Option("--ros2", help="Take joints and pressures of ROS 2.")] = False,
     monitor: Annotated[Path | None, typer.Option("--monitor", help="Monitor that raises the alarms.")] = None,
-    speed: Annotated[float, typer.Option(help="Factor on real time of a log, simulator or loop.")] = 1.0,
+    speed: Annotated[
+        float | None, typer.Option(help="Factor on real time of a log, simulator or loop; default: 1.")
+    ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 for a free one.")] = 0,
     bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     save: Annotated[Path | None, typer.Option("--save", help="Page (.html) to write at the end.")] = None,
@@ -43,8 +46,8 @@ def live(
     ] = False,
     until_end: Annotated[bool, typer.Option("--until-end", help="End with the source, for scripts.")] = False,
     machine: Annotated[str | None, typer.Option(help="Machine or machine file (.toml) of the side view.")] = None,
-    rate: Annotated[float | None, typer.Option(min=0.01, help="Rate (Hz) where no model says it.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulator or the loop.")] = 0,
+    rate: Annotated[float | None, typer.Option(help="Rate (Hz) where no model says it.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the simulator or the loop; default: 0.")] = None,
     excitation: Annotated[str | None, typer.Option(help="Operator of --sim; default: combined.")] = None,
     fault: Annotated[list[str], typer.Option("--fault", help="Fault of --sim, as edp simulate takes it.")] = [],  # noqa: B006
     controller: Annotated[str | None, typer.Option(help="Controller of --loop, such as pi.")] = None,
@@ -56,8 +59,12 @@ def live(
         Path | None, typer.Option("--predictor", help="Run folder of edp train that the controller of --loop uses.")
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Trust the native code of an FMU; do not ask.")] = False,
-    udp_bind: Annotated[str, typer.Option("--udp-bind", help="Address that --udp listens on.")] = "127.0.0.1",
-    free_s: Annotated[float, typer.Option("--free-s", min=0.1, help="Length (s) of a twin's free runs.")] = 60.0,
+    udp_bind: Annotated[
+        str | None, typer.Option("--udp-bind", help="Address that --udp listens on; default: 127.0.0.1.")
+    ] = None,
+    free_s: Annotated[
+        float | None, typer.Option("--free-s", help="Length (s) of a twin's free runs; default: 60.")
+    ] = None,
     signal_map: MapOption = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -67,39 +74,40 @@ def live(
 
     Example: `edp live runs/m22 --log data/m22/m22_000_combined.parquet --monitor monitors/m22`
     """
-    from edp.workflows.live import LiveOrder, SourceOptions, run_live
+    from edp.workflows.live import LiveOrder, SourceOptions, check_options, run_live
 
     sources = {"log": log, "sim": sim, "loop": loop, "udp": udp, "ros2": "ros2" if ros2 else None}
     name, value = _source(sources)
-    of_loop = {"controller": controller, "twin": twin, "plant": plant, "predictor": predictor}
-    of_sim = {"excitation": excitation, "fault": fault}
-    _check_options(name, {"loop": of_loop, "sim": of_sim})
+    of_sources = {
+        "map": signal_map, "machine": machine, "rate": rate, "seed": seed, "speed": speed, "excitation": excitation,
+        "fault": fault or None, "controller": controller, "twin": twin, "plant": plant, "predictor": predictor,
+        "yes": yes or None, "udp-bind": udp_bind,
+    }  # fmt: skip
+    check_options(name, (option for option, entry in of_sources.items() if entry is not None))
     ask_for_fmus(yes, plant)
-    settings = {"excitation": excitation, "faults": fault, "bind": udp_bind, **of_loop}
+    settings = {
+        "excitation": excitation, "faults": fault or None, "bind": udp_bind, "controller": controller, "twin": twin,
+        "plant": plant, "predictor": predictor,
+    }  # fmt: skip
     options = SourceOptions(
-        str(value), signal_map, machine, seed, rate, {key: entry for key, entry in settings.items() if entry}
+        str(value),
+        signal_map,
+        machine,
+        seed,
+        rate,
+        {key: entry for key, entry in settings.items() if entry is not None},
     )
     order = LiveOrder(
-        source=name, options=options, run=run, monitor=monitor, speed=speed, free_s=free_s, host=bind, port=port,
-        save=save, record=record, rerun=rerun, until_end=until_end,
+        source=name, options=options, run=run, monitor=monitor, speed=1.0 if speed is None else speed, free_s=free_s,
+        host=bind, port=port, save=save, record=record, rerun=rerun, until_end=until_end,
     )  # fmt: skip
 
-    def ready(server: LiveServer) -> None:
-        # To standard error, so that JSON on standard output stays one document.
-        (err if as_json else out).print(f"live view: {server.address}")
-        (err if as_json else out).print("whoever has this address sees the session; Ctrl-C ends it")
-        if bind not in ("127.0.0.1", "::1", "localhost"):
-            err.print(f"the page is open to the network of {bind}, and what it shows is not encrypted")
-
-    def event(kind: str, text: str) -> None:
-        if kind != "note":
-            err.print(f"{kind}: {text}")
-
-    def mirrored(address: str) -> None:
-        (err if as_json else out).print(f"Rerun: {address}")
-        err.print("Rerun has no token: every user of this machine can read there; its page calls its makers' servers")
-
-    result = run_live(order, ready, event, on_mirror=mirrored)
+    result = run_live(
+        order,
+        lambda server: _print_address(server, as_json),
+        _print_event,
+        on_mirror=lambda address: _print_mirror(address, as_json),
+    )
     facts = {
         "ticks": result.ticks,
         "alarms": result.alarms,
@@ -112,23 +120,31 @@ def live(
     def show() -> None:
         out.print(f"{result.ticks:,} ticks, {result.alarms:,} alarms; {result.ended}")
         if result.saved is not None:
-            out.print(f"session: {result.saved.resolve()}")
+            out.print(f"session: {full_path(result.saved)}")
         if result.recorded is not None:
-            out.print(f"recording: {result.recorded.resolve()}")
+            out.print(f"recording: {full_path(result.recorded)}")
 
     emit(as_json, facts, show)
 
 
-def _check_options(source: str, options: Mapping[str, Mapping[str, object]]) -> None:
-    """Refuse options of another source than the one that is shown.
+def _print_address(server: LiveServer, as_json: bool) -> None:
+    # To standard error, so that JSON on standard output stays one document.
+    (err if as_json else out).print(f"live view: {server.address}")
+    (err if as_json else out).print("whoever has this address sees the session; Ctrl-C ends it")
+    if not server.bind.is_loopback:
+        err.print(f"the page is open to {server.bind.reach} that has the address; what it shows is not encrypted")
 
-    Raises:
-        ConfigError: one was given, which would do nothing.
-    """
-    for of, named in options.items():
-        unfit = [f"--{name}" for name, value in named.items() if value]
-        if unfit and source != of:
-            raise ConfigError(f"{unfit[0]} is of --{of}, and --{source} was given; leave it out, or choose --{of}")
+
+def _print_event(kind: str, text: str) -> None:
+    if kind == "preparing":
+        err.print(text)
+    elif kind != "note":
+        err.print(f"{kind}: {text}")
+
+
+def _print_mirror(address: str, as_json: bool) -> None:
+    (err if as_json else out).print(f"Rerun: {address}")
+    err.print("Rerun has no token: every user of this machine can read there; its page calls its makers' servers")
 
 
 def _source(options: Mapping[str, object]) -> tuple[str, object]:

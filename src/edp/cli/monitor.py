@@ -12,6 +12,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import WorkersOption
+from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
     from edp.workflows.monitor import FittedMonitor
@@ -213,6 +214,6 @@ def report(
 
     def show() -> None:
         out.print(line)
-        out.print(f"report: {written.resolve()}")
+        out.print(f"report: {full_path(written)}")
 
     emit(as_json, {"report": str(written), "headline": line, "alarms": len(facts.alarms)}, show)

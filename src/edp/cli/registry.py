@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, emit, err, out, table
+from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
     from edp.workflows.fleet.registry import RegistryEntry
@@ -79,7 +80,7 @@ def show_entry(
     entry = find_entry(registry, asked)
     check_entry(registry, entry)
     steps = lineage(registry, entry)
-    files = (registry / FILES / entry.id).resolve()
+    files = full_path(registry / FILES / entry.id)
 
     def show() -> None:
         facts = [

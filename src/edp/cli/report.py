@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.storage.paths import full_path
 
 
 def report(
@@ -33,7 +34,7 @@ def report(
         if limit is not None:
             raise ConfigError(f"--limit: '{run}' holds a twin, which looks no fixed time ahead; leave it out")
         page = build_twin_report(run, output, title)
-        emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {page.resolve()}"))
+        emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {full_path(page)}"))
         return
     page = build_report(run, output, title, limit)
     facts = read_facts(run, limit)
@@ -46,6 +47,6 @@ def report(
             out.print(judged)
         if least:
             out.print(least)
-        out.print(f"report: {page.resolve()}")
+        out.print(f"report: {full_path(page)}")
 
     emit(as_json, {"report": str(page), "headline": line, "tests": judged, "limit": least}, show)

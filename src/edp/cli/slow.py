@@ -1,4 +1,4 @@
-"""What the command line says while a log takes long to read."""
+"""What the command line says about the reading of logs: what takes long, and a missing layer of the sandbox."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from edp.cli.console import err
-from edp.sandbox import sandbox
+from edp.sandbox import layers, sandbox
 from edp.storage.memory import readable
 
 # Each line takes twice as long: a slow log is told often at first, and never floods a terminal.
@@ -35,3 +35,8 @@ def tell_of_slow_logs() -> None:
     """Say what takes long, on a terminal, and wherever no program reads the output."""
     if err.is_terminal or "--json" not in sys.argv:
         sandbox.watch(SlowLogs())
+
+
+def tell_of_missing_layers() -> None:
+    """Say on standard error, once in each command, that logs are read with less protection than elsewhere."""
+    layers.announce_by(lambda text: err.print(f"warning: {text}"))

@@ -9,6 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, end_with, out, progress, show_verdict, table, verdict_facts
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.storage.paths import full_path, is_file_at
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -72,7 +73,7 @@ def twin(
             out.print(f"chosen: {choice_sentence(candidates)}")
         show_trained(trained)
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
-        if (folder / "datasheet.txt").is_file():
+        if is_file_at(folder / "datasheet.txt"):
             out.print(f"numbers of the machine with units and intervals in {folder / 'datasheet.txt'}")
         out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
 
@@ -140,7 +141,7 @@ def rollout(
         if plots is not None:
             out.print(f"plots in {plots}")
         if page is not None:
-            out.print(f"page: {page.resolve()}")
+            out.print(f"page: {full_path(page)}")
 
     emit(as_json, facts, show)
 

@@ -346,8 +346,10 @@ def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: t
 
 def _values(recordings: Sequence[Recording], names: tuple[str, ...]) -> tuple[Array, str]:
     kind = recordings[0].channels[recordings[0].index(names[0])].kind
-    factor = KINDS[kind].report_factor
-    return np.concatenate([signed(r, names) for r in recordings]) * factor, KINDS[kind].report_unit
+    facts, values = KINDS[kind], np.concatenate([signed(r, names) for r in recordings])
+    # Two channels are shown by their difference.
+    offset = facts.report_offset if len(names) == 1 else 0.0
+    return values * facts.report_factor + offset, facts.report_unit
 
 
 def _range(values: Array) -> tuple[float, float]:

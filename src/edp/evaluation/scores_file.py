@@ -10,6 +10,7 @@ from typing import Any
 from edp.errors import StorageError
 from edp.settings.bounds import shown
 from edp.storage import read_object
+from edp.storage.paths import is_file_at
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def read_scores(path: str | Path) -> dict[str, Any]:
 
 def earlier_scores(folder: Path, key: str) -> dict[str, Any] | None:
     """Scores of an earlier judgement with this key, beside their predictions; None where there are none."""
-    if not (folder / "scores.json").is_file() or not (folder / "predictions.safetensors").is_file():
+    if not is_file_at(folder / "scores.json") or not is_file_at(folder / "predictions.safetensors"):
         return None
     scores = read_scores(folder / "scores.json")
     return scores if scores.get("key") == key else None

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 
 from edp.errors import BusyError, StorageError
 from edp.storage import hold, make_folder, storage_error, write_bytes
+from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_of
 
 LIST = "export.sha256"
 UNFINISHED = "export.unfinished"
@@ -92,7 +93,7 @@ def _listed(path: Path) -> Listed:
     """Files of a list with the hashes that they may have; none if it is absent, and none of lines of another form."""
     listed: Listed = {}
     try:
-        if path.is_symlink() or not path.is_file() or path.stat().st_size > LONGEST_LIST:
+        if is_link_at(path) or not is_file_at(path) or status_of(path).st_size > LONGEST_LIST:
             return listed
         # Characters beyond ASCII cannot match the form of a line, so they need not be an error.
         lines = path.read_text(encoding="ascii", errors="replace").splitlines()
@@ -117,7 +118,7 @@ def _ours(path: Path, file: str, digests: set[str]) -> bool:
         StorageError: it is there with another content.
     """
     target = path / file
-    if _linked(path, target) or not target.is_file():
+    if _linked(path, target) or not is_file_at(target):
         return False
     try:
         digest = hashlib.sha256(target.read_bytes()).hexdigest()
@@ -134,7 +135,7 @@ def _ours(path: Path, file: str, digests: set[str]) -> bool:
 def _linked(path: Path, target: Path) -> bool:
     """Whether a place below a folder, or one on the way to it, is a symbolic link."""
     steps = target.relative_to(path).parts
-    return any(path.joinpath(*steps[: at + 1]).is_symlink() for at in range(len(steps)))
+    return any(is_link_at(path.joinpath(*steps[: at + 1])) for at in range(len(steps)))
 
 
 def _check_place(path: Path, target: Path) -> None:
@@ -155,9 +156,9 @@ def _remove(path: Path) -> None:
 def _clean(path: Path, every: Mapping[str, object]) -> None:
     """Remove what a killed export has not finished."""
     for folder in {path, *((path / file).parent for file in every)}:
-        if folder.is_dir() and not (folder != path and _linked(path, folder)):
-            for rest in folder.iterdir():
-                if _TEMPORARY.fullmatch(rest.name) and rest.is_file() and not rest.is_symlink():
+        if is_folder_at(folder) and not (folder != path and _linked(path, folder)):
+            for rest in entries_of(folder):
+                if _TEMPORARY.fullmatch(rest.name) and is_file_at(rest) and not is_link_at(rest):
                     _remove(rest)
 
 

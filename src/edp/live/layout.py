@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from edp.signals import KINDS, Channel, Kind
+from edp.signals import KINDS, Channel, display_offset
 
 MOST_LABEL = 80
 """Characters of a name on the page; a longer one would push everything else off it."""
-KELVIN = 273.15
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,8 @@ class LiveTrace:
     def of(channel: Channel) -> LiveTrace:
         """A channel in the unit of reports."""
         facts = KINDS[channel.kind]
-        offset = -KELVIN if channel.kind is Kind.TEMPERATURE else 0.0
         return LiveTrace(
-            label(channel.name), facts.report_unit, facts.report_factor, offset, label(channel.description)
+            label(channel.name), facts.report_unit, facts.report_factor, facts.report_offset, label(channel.description)
         )
 
 
@@ -68,6 +66,11 @@ class Forecast:
     coverage: float | None = None
     measured: int | None = None
     model: str = "network"
+
+    @property
+    def offset(self) -> float:
+        """Added behind the factor."""
+        return display_offset(self.unit)
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,8 @@ class LiveLayout:
     def to_plain(self) -> dict[str, Any]:
         """Plain JSON values, keys as the fields."""
         plain = asdict(self)
+        for entry, forecast in zip(plain["forecasts"], self.forecasts, strict=True):
+            entry["offset"] = forecast.offset
         plain["statistics"] = [{"name": label(name), "column": n} for name, n in (self.statistics or {}).items()]
         return plain
 

@@ -14,6 +14,8 @@ SLOWEST, FASTEST = 0.01, 1000.0
 LATE_S = 1.0
 """A source that is later than this gives up the lost time: it would otherwise race until it caught up."""
 
+LATE_SHOWN_S = 10.0
+
 
 class Pace:
     """The clock of a source that can be steered.
@@ -35,6 +37,11 @@ class Pace:
         self._clock, self._changed = clock, threading.Condition()
         self._ahead = 0
         self._base: tuple[int, float] | None = None
+        self._late_tick: int | None = None
+
+    def is_late(self, tick: int) -> bool:
+        """Whether time was given up within the last `LATE_SHOWN_S` of the source's time before a tick."""
+        return self._late_tick is not None and tick - self._late_tick < LATE_SHOWN_S * self.rate_hz
 
     def wait(self, tick: int) -> bool:
         """Wait until a tick is due; False once the session is over."""
@@ -53,6 +60,7 @@ class Pace:
                 if left <= 0.0:
                     if left < -LATE_S:
                         self.late += 1
+                        self._late_tick = tick
                         self._base = None
                     return True
                 self._changed.wait(left)

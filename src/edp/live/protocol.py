@@ -54,7 +54,10 @@ def request_of(message: Any) -> Request:
     try:
         entry = json.loads(message)
         name, names = entry["do"], REQUESTS[entry["do"]]
-        numbers = tuple(float(entry[key]) for key in names)
+        values = [entry[key] for key in names]
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
+            raise TypeError
+        numbers = tuple(map(float, values))
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"a request names one of {', '.join(REQUESTS)} with its numbers") from error
     if not all(math.isfinite(number) and abs(number) < 2**53 for number in numbers):

@@ -11,8 +11,8 @@ from typing import Any
 from markupsafe import Markup
 
 from edp.live.session import LiveSession
-from edp.report.animation.page import asset, script_text
-from edp.report.common.templates import template
+from edp.report.animation.page import script_text
+from edp.report.common.templates import asset, stylesheet, template
 from edp.storage import write_bytes
 
 SAVED_BYTES = 24 << 20
@@ -77,7 +77,7 @@ def write_session_page(session: LiveSession, target: str | Path) -> Path:
 @cache
 def parts() -> tuple[str, str]:
     """Script and style of the page."""
-    return "\n".join(map(asset, _SCRIPTS)), "\n".join(map(asset, _STYLES))
+    return "\n".join(map(asset, _SCRIPTS)), stylesheet(*_STYLES)
 
 
 def _rendered(title: str, connect: str, content: dict[str, Any]) -> str:

@@ -20,13 +20,13 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
 from edp.errors import ConfigError, DataError
+from edp.live.addresses import LOOPBACK, resolve_bind
 from edp.live.pace import Pace
 from edp.live.protocol import MOST_PAST, MOST_REQUEST, PAST, ROWS, Request, request_of, rows_message, text_message
 from edp.live.saved import live_page, session_page
 from edp.live.session import LiveSession
 from edp.live.viewer import SEND_BUFFER, Viewer
 
-LOOPBACK = "127.0.0.1"
 FLUSH_S = 0.04
 """Between messages of rows: 25 pictures a second, and at most as much of the lag."""
 STATE_S = 1.0
@@ -62,12 +62,14 @@ class LiveServer:
     Attributes:
         token: that page and socket ask for.
         port: once it listens.
+        bind: address that `host` stands for.
         viewers: that are connected.
         skipped: rows that were sent to nobody, since the source ran ahead.
     """
 
     def __init__(self, session: LiveSession, pace: Pace | None, host: str = LOOPBACK, port: int = 0) -> None:
         self.session, self.pace, self.host, self.port = session, pace, host, port
+        self.bind = resolve_bind(host, "--bind")
         self.token = secrets.token_urlsafe(TOKEN_BYTES)
         self.viewers: set[Viewer] = set()
         self.skipped = 0
@@ -77,7 +79,7 @@ class LiveServer:
     def address(self) -> str:
         """Of the page, with the token."""
         # An address that stands for all of a machine's is none to type into a browser.
-        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        host = socket.gethostname() if self.bind.is_everywhere else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
 
     async def run(self, stop: asyncio.Event, on_ready: Callable[[LiveServer], None] | None = None) -> None:
@@ -136,8 +138,12 @@ class LiveServer:
                 await asyncio.wait_for(stop.wait(), FLUSH_S)
             except TimeoutError:
                 continue
-        for viewer in self.viewers:
-            viewer.tell(text_message("closed"))
+        # What came last, with the reason of the end.
+        self._offer_rows()
+        for event in self.session.events(self._told):
+            self._tell(text_message("event", event=event.to_plain()))
+        self._tell(self._state())
+        self._tell(text_message("closed"))
         await asyncio.sleep(FLUSH_S)
 
     def _offer_rows(self) -> None:
@@ -167,7 +173,8 @@ class LiveServer:
             ended=session.ended,
             paused=pace is not None and pace.paused,
             speed=speed,
-            late=0 if pace is None else pace.late,
+            late=pace is not None and pace.is_late(session.ticks),
+            preparing=session.preparing if session.ticks == 0 else "",
             skipped=self.skipped,
             viewers=len(self.viewers),
             breaks=session.breaks[-MOST_BREAKS:],
@@ -215,7 +222,7 @@ class LiveServer:
             address = ipaddress.ip_address(name)
         except ValueError:
             return False
-        return address.is_loopback or self.host != LOOPBACK
+        return address.is_loopback or not self.bind.is_loopback
 
     async def _serve_viewer(self, connection: ServerConnection) -> None:
         """One viewer, from its first message to its end."""

@@ -51,15 +51,18 @@ class LiveSession:
     Args:
         layout: of the columns.
         history_bytes: of rows that are kept; the oldest go first.
+        preparing: what happens before the first row, in words; empty where that takes no time.
 
     Attributes:
         layout: of the columns.
+        preparing: see above.
         ticks: streamed so far.
         ended: why nothing more comes, in words; empty while it runs.
         stamp: time (s since 1970) of the newest tick.
     """
 
-    def __init__(self, layout: LiveLayout, history_bytes: int = HISTORY_BYTES) -> None:
+    def __init__(self, layout: LiveLayout, history_bytes: int = HISTORY_BYTES, preparing: str = "") -> None:
+        self.preparing = preparing
         self.layout, self.ticks, self.ended, self.stamp = layout, 0, "", time.time()
         capacity = max(1, history_bytes // (4 * layout.width))
         # A source whose end is known needs no more; pages of memory are taken as they are written.

@@ -10,6 +10,7 @@ from edp.errors import DataError, closest
 from edp.logs.formats.base import FORMATS, LogFormat, RawLog
 from edp.logs.sandboxed import read_apart
 from edp.signals import SignalMap
+from edp.storage.paths import entries_of, is_file_at, is_folder_at, status_of
 
 _HEAD = 4096
 """Bytes by which a format is recognised: beyond the header of every format."""
@@ -97,7 +98,7 @@ def format_for(path: Path) -> LogFormat:
 
     A folder with a ``metadata.yaml`` is a ROS 2 bag.
     """
-    if (path / BAG_MARK).is_file():
+    if is_file_at(path / BAG_MARK):
         return FORMATS["rosbag2"]
     suffix = path.suffix.lower()
     for part in FORMATS.values():
@@ -116,7 +117,7 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
     source = Path(path)
     named = format_for(source)
     try:
-        if source.is_dir():
+        if is_folder_at(source):
             return read_apart(named, source, _size_of_folder(source), signal_map)
         head, size = _begin(source)
     except OSError as error:
@@ -149,8 +150,8 @@ def _begin(path: Path) -> tuple[bytes, int]:
 def _size_of_folder(folder: Path) -> int:
     """Bytes of the files of a bag."""
     total = 0
-    for entry in folder.iterdir():
-        status = entry.stat()
+    for entry in entries_of(folder):
+        status = status_of(entry)
         if not stat.S_ISDIR(status.st_mode):
             _check_regular(entry, status)
             total += status.st_size

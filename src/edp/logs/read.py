@@ -18,6 +18,7 @@ from edp.logs.resolve import ChannelSource, resolve
 from edp.logs.write import truth_path
 from edp.recording import Recording, columns
 from edp.signals import SignalMap
+from edp.storage.paths import files_below, is_file_at, is_there
 
 TEXT = (".txt", ".dat")
 """Endings that logs share with other files: taken where a folder holds no logs of other endings."""
@@ -103,7 +104,7 @@ def read_truth(path: str | Path) -> Recording | None:
     """
     log = Path(path)
     beside = truth_path(log)
-    if beside.is_file():
+    if is_file_at(beside):
         return read_recording(beside)
     if not holds_truth_apart(format_for(log)):
         return None
@@ -123,19 +124,19 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         DataError: the path does not exist, or holds no log file.
     """
     source = Path(path)
-    if source.is_file() or (source / BAG_MARK).is_file():
+    if is_file_at(source) or is_file_at(source / BAG_MARK):
         return (source,)
-    if not source.exists():
+    if not is_there(source):
         raise DataError(f"'{source}' does not exist; give a log file or a folder of log files")
-    bags = {entry.parent for entry in source.rglob(BAG_MARK)}
+    there = list(files_below(source))
+    bags = {entry.parent for entry in there if entry.name == BAG_MARK}
     suffixes = known_suffixes()
     files = [
         entry
-        for entry in source.rglob("*")
+        for entry in there
         if entry.suffix.lower() in suffixes
         # Files that are being written have names that begin with a dot.
         and not entry.name.startswith(".")
-        and entry.is_file()
         and not _is_truth(entry)
         and (entry.suffix.lower() not in TEXT or is_text_log(entry))
     ]
@@ -150,7 +151,7 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
 
 def _instead(folder: Path) -> str:
     """How the most frequent files of a folder become logs, where that is known; else empty."""
-    endings = Counter(entry.suffix.lower() for entry in islice(folder.rglob("*"), _MOST_FILES) if entry.is_file())
+    endings = Counter(entry.suffix.lower() for entry in islice(files_below(folder), _MOST_FILES))
     advised = [(suffix, export_advice(suffix)) for suffix, _ in endings.most_common()]
     return next((f". {endings[suffix]} end in '{suffix}': {advice}" for suffix, advice in advised if advice), "")
 
@@ -158,7 +159,7 @@ def _instead(folder: Path) -> str:
 def _is_truth(path: Path) -> bool:
     """Whether a file holds the truth of a log that lies beside it."""
     log = path.with_name(f"{path.stem.removesuffix(f'.{TRUTH}')}{path.suffix}")
-    return log != path and log.is_file()
+    return log != path and is_file_at(log)
 
 
 def read_data_set(

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, DataError, EdpError, StorageError, brief
 from edp.logs.formats.base import FORMATS, Column, LogFormat, RawLog, RawSignal, load_column
 from edp.sandbox import WorkerConnection, open_channel
+from edp.sandbox.layers import are_layers_required, note_layers
 from edp.sandbox.protocol import Header
 from edp.sandbox.sandbox import SMALL_BYTES
 from edp.signals import Kind, SignalMap
@@ -44,8 +45,11 @@ def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) 
         signal_map: as in `edp.logs.open_log`.
 
     Raises:
-        DataError: the file cannot be read, or not within its limits; or no process can be started.
+        DataError: the file cannot be read, or not within its limits; no process can be started; or a layer of the
+            sandbox is missing and all are required (`edp.sandbox.layers`).
+        ConfigError: the environment variable `EDP_SANDBOX` holds an unknown word.
     """
+    all_layers = are_layers_required()
     libraries = list(getattr(chosen, "libraries", ()))
     name = FORMATS.name_of(chosen)
     # The module that registered the format, which for a plug-in may be another one than that of its class.
@@ -58,8 +62,9 @@ def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) 
         # The current folder was removed: relative paths have no meaning, absolute ones do.
         folder = os.sep
     order = {"path": str(path), "folder": folder, "size": size, "format": name}
-    channel.send(order | {"map": plain_map(signal_map)})
+    channel.send(order | {"map": plain_map(signal_map), "all_layers": all_layers})
     log = _Log(path, channel)
+    note_layers(path, log.answer().get("layers"))
     facts = log.answer()
     try:
         return _raw_log(path, log, facts)

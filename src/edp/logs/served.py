@@ -1,6 +1,7 @@
 """In the sandbox: one log is read by its format, and its columns are handed over as they are asked for.
 
-The messages are those of `edp.sandbox.protocol`. After the order come the log's facts, then answers to requests:
+The messages are those of `edp.sandbox.protocol`. After the order come the layers of the sandbox (for each one why it
+is missing, empty where it holds), the log's facts, then answers to requests:
 ``time`` and ``load`` (a header with the number of bytes, then the array), ``open`` and ``next`` for the pieces of a
 table, and with any of them the pieces that nobody wants any more (``drop``).
 """
@@ -59,7 +60,11 @@ def serve(requests: int, answers: int) -> None:
         # Limits and lock-down both hold before the file is opened.
         allowance = Allowance(path, order["size"])
         keep_temporary_files_in_memory()
-        lock_down([Path(os.path.realpath(path))])
+        layers = lock_down([Path(os.path.realpath(path))])
+        # Before the log is opened: a hostile one cannot speak for the layers.
+        send(write, {"layers": layers})
+        if order["all_layers"] and any(layers.values()):
+            return
         served = _answer(write, allowance, 0, lambda: _read(order, path))
         while served is not None:
             request, _ = receive(read_into)

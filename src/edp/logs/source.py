@@ -28,6 +28,7 @@ from edp.logs.store.remote import is_remote_store, local_store
 from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
+from edp.storage.paths import full_path, is_file_at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +106,7 @@ class DataSource:
 
     def to_plain(self) -> dict[str, Any]:
         """What provenance keeps, to read the same data again."""
-        plain: dict[str, Any] = {"path": self.address or str(self.path.resolve())}
+        plain: dict[str, Any] = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
             plain["map"] = plain_tree(self.signal_map)
         if self.repair is not None:
@@ -386,7 +387,7 @@ def read_with_truth(source: DataSource) -> Recording:
     if len(recordings) != 1:
         raise DataError(f"'{source.path}' holds {len(recordings)} recordings; give one log")
     recording, log = recordings[0], source.path
-    truth = read_truth(log) if log.suffix.lower() in known_suffixes() and log.is_file() else None
+    truth = read_truth(log) if log.suffix.lower() in known_suffixes() and is_file_at(log) else None
     if truth is None:
         return recording
     new = [c for c in truth.channels if c.name not in recording.channel_names]

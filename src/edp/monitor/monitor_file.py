@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Mapping
@@ -23,8 +22,10 @@ from edp.monitor.diagnosis.signatures import load_dictionary, remove_dictionary,
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import RESIDUALS, ResidualSource, SourceParts
 from edp.signals import Channel, Kind
-from edp.storage import make_folder, object_with, read_json, write_json
-from edp.storage.headers import HASH
+from edp.storage import make_folder, object_with, write_json
+from edp.storage.headers import read_header
+from edp.storage.paths import entries_of, is_entry_at, is_folder_at, is_link_at, is_there
+from edp.storage.seals import HASH
 from edp.training.bundle import HEADER as BUNDLE_HEADER
 from edp.training.bundle import (
     Bundle,
@@ -33,7 +34,7 @@ from edp.training.bundle import (
     load_bundle,
     read_arrays,
     save_bundle,
-    sealed,
+    with_plugins,
     write_arrays,
 )
 from edp.training.twin_bundle import HEADER as TWIN_HEADER
@@ -88,7 +89,7 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         remove_dictionary(path)
     else:
         save_dictionary(monitor.diagnosis, path)
-    write_json(path / HEADER, sealed(header))
+    write_json(path / HEADER, with_plugins(header))
     _remove_old(path, entry["file"], written)
     return path
 
@@ -106,9 +107,9 @@ def _write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
         save_twin(bundle, draft)
     else:
         save_bundle(bundle, draft)
-    digest = str(read_json(draft / (TWIN_HEADER if kind == "twin" else BUNDLE_HEADER))[HASH])
+    digest = str(read_header(draft / (TWIN_HEADER if kind == "twin" else BUNDLE_HEADER))[HASH])
     folder = f"{kind}-{digest}"
-    if (path / NETWORKS / folder).exists():
+    if is_there(path / NETWORKS / folder):
         # Equal content has an equal name: what is there is this network.
         shutil.rmtree(draft)
     else:
@@ -118,11 +119,11 @@ def _write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
 
 def _remove_old(path: Path, arrays: str, networks: set[str]) -> None:
     """Remove what an earlier monitor left; a kill before that leaves spare files, not a broken monitor."""
-    for old in path.glob("monitor-*.safetensors"):
+    for old in entries_of(path, "monitor-*.safetensors"):
         if old.name != arrays:
             old.unlink(missing_ok=True)
-    for folder in (path / NETWORKS).glob("*"):
-        if folder.name not in networks and _FOLDER.fullmatch(folder.name) and not folder.is_symlink():
+    for folder in entries_of(path / NETWORKS, "*"):
+        if folder.name not in networks and _FOLDER.fullmatch(folder.name) and not is_link_at(folder):
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -134,10 +135,10 @@ def load_monitor(folder: str | Path) -> Monitor:
         StorageError: its dictionary is damaged, or of another monitor.
     """
     path = Path(folder)
-    if not os.path.lexists(path / HEADER):
+    if not is_entry_at(path / HEADER):
         raise BundleError(f"'{path}' is not a monitor: it has no {HEADER}; give the folder that edp monitor fit wrote")
     with as_damage(path):
-        header = object_with(read_json(path / HEADER), ("schema",), f"'{path / HEADER}'")
+        header = read_header(path / HEADER, ("schema",))
         schema = header["schema"]
         if isinstance(schema, bool) or schema != SCHEMA:
             raise BundleError(
@@ -219,11 +220,11 @@ def _network(path: Path, entry: Mapping[str, Any]) -> Bundle | TwinBundle:
     if not _FOLDER.fullmatch(folder):
         raise ValueError(f"'{folder[:80]}' is no folder of a network")
     where = path / NETWORKS / folder
-    if not where.is_dir():
+    if not is_folder_at(where):
         raise BundleError(f"monitor '{path}' lacks its network '{folder}'; restore the monitor")
     twin = folder.startswith("twin-")
     network = load_twin(where) if twin else load_bundle(where)
-    stated = read_json(where / (TWIN_HEADER if twin else BUNDLE_HEADER))[HASH]
+    stated = read_header(where / (TWIN_HEADER if twin else BUNDLE_HEADER))[HASH]
     if stated != entry[HASH]:
         raise ValueError(f"its network '{folder}' is another one than its header names")
     return network

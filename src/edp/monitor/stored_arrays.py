@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,12 +12,14 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from edp.errors import StorageError, brief
-from edp.storage import object_with, read_bytes, read_json, write_bytes, write_json
+from edp.storage import read_bytes, write_bytes, write_json
+from edp.storage.headers import read_header
+from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 Arrays = Mapping[str, NDArray[Any]]
 ARRAY_BYTES = 512 * 2**20
 """Of a file of arrays; a day of traces takes a tenth of it."""
-HASH, ARRAYS = "blake2b", "arrays_blake2b"
+ARRAYS = "arrays_blake2b"
 
 
 def write_stored(folder: Path, name: str, header: Mapping[str, Any], arrays: Arrays) -> None:
@@ -30,8 +30,8 @@ def write_stored(folder: Path, name: str, header: Mapping[str, Any], arrays: Arr
     """
     data = save({key: np.ascontiguousarray(values) for key, values in arrays.items()})
     write_bytes(folder / f"{name}.safetensors", data)
-    whole = dict(header) | {ARRAYS: _digest(data)}
-    write_json(folder / f"{name}.json", whole | {HASH: _header_digest(whole)})
+    whole = dict(header) | {ARRAYS: digest_of_bytes(data)}
+    write_json(folder / f"{name}.json", whole)
 
 
 def read_stored(folder: Path, name: str, schema: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -41,13 +41,13 @@ def read_stored(folder: Path, name: str, schema: int) -> tuple[dict[str, Any], d
         StorageError: missing, damaged, changed, too large, or of another schema.
     """
     file = folder / f"{name}.json"
-    header = object_with(read_json(file), ("schema", HASH, ARRAYS), f"'{file}'")
+    header = read_header(file, ("schema", HASH, ARRAYS))
     if type(header["schema"]) is not int or header["schema"] != schema:
         raise StorageError(f"'{file}' has schema {str(header['schema'])[:40]}, this EDP reads {schema}; write it anew")
-    if header[HASH] != _header_digest({key: value for key, value in header.items() if key != HASH}):
+    if header[HASH] != content_digest(header):
         raise StorageError(f"'{file}' does not match its hash: it was cut off or changed by hand; write it anew")
     data = read_bytes(folder / f"{name}.safetensors", ARRAY_BYTES)
-    if _digest(data) != header[ARRAYS]:
+    if digest_of_bytes(data) != header[ARRAYS]:
         raise StorageError(f"'{folder / name}.safetensors' does not match its hash: cut off or changed; write it anew")
     try:
         arrays = load(data)
@@ -66,13 +66,3 @@ def shaped(arrays: Arrays, name: str, shape: tuple[int, ...], where: str) -> NDA
     if values is None or values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
         raise StorageError(f"{where}: array '{name}' must hold finite numbers of shape {shape}; write it anew")
     return values.astype(np.float64)
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
-
-
-def _header_digest(header: Mapping[str, Any]) -> str:
-    # One round through JSON: the hash is over what a reader will see, tuples as lists.
-    plain = json.loads(json.dumps(dict(header), allow_nan=False))
-    return _digest(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode())

@@ -28,8 +28,17 @@ _IN_MEMORY = ":memory:"
 
 
 def restrict(readable: Iterable[Path]) -> None:
-    """Refuse for good to open, from Python, anything for writing, and for reading all but `readable`; and more."""
+    """Refuse for good to open, from Python, anything for writing, and for reading all but `readable`; and more.
+
+    Raises:
+        OSError: the interpreter does not obey the hook.
+    """
     sys.addaudithook(hook(readable))
+    try:
+        sys.audit("socket.__new__")
+    except PermissionError:
+        return
+    raise OSError("the interpreter took the hook and does not obey it")
 
 
 def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Protocol, TypeVar
 
 from edp.errors import EdpError
-from edp.sandbox.processes import begin_helper
+from edp.sandbox.processes import begin_helper, choose_socket_folder
 
 
 class Labelled(Protocol):
@@ -85,6 +85,7 @@ class Helpers:
         if self._pool is None:
             # Spawned rather than forked: a forked child may inherit locks of threads that do not exist in it.
             context = multiprocessing.get_context("spawn")
+            choose_socket_folder()
             self._pool = ProcessPoolExecutor(self.workers, context, begin_helper, (os.getpid(),))
         return self._pool
 

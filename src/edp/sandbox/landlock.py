@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import os
 import struct
 import sys
@@ -28,25 +29,24 @@ _SCOPE_FROM, _SCOPES = 6, 3
 """Abstract sockets and signals of processes outside."""
 
 
-def restrict(readable: Iterable[Path]) -> bool:
-    """Forbid this process for good to open anything for writing, and for reading all but `readable`.
+def restrict(readable: Iterable[Path]) -> None:
+    """Forbid this process for good to open anything for writing, and anything but `readable` for reading.
+
+    Proves the ban on a folder that is not among `readable`.
 
     Args:
         readable: files, or folders with all below them; missing ones are passed over.
 
-    Returns:
-        whether the kernel does so.
-
     Raises:
-        OSError: the kernel has Landlock but refuses.
+        OSError: the system or the kernel has no Landlock, or does not obey it.
     """
     if not sys.platform.startswith("linux"):
-        return False
+        raise OSError(errno.ENOSYS, "exists on Linux only")
     libc = ctypes.CDLL(None, use_errno=True)
     # Asked first: each version knows more rights, and a kernel refuses bits that it does not know.
-    version = libc.syscall(_CREATE, None, ctypes.c_size_t(0), ctypes.c_uint(_VERSION))
+    version = _version(libc)
     if version < 1:
-        return False
+        raise _failure("be asked for")
     rights = (1 << max(count for since, count in _FILE_RIGHTS.items() if since <= version)) - 1
     net = (1 << _NET_RIGHTS) - 1 if version >= _NET_FROM else 0
     scopes = _SCOPES if version >= _SCOPE_FROM else 0
@@ -65,7 +65,21 @@ def restrict(readable: Iterable[Path]) -> bool:
             raise _failure("take effect")
     finally:
         os.close(rules)
-    return True
+    try:
+        handle = os.open(os.sep, os.O_RDONLY)
+    except PermissionError:
+        return
+    os.close(handle)
+    raise OSError("the kernel took the rules and does not obey them")
+
+
+def is_available() -> bool:
+    """Whether the kernel has Landlock."""
+    return sys.platform.startswith("linux") and _version(ctypes.CDLL(None, use_errno=True)) >= 1
+
+
+def _version(libc: ctypes.CDLL) -> int:
+    return int(libc.syscall(_CREATE, None, ctypes.c_size_t(0), ctypes.c_uint(_VERSION)))
 
 
 def _allow(libc: ctypes.CDLL, rules: int, path: Path) -> None:
@@ -84,4 +98,4 @@ def _allow(libc: ctypes.CDLL, rules: int, path: Path) -> None:
 
 def _failure(doing: str) -> OSError:
     number = ctypes.get_errno()
-    return OSError(number, f"Landlock cannot {doing}: {os.strerror(number)}")
+    return OSError(number, f"Landlock cannot {doing} ({os.strerror(number)})")

@@ -1,9 +1,9 @@
 """What a process may no longer do once it reads a log, and which layer sees to it.
 
-* **Landlock** (`edp.sandbox.landlock`, Linux 5.13): opens nothing for writing and, for reading, only the log and the
-  folders of Python and its libraries; from 6.7 no TCP, from 6.12 no signals to other processes.
-* **System calls** (`edp.sandbox.syscalls`, Linux on x86_64 and aarch64): no sockets, no programs, no new processes, no
-  change of files, no tracing, mounting or loading into the kernel.
+* **File rules** (`edp.sandbox.landlock`, Linux 5.13): opens nothing for writing and, for reading, only the log and the
+  folders of Python and its libraries; from 6.7 no TCP, from 6.12 no signals to other processes. Where Landlock is
+  missing, another process opens files by the same list (`edp.sandbox.broker`, Linux 5.9).
+* **System calls** (`edp.sandbox.syscalls`, Linux on x86_64 and aarch64): the calls that reading needs, and no others.
 * **Limits** (`edp.sandbox.allowance`, POSIX): memory, processor time, no file grows, no core file. The number of
   processes is not limited: that limit counts all processes and threads of the user.
 * **Audit hook** (`edp.sandbox.audit`, everywhere): the same from Python code.
@@ -13,14 +13,19 @@ Each layer holds where the system has it; none needs rights.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import sysconfig
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from edp.sandbox import audit, landlock, syscalls
+from edp.sandbox import audit, broker, landlock, syscalls
+from edp.sandbox.layers import AUDIT_HOOK, FILE_RULES, LIMITS, SYSTEM_CALLS
+
+try:
+    import resource
+except ImportError:  # not POSIX
+    resource = None  # type: ignore[assignment]
 
 _SYSTEM = (
     "/lib", "/lib64", "/usr/lib", "/usr/lib64", "/usr/local/lib", "/usr/share/zoneinfo", "/etc/localtime",
@@ -54,26 +59,52 @@ def note_libraries() -> None:
             _folders.append(Path(entry))
 
 
-def lock_down(readable: Iterable[Path]) -> list[str]:
+def lock_down(readable: Iterable[Path]) -> dict[str, str]:
     """Give up for good all that reading a log does not need.
 
     Args:
         readable: the log, a file or a folder.
 
     Returns:
-        the layers that hold.
+        for each layer, by its name in `edp.sandbox.layers`, why it is missing; empty where it holds. Each layer was
+        tried after it was put in force.
     """
     if not _folders:
         note_libraries()
     # Listed before any layer holds: looking for folders needs what the layers forbid.
     allowed = [*readable, *_folders, *map(Path, _SYSTEM)]
-    layers = []
-    with contextlib.suppress(OSError):
-        if landlock.restrict(allowed):
-            layers.append("landlock")
-    with contextlib.suppress(OSError):
-        if syscalls.restrict():
-            layers.append("system calls")
-    # Last: a hook cannot be removed, and would judge what the other layers open as well.
-    audit.restrict(allowed)
-    return [*layers, "audit hook"]
+    # Landlock before the filter, which refuses the calls that make Landlock's rules. The hook comes last: it cannot be
+    # removed, and would decide about what the other layers open as well.
+    return {
+        FILE_RULES.name: _missing(lambda: _restrict_files(allowed)),
+        SYSTEM_CALLS.name: _missing(syscalls.restrict),
+        LIMITS.name: _missing(_check_limits),
+        AUDIT_HOOK.name: _missing(lambda: audit.restrict(allowed)),
+    }
+
+
+def _restrict_files(readable: Sequence[Path]) -> None:
+    try:
+        landlock.restrict(readable)
+    except OSError as error:
+        try:
+            broker.restrict(readable)
+        except OSError as other:
+            raise OSError(f"{error.strerror or error}, and {other.strerror or other}") from other
+
+
+def _missing(put_in_force: Callable[[], None]) -> str:
+    try:
+        put_in_force()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def _check_limits() -> None:
+    """Raise OSError if files may grow or memory is unlimited (`edp.sandbox.allowance` sets both)."""
+    if resource is None:
+        raise OSError("the system has no limits of processes")
+    unlimited = resource.RLIM_INFINITY
+    if resource.getrlimit(resource.RLIMIT_FSIZE)[0] != 0 or resource.getrlimit(resource.RLIMIT_AS)[0] == unlimited:
+        raise OSError("the system does not take limits of file size and memory")

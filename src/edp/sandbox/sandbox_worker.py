@@ -21,6 +21,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from edp.sandbox import broker
 from edp.sandbox.lockdown import note_libraries
 from edp.sandbox.processes import die_with_parent
 
@@ -200,6 +201,8 @@ def _serve(serve: Serve, pipes: tuple[int, int], inherited: list[int], worker: i
         nothing = os.open(os.devnull, os.O_RDWR)
         for handle in (0, 1, 2):
             os.dup2(nothing, handle)
+        os.close(nothing)
+        broker.divide(pipes)
         serve(*pipes)
         code = 0
     except BaseException:

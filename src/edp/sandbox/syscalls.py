@@ -1,8 +1,15 @@
-"""A filter of system calls (seccomp, Linux): no network, no new programs or processes, no change of any file.
+"""Filter of system calls (seccomp, Linux): a list of the calls that readers of logs need; every other call is refused.
 
-Source: the kernel's documentation "Seccomp BPF"; numbers from asm/unistd_64.h (x86_64) and asm-generic/unistd.h
-(aarch64), in this order; None where an architecture has no such call. A refused call fails with EPERM; the newer forms
-of calls whose arguments a filter cannot see fail with ENOSYS, so that libraries use the older forms.
+The list was traced with `strace -f` from the readers of every format (sound, damaged and oversized logs, aborts of
+libraries, threads), on glibc. `_MARGIN` adds calls that other C libraries, kernels and processors make in place of
+the traced ones. A call that is not on the list fails with EPERM, whether or not a kernel knows its number. Calls in
+`_ABSENT` fail with ENOSYS, since libraries then use an older call that the filter can check.
+
+Pages with PROT_EXEC stay allowed: libraries are loaded while a log is read, and the layer assumes that a hostile file
+may already run native code in the reader.
+
+Sources: the kernel's documentation "Seccomp BPF"; numbers from asm/unistd_64.h (x86_64) and asm-generic/unistd.h
+(aarch64), in this order; None where an architecture does not have the call.
 """
 
 from __future__ import annotations
@@ -13,116 +20,193 @@ import os
 import platform
 import struct
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-_NETWORK = {
-    "socket": (41, 198), "socketpair": (53, 199), "connect": (42, 203), "bind": (49, 200), "listen": (50, 201),
-    "accept": (43, 202), "accept4": (288, 242), "sendto": (44, 206), "sendmsg": (46, 211), "sendmmsg": (307, 269),
-    "recvfrom": (45, 207), "recvmsg": (47, 212), "recvmmsg": (299, 243),
-    # Rings do what calls do, past any filter.
-    "io_uring_setup": (425, 425), "io_uring_enter": (426, 426), "io_uring_register": (427, 427),
+Numbers = tuple[int | None, int | None]
+"""Number of a call on x86_64 and on aarch64."""
+
+_TRACED: dict[str, Numbers] = {
+    # Files that are open or that the `open` rules below let through.
+    "read": (0, 63), "write": (1, 64), "close": (3, 57), "lseek": (8, 62), "pread64": (17, 67), "readv": (19, 65),
+    "fstat": (5, 80), "newfstatat": (262, 79), "stat": (4, None), "lstat": (6, None), "access": (21, None),
+    "readlink": (89, None), "getcwd": (79, 17), "getdents64": (217, 61), "fadvise64": (221, 223),
+    "pipe2": (293, 59),
+    # Memory.
+    "mmap": (9, 222), "mprotect": (10, 226), "munmap": (11, 215), "brk": (12, 214), "mremap": (25, 216),
+    "madvise": (28, 233),
+    # Threads and signals of this process.
+    "futex": (202, 98), "set_robust_list": (273, 99), "rseq": (334, 293), "gettid": (186, 178), "getpid": (39, 172),
+    "rt_sigaction": (13, 134), "rt_sigprocmask": (14, 135), "exit": (60, 93), "exit_group": (231, 94),
+    # Time limits, which the reader sets again as checked headers announce work.
+    "setitimer": (38, 103), "getitimer": (36, 102), "getrandom": (318, 278),
 }  # fmt: skip
-_PROGRAMS = {
-    "execve": (59, 221), "execveat": (322, 281), "fork": (57, None), "vfork": (58, None), "ptrace": (101, 117),
-    "process_vm_readv": (310, 270), "process_vm_writev": (311, 271), "process_madvise": (440, 440), "kcmp": (312, 272),
-    "pidfd_open": (434, 434), "pidfd_getfd": (438, 438), "pidfd_send_signal": (424, 424), "tkill": (200, 130),
-    "rt_sigqueueinfo": (129, 138), "rt_tgsigqueueinfo": (297, 240), "uselib": (134, None),
+_MARGIN: dict[str, Numbers] = {
+    # Newer, older or vectored forms of traced calls.
+    "statx": (332, 291), "readlinkat": (267, 78), "faccessat": (269, 48), "faccessat2": (439, 439),
+    "writev": (20, 66), "preadv": (295, 69), "preadv2": (327, 286), "readahead": (187, 213), "pipe": (22, None),
+    "dup": (32, 23), "dup2": (33, None), "dup3": (292, 24), "eventfd2": (290, 19), "futex_waitv": (449, 449),
+    "statfs": (137, 43), "fstatfs": (138, 44), "mincore": (27, 232),
+    # Waiting.
+    "poll": (7, None), "ppoll": (271, 73), "select": (23, None), "pselect6": (270, 72), "nanosleep": (35, 101),
+    "clock_nanosleep": (230, 115), "sched_yield": (24, 124), "restart_syscall": (219, 128),
+    # Clocks, where the kernel's page of them (vDSO) is missing.
+    "clock_gettime": (228, 113), "clock_getres": (229, 114), "gettimeofday": (96, 169), "time": (201, None),
+    # Handlers of signals (faulthandler) and what a process asks about itself.
+    "rt_sigreturn": (15, 139), "sigaltstack": (131, 132), "set_tid_address": (218, 96), "getcpu": (309, 168),
+    "membarrier": (324, 283), "getppid": (110, 173), "getuid": (102, 174), "geteuid": (107, 175),
+    "getgid": (104, 176), "getegid": (108, 177), "getrusage": (98, 165), "times": (100, 153), "uname": (63, 160),
+    "sysinfo": (99, 179),
 }  # fmt: skip
-_SYSTEM = {
-    "mount": (165, 40), "umount2": (166, 39), "pivot_root": (155, 41), "chroot": (161, 51), "unshare": (272, 97),
-    "setns": (308, 268), "move_mount": (429, 429), "open_tree": (428, 428), "fsopen": (430, 430),
-    "fsconfig": (431, 431), "fsmount": (432, 432), "fspick": (433, 433), "mount_setattr": (442, 442),
-    "bpf": (321, 280), "perf_event_open": (298, 241), "userfaultfd": (323, 282), "keyctl": (250, 219),
-    "add_key": (248, 217), "request_key": (249, 218), "init_module": (175, 105), "finit_module": (313, 273),
-    "delete_module": (176, 106), "kexec_load": (246, 104), "kexec_file_load": (320, 294), "reboot": (169, 142),
-    "swapon": (167, 224), "swapoff": (168, 225), "acct": (163, 89), "quotactl": (179, 60), "syslog": (103, 116),
-    "personality": (135, 92), "modify_ldt": (154, None), "iopl": (172, None), "ioperm": (173, None),
-    "sethostname": (170, 161), "setdomainname": (171, 162), "settimeofday": (164, 170), "clock_settime": (227, 112),
-    "clock_adjtime": (305, 266), "adjtimex": (159, 171), "vhangup": (153, 58), "lookup_dcookie": (212, 18),
-    "setuid": (105, 146), "setgid": (106, 144), "setreuid": (113, 145), "setregid": (114, 143),
-    "setresuid": (117, 147), "setresgid": (119, 149), "setgroups": (116, 159), "capset": (126, 91),
-    "inotify_init": (253, None), "inotify_init1": (294, 26), "fanotify_init": (300, 262),
-    "shmget": (29, 194), "shmat": (30, 196), "shmctl": (31, 195), "msgget": (68, 186), "msgsnd": (69, 189),
-    "msgrcv": (70, 188), "msgctl": (71, 187), "semget": (64, 190), "mq_open": (240, 180), "mq_unlink": (241, 181),
+_ABSENT: dict[str, Numbers] = {
+    # Their arguments lie in memory, where a filter cannot see them.
+    "clone3": (435, 435), "openat2": (437, 437),
+    "futex_wake": (454, 454), "futex_wait": (455, 455), "futex_requeue": (456, 456),
 }  # fmt: skip
-_FILES = {
-    "creat": (85, None), "rename": (82, None), "renameat": (264, 38), "renameat2": (316, 276), "link": (86, None),
-    "linkat": (265, 37), "symlink": (88, None), "symlinkat": (266, 36), "unlink": (87, None), "unlinkat": (263, 35),
-    "mkdir": (83, None), "mkdirat": (258, 34), "rmdir": (84, None), "mknod": (133, None), "mknodat": (259, 33),
-    "chmod": (90, None), "fchmod": (91, 52), "fchmodat": (268, 53), "fchmodat2": (452, 452), "chown": (92, None),
-    "fchown": (93, 55), "lchown": (94, None), "fchownat": (260, 54), "utime": (132, None), "utimes": (235, None),
-    "utimensat": (280, 88), "futimesat": (261, None), "setxattr": (188, 5), "lsetxattr": (189, 6),
-    "fsetxattr": (190, 7), "removexattr": (197, 14), "lremovexattr": (198, 15), "fremovexattr": (199, 16),
-    "truncate": (76, 45), "ftruncate": (77, 46), "fallocate": (285, 47), "open_by_handle_at": (304, 265),
-    "name_to_handle_at": (303, 264),
-}  # fmt: skip
-_UNSEEN = {"clone3": (435, 435), "openat2": (437, 437)}
-_CLONE, _OPEN, _OPENAT = (56, 220), (2, None), (257, 56)
-_SIGNALS = {"kill": (62, 129), "tgkill": (234, 131)}
-"""Allowed towards this process itself: a library that gives up ends it so."""
+_WORD = 0xFFFFFFFF
+NOT_READING = (
+    os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+    # O_TMPFILE: a file without a name; O_PATH: a handle of any path, which Landlock does not check.
+    | 0o20000000 | 0o10000000
+)  # fmt: skip
+_THREAD = 0x10F00
+"""CLONE_VM, CLONE_FS, CLONE_FILES, CLONE_SIGHAND and CLONE_THREAD."""
+_THREAD_OPTIONS = 0x017C0000
+"""What C libraries add: CLONE_SYSVSEM, _SETTLS, _PARENT_SETTID, _CHILD_CLEARTID, _DETACHED and _CHILD_SETTID."""
+_FCNTL = (0, 1, 2, 3, 1030, 1032)
+"""F_DUPFD, F_GETFD, F_SETFD, F_GETFL, F_DUPFD_CLOEXEC, F_GETPIPE_SZ. F_SETOWN and F_SETSIG send signals to others."""
+_F_SETFL, _O_ASYNC = 4, 0o20000
+_IOCTL = (0x5401, 0x802C542A, 0x5413, 0x541B, 0x5421, 0x5450, 0x5451)
+"""TCGETS, TCGETS2, TIOCGWINSZ, FIONREAD, FIONBIO, FIONCLEX, FIOCLEX. TIOCSTI types into a terminal."""
+_PRCTL = (15, 16, 0x53564D41)
+"""PR_SET_NAME, PR_GET_NAME, PR_SET_VMA (names of memory areas)."""
+_SHARED_LOCKS = 1 | 4 | 8
+"""LOCK_SH, LOCK_NB, LOCK_UN."""
 _ARCHITECTURES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
-_X32 = 0x40000000
-"""Set in the numbers of the calls of another interface of x86_64, which pass by the numbers above."""
-_CLONE_THREAD = 0x10000
-_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+_LOAD, _EQUAL, _AND, _RETURN = 0x20, 0x15, 0x54, 0x06
 _NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
 _ALLOW, _FAIL, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
 _SET_NO_NEW_PRIVILEGES, _SET_SECCOMP, _MODE_FILTER = 38, 22, 2
+_UNUSED_NUMBER = 1023
+"""Number of a call that no kernel has, which an unfiltered process is refused with ENOSYS."""
 Instruction = tuple[int, int, int, int]
 
 
+@dataclass(frozen=True)
+class Condition:
+    """Test of one argument of a call: its low 32 bits, masked, must equal one of some values.
+
+    The kernel reads process ids, flags and commands as 32 bits, so higher bits change nothing.
+
+    Attributes:
+        argument: its index, from 0.
+        mask: bits that are compared.
+        values: allowed results.
+    """
+
+    argument: int
+    mask: int
+    values: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class CallForm:
+    """A call that is allowed in some forms only.
+
+    Attributes:
+        numbers: the call.
+        alternatives: each is a sequence of conditions that must all hold; one alternative is enough.
+        refusal: error number of every other form.
+    """
+
+    numbers: Numbers
+    alternatives: Sequence[Sequence[Condition]]
+    refusal: int = errno.EPERM
+
+
+def call_forms(own_pid: int) -> dict[str, CallForm]:
+    """Return the calls whose arguments decide, by name.
+
+    Args:
+        own_pid: process id of the reader.
+    """
+    own, own_or_zero = Condition(0, _WORD, (own_pid,)), Condition(0, _WORD, (0, own_pid))
+    return {
+        "open": CallForm((2, None), [[Condition(1, NOT_READING, (0,))]]),
+        "openat": CallForm((257, 56), [[Condition(2, NOT_READING, (0,))]]),
+        "clone": CallForm((56, 220), [[Condition(0, _WORD & ~_THREAD_OPTIONS, (_THREAD,))]]),
+        # A library that gives up ends its own process so (tkill: musl, main thread).
+        "kill": CallForm((62, 129), [[own]]),
+        "tkill": CallForm((200, 130), [[own]]),
+        "tgkill": CallForm((234, 131), [[own]]),
+        "prlimit64": CallForm((302, 261), [[own_or_zero]]),
+        # ENOSYS: pthread_getattr_np then goes on without it, for a thread whose id differs from the process id.
+        "sched_getaffinity": CallForm((204, 123), [[own_or_zero]], errno.ENOSYS),
+        "fcntl": CallForm(
+            (72, 25),
+            [[Condition(1, _WORD, _FCNTL)], [Condition(1, _WORD, (_F_SETFL,)), Condition(2, _O_ASYNC, (0,))]],
+        ),
+        "ioctl": CallForm((16, 29), [[Condition(1, _WORD, _IOCTL)]]),
+        "prctl": CallForm((157, 167), [[Condition(0, _WORD, _PRCTL)]]),
+        "flock": CallForm((73, 32), [[Condition(1, _WORD & ~_SHARED_LOCKS, (0,))]]),
+    }
+
+
 def filter_program(column: int, architecture: int, own_pid: int) -> list[Instruction]:
-    """The instructions (code, steps if true, steps if false, value) that judge a call.
+    """Return the instructions (code, steps if true, steps if false, value) that decide about a call.
 
     Args:
         column: of the tables above.
-        architecture: the kernel's name of it.
-        own_pid: the process that signals may be sent to.
+        architecture: the kernel's number of it.
+        own_pid: process id of the reader.
     """
-    refuse: Instruction = (_RETURN, 0, 0, _FAIL | errno.EPERM)
-    allow: Instruction = (_RETURN, 0, 0, _ALLOW)
     program: list[Instruction] = [
         (_LOAD, 0, 0, _ARCHITECTURE_AT),
         # Numbers mean other calls on another architecture: whoever switches is killed.
         (_EQUAL, 1, 0, architecture),
         (_RETURN, 0, 0, _KILL),
         (_LOAD, 0, 0, _NUMBER_AT),
-        (_AT_LEAST, 0, 1, _X32),
-        refuse,
     ]
-    for table, answer in ((_NETWORK | _PROGRAMS | _SYSTEM | _FILES, errno.EPERM), (_UNSEEN, errno.ENOSYS)):
-        for numbers in table.values():
-            number = numbers[column]
-            if number is not None:
-                program += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, _FAIL | answer)]
-
-    def judge(numbers: tuple[int | None, int | None], argument: int, test: Instruction, fitting: Instruction) -> None:
-        """Where the argument (its low 32 bits) passes the test: `fitting`, else the other answer."""
-        number = numbers[column]
-        if number is not None:
-            # Steps count instructions: past the load, the test and its two answers.
-            program.append((_EQUAL, 0, 4, number))
-            program.append((_LOAD, 0, 0, _ARGUMENTS_AT + 8 * argument))
-            program.extend([test, fitting, allow if fitting is refuse else refuse])
-
-    # Threads are allowed, processes are not.
-    judge(_CLONE, 0, (_ANY_BIT, 0, 1, _CLONE_THREAD), allow)
-    for numbers in _SIGNALS.values():
-        judge(numbers, 0, (_EQUAL, 0, 1, own_pid), allow)
-    # Opening for reading is left to Landlock, which sees paths; a filter sees only numbers.
-    judge(_OPEN, 1, (_ANY_BIT, 0, 1, _WRITING), refuse)
-    judge(_OPENAT, 2, (_ANY_BIT, 0, 1, _WRITING), refuse)
-    return [*program, allow]
+    for numbers in (_TRACED | _MARGIN).values():
+        program += _answer(numbers[column], [(_RETURN, 0, 0, _ALLOW)])
+    for form in call_forms(own_pid).values():
+        # After a condition the accumulator holds an argument, so each form ends with an answer.
+        body = [step for conditions in form.alternatives for step in _alternative(conditions)]
+        program += _answer(form.numbers[column], [*body, (_RETURN, 0, 0, _FAIL | form.refusal)])
+    for numbers in _ABSENT.values():
+        program += _answer(numbers[column], [(_RETURN, 0, 0, _FAIL | errno.ENOSYS)])
+    return [*program, (_RETURN, 0, 0, _FAIL | errno.EPERM)]
 
 
-def restrict() -> bool:
-    """Filter the system calls of this process for good.
+def _answer(number: int | None, body: list[Instruction]) -> list[Instruction]:
+    return [] if number is None else [(_EQUAL, 0, len(body), number), *body]
 
-    Returns:
-        whether the kernel does so; False on other systems and architectures.
+
+def _alternative(conditions: Sequence[Condition]) -> list[Instruction]:
+    """Return instructions that allow the call if all conditions hold, and otherwise run past their end."""
+    steps: list[Instruction] = [(_RETURN, 0, 0, _ALLOW)]
+    for condition in reversed(conditions):
+        count = len(condition.values)
+        tests: list[Instruction] = [
+            # A match skips the tests that follow; the last test that fails skips the rest of the alternative.
+            (_EQUAL, count - 1 - value_index, 0 if value_index < count - 1 else len(steps), value)
+            for value_index, value in enumerate(condition.values)
+        ]
+        at = _ARGUMENTS_AT + 8 * condition.argument
+        steps = [(_LOAD, 0, 0, at), (_AND, 0, 0, condition.mask), *tests, *steps]
+    return steps
+
+
+def restrict() -> None:
+    """Filter the system calls of this process for good, and prove that the filter holds.
+
+    Raises:
+        OSError: the system, the architecture or the kernel has no such filter, or does not obey it.
     """
-    if not sys.platform.startswith("linux") or platform.machine() not in _ARCHITECTURES or sys.byteorder != "little":
-        return False
+    if not sys.platform.startswith("linux"):
+        raise OSError(errno.ENOSYS, "exists on Linux only")
+    if platform.machine() not in _ARCHITECTURES or sys.byteorder != "little":
+        raise OSError(errno.ENOSYS, f"is not written for the processor {platform.machine()}")
     column, architecture = _ARCHITECTURES[platform.machine()]
     program = filter_program(column, architecture, os.getpid())
     code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *step) for step in program))
@@ -130,6 +214,12 @@ def restrict() -> bool:
     about = ctypes.create_string_buffer(struct.pack("@HP", len(program), ctypes.addressof(code)))
     libc = ctypes.CDLL(None, use_errno=True)
     # The kernel takes a filter from a process without rights only after this.
-    if libc.prctl(_SET_NO_NEW_PRIVILEGES, *map(ctypes.c_ulong, (1, 0, 0, 0))):
-        return False
-    return bool(libc.prctl(_SET_SECCOMP, ctypes.c_ulong(_MODE_FILTER), about) == 0)
+    if libc.prctl(_SET_NO_NEW_PRIVILEGES, *map(ctypes.c_ulong, (1, 0, 0, 0))) or libc.prctl(
+        _SET_SECCOMP, ctypes.c_ulong(_MODE_FILTER), about
+    ):
+        number = ctypes.get_errno()
+        raise OSError(number, f"the kernel takes no filter ({os.strerror(number)})")
+    # Without the filter the first call fails with ENOSYS and the second makes a socket.
+    for call, arguments in ((libc.syscall, (_UNUSED_NUMBER,)), (libc.socket, (1, 1, 0))):
+        if call(*arguments) != -1 or ctypes.get_errno() != errno.EPERM:
+            raise OSError("the kernel took the filter and does not obey it")

@@ -31,6 +31,7 @@ from edp.storage import (
     remove_unfinished,
     write_json,
 )
+from edp.storage.paths import is_entry_at, is_there
 
 MANIFEST = "data_set.json"
 LIMIT = "limit.json"
@@ -180,7 +181,7 @@ def simulate_data_set(
     paths = [folder / f"{scenario.name}{suffix}" for scenario in plan]
     with _alone(folder) as check:
         bound = _bound(folder, identity)
-        missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
+        missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not is_there(path)]
         # Before the manifest: a refused order leaves the folder unbound.
         check_room(folder, missing, suffix)
         if not bound:
@@ -213,7 +214,7 @@ def simulate_data_set(
 def _bound(folder: Path, identity: dict[str, Any]) -> bool:
     """Whether a folder is bound to an order; False where it is bound to none."""
     manifest = folder / MANIFEST
-    if not os.path.lexists(manifest):
+    if not is_entry_at(manifest):
         return False
     if read_json(manifest) != identity:
         raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
@@ -266,7 +267,7 @@ def find_data_set_limit(
     plan = order.scenarios()
     key = _digest([identity_of(plan, WriteOptions()), asdict(spec)])
     target = make_folder(folder) / LIMIT
-    if os.path.lexists(target):
+    if is_entry_at(target):
         stored_limit = read_json(target)
         if isinstance(stored_limit, dict) and stored_limit.get("key") == key:
             return stored_limit

@@ -56,9 +56,12 @@ def thesis_power(
     experiments: int = 3000,
     seed: int = 0,
 ) -> float:
-    """Eq. 2.19 and 2.20: share of simulated experiments in which a one-tailed z-test rejects.
+    """Return the fraction of simulated experiments in which the thesis's one-tailed test rejects (eq. 2.19 and 2.20).
 
-    The z-test takes the sample standard deviation, as the printed p-values of Table 4.5 do.
+    The test divides by the sample standard deviation, but takes the quantile of the normal distribution, as the printed
+    p-values of Table 4.5 do. Its power is that of a noncentral t variable above this quantile, and exceeds the power of
+    a z-test with a known standard deviation. At two splits, ``delta = 0.866 sigma_seed`` and one seed the power is 0.50
+    in place of 0.34, because the test rejects too often: 0.17 in place of 0.05 without any effect.
 
     Raises:
         ConfigError: fewer than two splits or a value that is not above zero.

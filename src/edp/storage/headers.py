@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from edp.storage.reading import read_bytes, read_object
+from edp.errors import StorageError
+from edp.storage.reading import JSON_BYTES, object_with, parse_json, read_bytes, read_text
+from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
-HASH = "blake2b"
-"""Key of the hash over the rest of the header."""
 ARRAYS_BYTES = 2**30
 """Most that a file of arrays has; the weights of 250 million parameters."""
+FILES = "files"
+"""Key of the hashes of files beside a JSON file."""
 _ENTRY = {"file", HASH}
 
 
-def header_digest(header: Mapping[str, Any]) -> str:
-    """Hash over all of a header but its hash: what is fed and predicted, and in which order, is under it."""
-    # One round through JSON: the hash is over what a reader will see, tuples as lists.
-    plain = json.loads(json.dumps({key: value for key, value in header.items() if key != HASH}, allow_nan=False))
-    text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
-    return arrays_digest(text.encode())
+def read_header(file: str | Path, keys: Iterable[str] = ()) -> dict[str, Any]:
+    """Return a header with its hash, which is not checked: headers of several schemas state it differently.
+
+    Raises:
+        StorageError: the file cannot be read, is not JSON, holds no object, or lacks one of the keys.
+    """
+    return object_with(parse_json(read_text(file, JSON_BYTES), f"'{file}'"), keys, f"'{file}'")
 
 
-def arrays_digest(data: bytes) -> str:
-    """Digest of a file of arrays, as a header states it."""
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
+def digests_of(folder: str | Path, *names: str) -> dict[str, str]:
+    """Return what a JSON file states under `FILES` of the files beside it: the hash of each, by name."""
+    return {name: digest_of_bytes(read_bytes(Path(folder, name), ARRAYS_BYTES)) for name in names}
+
+
+def check_files(content: Mapping[str, Any], folder: str | Path, advice: str) -> None:
+    """Refuse files beside a JSON file that are not the ones it was written with.
+
+    Args:
+        content: of the JSON file; one of an earlier version states no hashes.
+        folder: of the JSON file.
+        advice: what to do about it.
+
+    Raises:
+        StorageError: a file is missing, or was changed or replaced since.
+    """
+    stated = content.get(FILES, {})
+    for name, digest in stated.items() if isinstance(stated, dict) else ():
+        file = Path(folder, Path(str(name)).name)  # never a path out of the folder
+        if digest_of_bytes(read_bytes(file, ARRAYS_BYTES)) != digest:
+            raise StorageError(f"'{file}' was changed since it was written with the result beside it; {advice}")
 
 
 def is_whole(file: Path) -> bool:
@@ -38,12 +57,12 @@ def is_whole(file: Path) -> bool:
     Raises:
         StorageError: a file cannot be read, is no regular one or too large, or the header is no JSON object.
     """
-    header = read_object(file)
-    if HASH in header and header[HASH] != header_digest(header):
+    header = read_header(file)
+    if HASH in header and header[HASH] != content_digest(header):
         return False
     for entry in _entries(header):
         name = Path(str(entry["file"])).name  # never a path out of the folder
-        if arrays_digest(read_bytes(file.parent / name, ARRAYS_BYTES)) != entry[HASH]:
+        if digest_of_bytes(read_bytes(file.parent / name, ARRAYS_BYTES)) != entry[HASH]:
             return False
     return True
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from edp.errors import StorageError
 from edp.storage.portable import BINARY, QUIETLY
+from edp.storage.seals import unsealed
 
 JSON_BYTES = 64 * 2**20
 """Of a JSON file; larger ones are not EDP's own."""
@@ -92,13 +93,14 @@ def read_text(path: str | Path, limit: int, where: str = "", error: type[Excepti
 
 
 def read_json(path: str | Path, where: str = "", error: type[Exception] = StorageError) -> Any:
-    """A JSON file; see `parse_json`.
+    """Return the content of a JSON file of EDP; see `parse_json`. A hash of the content is checked and left out.
 
     Raises:
-        Exception: `error`; the file is missing, unreadable, beyond its bounds, or not JSON.
+        Exception: `error`; the file is missing, unreadable, beyond its bounds, not JSON, or changed since it was
+            written.
     """
     where = where or f"'{path}'"
-    return parse_json(read_text(path, JSON_BYTES, where, error), where, error)
+    return unsealed(parse_json(read_text(path, JSON_BYTES, where, error), where, error), where, error)
 
 
 def read_object(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import time
@@ -13,7 +14,9 @@ from typing import Any
 from edp.errors import StorageError
 from edp.storage.headers import is_whole
 from edp.storage.locks import held_by
+from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_of
 from edp.storage.reading import parse_json, read_text, read_toml
+from edp.storage.seals import unsealed
 
 MOST_FOLDERS = 20_000
 """Folders that are looked into: more is a whole disk."""
@@ -48,9 +51,10 @@ class ListedRun:
 
     Attributes:
         folder: where it is.
-        kind: ``network`` or what `_MARKS` says.
+        kind: ``network`` or what `_MARKS` says; ``-`` for a folder that cannot be read.
         state: ``finished``, ``running``, ``stopped``, ``diverged``, or ``damaged`` where a file cannot be read, its
-            settings are no TOML, or what it made is not there or not as it was written.
+            settings are no TOML, or what it made is not there or not as it was written; ``cannot be read: REASON``
+            for a folder that this process has no right to look into.
         when: of its last state, as its files say; else of its files.
         data: where its recordings were.
         score: its error on test logs in words; empty where it was not judged.
@@ -73,15 +77,20 @@ def list_runs(folder: str | Path) -> tuple[list[ListedRun], bool]:
         StorageError: there is no such folder.
     """
     top = Path(folder)
-    if not top.is_dir():
+    if not is_folder_at(top):
         raise StorageError(f"no folder at '{top}'; give one that holds runs")
     runs, whole = [], True
     for number, path in enumerate(_folders(top)):
         if number >= MOST_FOLDERS:
             whole = False
             break
-        if any((path / name).is_file() for name in _RUN):
-            runs.append(_run(path))
+        try:
+            if any(is_file_at(path / name) for name in _RUN):
+                runs.append(_run(path))
+            elif not os.access(path, os.R_OK | os.X_OK):
+                runs.append(_unreadable(path, os.strerror(errno.EACCES)))
+        except StorageError as error:
+            runs.append(_unreadable(path, _reason(error)))
     return sorted(runs, key=lambda run: run.when, reverse=True), whole
 
 
@@ -91,18 +100,27 @@ def _folders(top: Path) -> Iterator[Path]:
     while waiting:
         path, depth = waiting.pop()
         yield path
-        if depth == DEEPEST or (path / "run.json").is_file():
-            continue
         try:
-            with os.scandir(path) as entries:
-                below = sorted(e.name for e in entries if e.is_dir(follow_symlinks=False) and e.name[:1] != ".")
-        except OSError:  # not ours to read
+            if depth == DEEPEST or is_file_at(path / "run.json"):
+                continue
+            below = [e for e in entries_of(path) if e.name[:1] != "." and is_folder_at(e) and not is_link_at(e)]
+        except StorageError:  # listed as a folder that cannot be read
             continue
-        waiting += [(path / name, depth + 1) for name in reversed(below)]
+        waiting += [(entry, depth + 1) for entry in reversed(below)]
+
+
+def _reason(error: StorageError) -> str:
+    cause = error.__cause__
+    return (cause.strerror if isinstance(cause, OSError) else None) or str(error)
+
+
+def _unreadable(path: Path, reason: str) -> ListedRun:
+    """Return the row of a folder that cannot be looked into."""
+    return ListedRun(path, "-", f"cannot be read: {reason.lower()}"[:_LONGEST], "", "", "")
 
 
 def _run(path: Path) -> ListedRun:
-    kind = next((kind for mark, kind in _MARKS.items() if (path / mark).is_file()), "network")
+    kind = next((kind for mark, kind in _MARKS.items() if is_file_at(path / mark)), "network")
     damaged: list[str] = []
     status, provenance, scores = (_part(path / f"{name}.json", damaged) for name in ("status", "provenance", "scores"))
     state = str(status.get("status", ""))
@@ -124,7 +142,7 @@ def _damaged_parts(path: Path, finished: str) -> list[str]:
     """Settings and results of a run that are damaged; of a finished one of that kind, also a result that is missing."""
     damaged = []
     try:
-        if (path / "config.toml").is_file():
+        if is_file_at(path / "config.toml"):
             read_toml(path / "config.toml")
     except StorageError:
         damaged.append("config.toml")
@@ -132,7 +150,7 @@ def _damaged_parts(path: Path, finished: str) -> list[str]:
         file = path / name
         try:
             missing = name == _HEADERS[0] and finished in _NETWORKS
-            damaged += [name] if (not is_whole(file) if file.is_file() else missing) else []
+            damaged += [name] if (not is_whole(file) if is_file_at(file) else missing) else []
         except (StorageError, ValueError):
             damaged.append(name)
     return damaged
@@ -140,11 +158,12 @@ def _damaged_parts(path: Path, finished: str) -> list[str]:
 
 def _part(file: Path, damaged: list[str]) -> Mapping[str, Any]:
     """A JSON file of a run; empty where there is none or it is damaged."""
-    if not file.is_file():
+    if not is_file_at(file):
         return {}
     try:
         content = parse_json(read_text(file, _BYTES), f"'{file}'", finite=False)
-    except StorageError:
+        content = unsealed(content, f"'{file}'", StorageError)
+    except (StorageError, ValueError):  # also a number that is not finite, under a hash
         content = None
     if not isinstance(content, dict):
         damaged.append(file.name)
@@ -155,8 +174,8 @@ def _part(file: Path, damaged: list[str]) -> Mapping[str, Any]:
 def _touched(path: Path) -> str:
     """When a folder was last written, in the form of the files."""
     try:
-        return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(path.stat().st_mtime))
-    except (OSError, OverflowError, ValueError):
+        return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(status_of(path).st_mtime))
+    except (StorageError, OverflowError, ValueError):
         return ""
 
 

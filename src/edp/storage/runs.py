@@ -19,6 +19,7 @@ from typing import Any
 from edp import __version__
 from edp.errors import BusyError, StorageError
 from edp.storage.locks import check_held, held_by, hold
+from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
 from edp.storage.reading import object_with, read_object
 from edp.storage.writing import make_folder, remove_unfinished, write_bytes, write_json
 
@@ -96,7 +97,7 @@ class RunFolder:
             StorageError: the folder holds a run with other settings, data or code version.
         """
         identity = self.file(IDENTITY)
-        if identity.exists():
+        if is_there(identity):
             stored_identity = read_object(identity, ("key",))
             if stored_identity["key"] != key:
                 raise StorageError(
@@ -117,7 +118,7 @@ class RunFolder:
     def status(self) -> dict[str, Any]:
         """Where the run stands; empty where nothing was written yet."""
         status_file = self.file(STATUS)
-        return read_object(status_file, ("status", "time")) if status_file.exists() else {}
+        return read_object(status_file, ("status", "time")) if is_there(status_file) else {}
 
     def remove_parts(self) -> None:
         """Delete the folders of its single trainings, which only an unfinished run reads."""
@@ -139,8 +140,8 @@ def unfinished_text(folder: str | Path) -> str:
         StorageError: the status of the run is damaged.
     """
     path = Path(folder)
-    started = (path / IDENTITY).is_file() or all((path / name).is_file() for name in LEFT)
-    status = read_object(path / STATUS, ("status",)) if (path / STATUS).is_file() else {}
+    started = is_file_at(path / IDENTITY) or all(is_file_at(path / name) for name in LEFT)
+    status = read_object(path / STATUS, ("status",)) if is_file_at(path / STATUS) else {}
     if not started or status.get("status") in ENDED:
         return ""
     holder = held_by(path / ".lock")
@@ -160,11 +161,11 @@ def check_free(path: str | Path, what: str) -> None:
         StorageError: it is a file, or holds something and no run.
     """
     folder = Path(path)
-    if not folder.exists() or (folder / IDENTITY).is_file():
+    if not is_there(folder) or is_file_at(folder / IDENTITY):
         return
-    if not folder.is_dir():
+    if not is_folder_at(folder):
         raise StorageError(f"'{folder}' is a file; {what} writes a folder: choose another name")
-    others = sorted(entry.name for entry in folder.iterdir() if entry.name not in LEFT)
+    others = sorted(entry.name for entry in entries_of(folder) if entry.name not in LEFT)
     if others:
         raise StorageError(
             f"folder '{folder}' is not empty and holds no run ('{others[0][:60]}'); nothing was changed. Choose a new "
@@ -204,7 +205,7 @@ def read_provenance(folder: str | Path) -> dict[str, Any]:
         StorageError: not a run folder, or its provenance is damaged.
     """
     file = Path(folder) / "provenance.json"
-    if not file.is_file():
+    if not is_file_at(file):
         raise StorageError(
             unfinished_text(folder)
             or f"'{folder}' is not a run folder: it has no {file.name}; give the folder of edp train"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
+from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.reading import read_json
 
 FILE, SCHEMA = "study.json", 2
@@ -26,9 +27,9 @@ def read_study(path: str | Path) -> Mapping[str, Any]:
         StorageError: missing, unreadable, of another schema, or no study.
     """
     file = Path(path)
-    if file.is_dir() or file.suffix != ".json":
+    if is_folder_at(file) or file.suffix != ".json":
         file = file / FILE
-        if not file.is_file():
+        if not is_file_at(file):
             raise StorageError(f"'{path}' holds no study ({FILE} is missing); give the folder of edp search --study")
     study = read_json(file)
     check_study(study, str(file))

@@ -7,12 +7,14 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
+from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at
 from edp.storage.portable import BINARY, QUIETLY
+from edp.storage.seals import sealed
 
 
 def storage_error(path: Path, error: OSError, doing: str) -> StorageError:
@@ -111,7 +113,7 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     try:
         temporary.mkdir()
         yield temporary
-        if os.name == "nt" and target.is_dir():
+        if os.name == "nt" and is_folder_at(target):
             target.rmdir()  # Windows renames onto nothing that is there
         temporary.rename(target)
     except OSError as error:
@@ -122,9 +124,9 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
 
 def remove_unfinished(folder: Path) -> None:
     """Remove what a process that was killed while it wrote has left; only for who holds the folder."""
-    for rest in folder.glob(".*.tmp"):
+    for rest in entries_of(folder, ".*.tmp"):
         # A link of this name is not ours.
-        if rest.is_file() and not rest.is_symlink():
+        if is_file_at(rest) and not is_link_at(rest):
             rest.unlink(missing_ok=True)
 
 
@@ -134,6 +136,6 @@ def write_bytes(path: str | Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def write_json(path: str | Path, value: Any) -> None:
-    """Write JSON atomically; NaN and infinity are refused, they are not JSON."""
-    write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+def write_json(path: str | Path, value: Mapping[str, Any]) -> None:
+    """Write an object as JSON with the hash of its content (`edp.storage.seals`); NaN and infinity are refused."""
+    write_bytes(path, (json.dumps(sealed(value), indent=1, allow_nan=False) + "\n").encode())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,9 +30,11 @@ from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain
 from edp.networks.predictor import Predictor
 from edp.registry import missing_parts, origins_in
 from edp.signals import Channel, Kind
-from edp.storage import make_folder, object_with, read_bytes, read_json, write_bytes, write_json
-from edp.storage.headers import ARRAYS_BYTES, HASH, arrays_digest, header_digest
+from edp.storage import make_folder, object_with, read_bytes, write_bytes, write_json
+from edp.storage.headers import ARRAYS_BYTES, read_header
+from edp.storage.paths import entries_of, is_entry_at
 from edp.storage.runs import unfinished_text
+from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 SCHEMA = 8
 INTEGER_SCHEMA = 9
@@ -115,7 +116,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         )
     path = make_folder(folder)  # an old bundle stays valid until the header is renamed
     data = _weights_bytes(bundle.predictor)
-    digest = arrays_digest(data)
+    digest = digest_of_bytes(data)
     # Names by content: a reader of the old header never finds new weights under the old name.
     weights = f"weights-{digest[:12]}.safetensors"
     write_bytes(path / weights, data)
@@ -146,9 +147,11 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
-    write_json(path / HEADER, sealed(header))
+    write_json(path / HEADER, with_plugins(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken bundle.
-    for old in (file for what in ("weights", "integers", "adaptation") for file in path.glob(f"{what}-*.safetensors")):
+    for old in (
+        file for what in ("weights", "integers", "adaptation") for file in entries_of(path, f"{what}-*.safetensors")
+    ):
         if old.name not in referenced:
             old.unlink(missing_ok=True)
     return path
@@ -161,7 +164,7 @@ def _integers_bytes(predictor: IntegerPredictor) -> bytes:
 
 def write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
     """Write arrays beside the weights; returns file and digest."""
-    digest = arrays_digest(data)
+    digest = digest_of_bytes(data)
     file = f"{what}-{digest[:12]}.safetensors"
     write_bytes(path / file, data)
     return {"file": file, "blake2b": digest}
@@ -185,11 +188,10 @@ def load_bundle(folder: str | Path) -> Bundle:
         return _assembled(header, path)
 
 
-def sealed(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a header with the plug-ins whose parts it names, and with its hash."""
+def with_plugins(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a header with the plug-ins whose parts it names."""
     plugins = origins_in(header)
-    complete = {**header, PLUGINS: plugins} if plugins else dict(header)
-    return complete | {HASH: header_digest(complete)}
+    return {**header, PLUGINS: plugins} if plugins else dict(header)
 
 
 def check_hash(header: Mapping[str, Any], file: Path) -> None:
@@ -199,7 +201,7 @@ def check_hash(header: Mapping[str, Any], file: Path) -> None:
         BundleError: one of both; the message names the package of a part.
     """
     # The hash protects against damage and stray edits, not against an attacker: it has no key.
-    if header.get(HASH) != header_digest(header):
+    if header.get(HASH) != content_digest(header):
         raise BundleError(f"'{file}' does not match its hash: it was cut off or changed by hand; restore the bundle")
     built = {key: value for key, value in header.items() if key not in ("provenance", "scores")}
     missing = missing_parts(header.get(PLUGINS), built)
@@ -226,7 +228,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
         upgraded = _reworded(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
         _assembled(upgraded, path)
-    write_json(path / HEADER, sealed(upgraded))
+    write_json(path / HEADER, with_plugins(upgraded))
     return path
 
 
@@ -246,10 +248,10 @@ def _renamed(table: Mapping[str, Any], old: str, new: str) -> dict[str, Any]:
 def _bundle_folder(folder: str | Path) -> Path:
     path = Path(folder)
     # Both the run folder and the bundle in it are accepted.
-    path = path / "bundle" if os.path.lexists(path / "bundle" / HEADER) else path
-    if os.path.lexists(path / "twin" / "twin.json"):
+    path = path / "bundle" if is_entry_at(path / "bundle" / HEADER) else path
+    if is_entry_at(path / "twin" / "twin.json"):
         raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
-    if not os.path.lexists(path / HEADER):
+    if not is_entry_at(path / HEADER):
         missing = f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote"
         raise BundleError(unfinished_text(path) or missing)
     return path
@@ -272,7 +274,7 @@ def as_damage(path: Path) -> Iterator[None]:
 
 
 def _read_header(path: Path) -> dict[str, Any]:
-    header = read_json(path / HEADER)
+    header = read_header(path / HEADER)
     if not isinstance(header, dict) or "schema" not in header:
         header = {"schema": None}
     return header
@@ -386,10 +388,10 @@ def _check_schema(header: Mapping[str, Any], path: Path) -> None:
 def read_arrays(path: Path, entry: Mapping[str, str]) -> bytes:
     """A file of arrays that a header names, checked against its digest."""
     file = path / Path(_text(entry["file"])).name  # never a path out of the bundle
-    if not os.path.lexists(file):
+    if not is_entry_at(file):
         raise BundleError(f"bundle '{path}' lacks its weights '{file.name}'; restore the bundle")
     data = read_bytes(file, ARRAYS_BYTES, f"weights '{file}'", BundleError)
-    if arrays_digest(data) != entry["blake2b"]:
+    if digest_of_bytes(data) != entry["blake2b"]:
         raise BundleError(f"weights '{file}' do not match their digest: cut off or changed; restore the bundle")
     return data
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from torch import Tensor
 from edp.errors import StorageError
 from edp.networks.streaming import State
 from edp.storage import parse_json, read_bytes, write_bytes
+from edp.storage.paths import is_entry_at
 from edp.training.schedules import ScheduleState
 
 CHECKPOINT_BYTES = 16 * 2**30
@@ -92,7 +92,7 @@ def load_checkpoint(path: Path, key: str) -> tuple[Progress, Weights, dict[str, 
     Raises:
         StorageError: the file is damaged, in a single bit, too, or belongs to another run.
     """
-    if not os.path.lexists(path):
+    if not is_entry_at(path):
         return None
     data = read_bytes(path, CHECKPOINT_BYTES, f"checkpoint '{path}'")
     try:

@@ -13,6 +13,7 @@ from edp.networks.twin import TwinScales
 from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, member_seed
 from edp.networks.twin.static_map import StaticTwin
 from edp.storage import read_object, write_json
+from edp.storage.paths import is_file_at
 from edp.storage.runs import PARTS, KeyedRun, RunFolder
 from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
 
@@ -89,7 +90,7 @@ def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
 
 
 def _noted(job: MemberTraining) -> FreeRunProgress | None:
-    if job.folder is None or not (note := job.folder[0] / NOTE).is_file():
+    if job.folder is None or not is_file_at(note := job.folder[0] / NOTE):
         return None
     try:
         row = read_object(note, ("update", "updates", "length_s", "seconds_left", "validation", "best"))

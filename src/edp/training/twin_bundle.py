@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,11 +19,13 @@ from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
 from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel, Kind
-from edp.storage import make_folder, object_with, read_json, write_json
-from edp.storage.headers import HASH
+from edp.storage import make_folder, object_with, write_json
+from edp.storage.headers import read_header
 from edp.storage.memory import check_setting
+from edp.storage.paths import entries_of, is_entry_at
 from edp.storage.runs import unfinished_text
-from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, sealed, write_arrays
+from edp.storage.seals import HASH
+from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, with_plugins, write_arrays
 
 SCHEMA = 2
 GROUNDED = 3
@@ -105,9 +106,9 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     }
     if bundle.ground is not None:
         header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
-    write_json(path / HEADER, sealed(header))
+    write_json(path / HEADER, with_plugins(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken twin.
-    for old in path.glob("weights-*.safetensors"):
+    for old in entries_of(path, "weights-*.safetensors"):
         if old.name != entry["file"]:
             old.unlink(missing_ok=True)
     return path
@@ -116,7 +117,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
 def holds_twin(folder: str | Path) -> bool:
     """Whether a folder, or the run folder around it, is that of a twin."""
     path = Path(folder)
-    return os.path.lexists(path / HEADER) or os.path.lexists(path / "twin" / HEADER)
+    return is_entry_at(path / HEADER) or is_entry_at(path / "twin" / HEADER)
 
 
 def twin_hash(folder: str | Path) -> str:
@@ -130,14 +131,14 @@ def twin_hash(folder: str | Path) -> str:
     """
     path = _twin_folder(folder)
     with as_damage(path):
-        header = object_with(read_json(path / HEADER), (HASH,), f"'{path / HEADER}'")
+        header = read_header(path / HEADER, (HASH,))
         check_hash(header, path / HEADER)
         return str(header[HASH])
 
 
 def _twin_folder(folder: str | Path) -> Path:
     path = Path(folder)
-    return path / "twin" if os.path.lexists(path / "twin" / HEADER) else path
+    return path / "twin" if is_entry_at(path / "twin" / HEADER) else path
 
 
 def load_twin(folder: str | Path) -> TwinBundle:
@@ -150,11 +151,11 @@ def load_twin(folder: str | Path) -> TwinBundle:
         BundleError: not a twin, another schema, damaged numbers, or a formulation that this version does not know.
     """
     path = _twin_folder(folder)
-    if not os.path.lexists(path / HEADER):
+    if not is_entry_at(path / HEADER):
         missing = f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote"
         raise BundleError(unfinished_text(path) or missing)
     with as_damage(path):
-        header = object_with(read_json(path / HEADER), ("schema",), f"'{path / HEADER}'")
+        header = read_header(path / HEADER, ("schema",))
         schema = header["schema"]
         if isinstance(schema, bool) or schema not in READABLE:
             raise BundleError(

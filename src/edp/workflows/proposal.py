@@ -22,6 +22,7 @@ from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.signals import Kind
 from edp.storage import make_folder, write_bytes
+from edp.storage.paths import is_file_at, is_link_at, is_there, status_of
 from edp.workflows.proposal_files import (
     DATA,
     MAP,
@@ -211,11 +212,11 @@ def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
     """Logs without files that hold the same bytes as an earlier one, and these with that one: a test on a copy of
     what trained says nothing.
     """
-    sizes = Counter(path.stat().st_size for path in paths if path.is_file())
+    sizes = Counter(status_of(path).st_size for path in paths if is_file_at(path))
     seen: dict[bytes, Path] = {}
     single, copies = [], []
     for path in paths:
-        if not path.is_file() or sizes[path.stat().st_size] == 1:
+        if not is_file_at(path) or sizes[status_of(path).st_size] == 1:
             single.append(path)
             continue
         with path.open("rb") as stream:
@@ -252,7 +253,7 @@ def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool =
     """
     out = Path(folder)
     paths = [out / name for name in proposal.files]
-    there = [path for path in paths if path.exists() or path.is_symlink()]
+    there = [path for path in paths if is_there(path) or is_link_at(path)]
     if there and not overwrite:
         shown = ", ".join(f"'{path}'" for path in there)
         raise StorageError(
@@ -288,7 +289,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
         notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")
     roles = {guess.role for guess in proposal.columns}
     notes += ["labels: those that are known while the machine works may be features"] * ("label" in roles)
-    notes += [f"not readable: {reason[:300]}" for reason in list(broken.values())[:3]]
+    notes += [f"not readable: {reason}" for reason in list(broken.values())[:3]]
     if len(broken) > 3:
         notes.append(f"{len(broken) - 3} more logs are not readable")
     return notes

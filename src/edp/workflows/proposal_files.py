@@ -14,6 +14,7 @@ from edp.logs.read import unique_names
 from edp.logs.source import map_of_table
 from edp.settings.tree import parse_toml
 from edp.signals import VOCABULARY, Kind, SignalMap
+from edp.storage.paths import full_path
 
 MAP, SETTINGS, DATA = "map.toml", "settings.toml", "data.toml"
 MOST_FEATURES = 48
@@ -92,12 +93,12 @@ def settings_text(proposal: MapProposal, channels: Sequence[str], targets: Seque
 
 def listed_path(path: Path) -> str:
     """A path for a data-set file, which puts environment variables in."""
-    return str(path.resolve())
+    return str(full_path(path))
 
 
 def named_paths(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     """Paths that a data-set file can list, each with a name of its own."""
-    usable = [path for path in paths if "$" not in str(path.resolve()) and str(path).isprintable()]
+    usable = [path for path in paths if "$" not in str(full_path(path)) and str(path).isprintable()]
     return list(zip(usable, unique_names([path.stem for path in usable], usable)))
 
 

@@ -29,6 +29,8 @@ from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
 from edp.storage import check_writable, make_folder, write_bytes, write_json
+from edp.storage.headers import FILES, digests_of
+from edp.storage.paths import is_folder_at, is_there
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
@@ -181,7 +183,7 @@ def _refuse_diverged(run: RunFolder) -> None:
     # Every training is deterministic: trying again would take as long and end alike.
     status = run.status()
     if status.get("status") == "diverged":
-        bundle_note = " Its bundle holds the weights from before." if run.file("bundle").exists() else ""
+        bundle_note = " Its bundle holds the weights from before." if is_there(run.file("bundle")) else ""
         raise Diverged(
             f"the run in '{run.path}' diverged on {status['time']}: {status['message']}. The same settings would do so "
             f"again.{bundle_note} Change them and choose another folder with --out, or remove this one",
@@ -279,7 +281,7 @@ def evaluate(
         sample = {} if drawn is None else {"drawn": {**asdict(drawn), "what": drawn.what}}
         scores = evaluation.scores | sample | {"key": "" if "left_out" in evaluation.scores else key}
         write_bytes(target / "predictions.safetensors", save(evaluation.tensors))
-        write_json(target / "scores.json", scores)
+        write_json(target / "scores.json", scores | {FILES: digests_of(target, "predictions.safetensors")})
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
         save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
@@ -293,7 +295,7 @@ def other_recordings(source: DataSource | None, provenance: Mapping[str, Any]) -
 
 def _check_run_writable(folder: Path) -> None:
     """See before minutes of work that a run folder can be written; a missing one is reported by its reader."""
-    if folder.is_dir():
+    if is_folder_at(folder):
         check_writable(folder)
 
 
@@ -352,7 +354,7 @@ def channel_importance(
 
 def _floor_scores(folder: Path, data: Prepared, scores: Mapping[str, Any]) -> dict[str, Any] | None:
     """Scores, on the same ticks, of what the preset auto tells its skill against; None where the run has none."""
-    if not (folder / FLOOR).is_dir():
+    if not is_folder_at(folder / FLOOR):
         return None
     floor = load_bundle(folder / FLOOR).predictor
     return score_network(floor, data, scores["task"]["skip"])

@@ -52,7 +52,6 @@ class Ended:
 @pytest.fixture
 def edp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
     """Run a command line: ``edp("inspect", folder)``."""
-    monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("TERM", "dumb")
 
     def run(*args: object) -> Ended:

@@ -8,6 +8,7 @@ import pytest
 
 from edp.cli.evaluate import baseline_names
 from edp.evaluation.baselines import BASELINES
+from edp.storage import write_json
 
 SETTINGS = ("--set", "task.targets=['CylVels_1']", "--set", "task.horizons=[5]", "--minutes", "0.01")
 
@@ -53,7 +54,7 @@ def test_a_network_that_loses_says_so_first_and_by_its_exit_code(edp, trained):
         for targets in scores["models"][model]["overall"].values():
             for metrics in targets.values():
                 metrics["rmse"] = factor
-    file.write_text(json.dumps(scores))
+    write_json(file, scores)
     lost = edp(*few)
     assert lost.code == 6
     assert lost.out.startswith("On the held-out recordings Persistence has 50.0 % less error")
@@ -61,7 +62,7 @@ def test_a_network_that_loses_says_so_first_and_by_its_exit_code(edp, trained):
     for targets in scores["models"]["network"]["overall"].values():
         for metrics in targets.values():
             metrics["rmse"] = 0.5
-    file.write_text(json.dumps(scores))
+    write_json(file, scores)
     won = edp(*few)
     assert won.code == 0
     assert "less error than the network" not in won.out

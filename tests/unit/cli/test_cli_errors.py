@@ -6,6 +6,7 @@ import json
 import pytest
 
 from edp.logs import write_recording
+from edp.storage import write_json
 
 TABLE_HEAD = "time,CylVels_1,CylVels_2\n"
 
@@ -183,7 +184,7 @@ def test_damaged_weights(edp, trained):
 def test_recordings_that_changed_after_training(edp, trained, recording_of, logs, tmp_path):
     provenance = json.loads((trained / "provenance.json").read_text())
     provenance["data"]["reader"]["path"] = str(tmp_path / "other")
-    (trained / "provenance.json").write_text(json.dumps(provenance))
+    write_json(trained / "provenance.json", provenance)
     for i in range(5):
         write_recording(recording_of(f"drive_{i}", seed=i + 50), tmp_path / "other" / f"drive_{i}.parquet")
     refused(edp("evaluate", trained), "changed since", "--data")

@@ -72,7 +72,7 @@ def test_many_logs_have_a_line_each_and_details_on_demand(edp, tmp_path):
 
 def test_tables_fit_into_the_terminal_with_whole_names(edp, tmp_path, monkeypatch):
     folder = excavator(tmp_path / "logs", 1)
-    monkeypatch.setattr(console.out, "_width", 80)
+    monkeypatch.setenv("COLUMNS", "80")
     shown = edp("inspect", folder, "--details", "--no-coverage").out
     tables = [line for line in shown.splitlines() if line.startswith(("Cyl", "channel", "Bm", "Am", "Bkt"))]
     assert max(map(len, tables)) <= 80
@@ -81,7 +81,7 @@ def test_tables_fit_into_the_terminal_with_whole_names(edp, tmp_path, monkeypatc
 
 
 def test_wide_tables_are_parted_into_blocks(capsys, monkeypatch):
-    monkeypatch.setattr(console.out, "_width", 30)
+    monkeypatch.setenv("COLUMNS", "30")
     console.table("wide", ["name", "first", "second", "third"], [["CylPressures_1", 1.5, "22222222", 1234567]])
     lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
     assert lines[0] == "wide"
@@ -96,7 +96,7 @@ def test_wide_tables_are_parted_into_blocks(capsys, monkeypatch):
 @pytest.mark.parametrize("name", [9, 60, 200])
 @pytest.mark.parametrize("cell", [3, 70, 300])
 def test_no_character_of_a_table_is_lost_at_80_columns_however_wide_it_is(capsys, monkeypatch, show, name, cell):
-    monkeypatch.setattr(console.out, "_width", 80)
+    monkeypatch.setenv("COLUMNS", "80")
     rows = [[f"CylPressures_{n}".ljust(name, "x"), "over: ".ljust(cell - 1, "y") + str(n), "5"] for n in range(3)]
     show("", ["name", "budget", "k"], rows)
     shown = capsys.readouterr().out

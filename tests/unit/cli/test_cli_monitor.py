@@ -13,6 +13,7 @@ from edp.logs.source import DataSource
 from edp.monitor.monitor_file import load_monitor
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY
+from edp.storage import write_json
 from edp.testing.monitor import rig_sessions
 from edp.workflows.monitor import fit_monitor
 
@@ -143,11 +144,11 @@ def test_what_is_remarked_of_logs_stands_on_the_page_and_a_damaged_remark_is_ref
     assert edp("monitor", "run", fitted, write(logs(1, first=42), tmp_path / "day"), "--out", out).code in (0, 5)
     run = json.loads((out / "run.json").read_text())
     assert run["unlike"] == {}
-    (out / "run.json").write_text(json.dumps(run | {"unlike": {"<b>monday": "all axes are off"}}))
+    write_json(out / "run.json", run | {"unlike": {"<b>monday": "all axes are off"}})
     assert edp("monitor", "report", out).code == 0
     assert "Of &lt;b&gt;monday: all axes are off." in (out / "report.html").read_text()
     for damaged in ([], {"monday": 3}, {"monday": "x" * 5000}, {"monday": ["a", None]}):
-        (out / "run.json").write_text(json.dumps(run | {"unlike": damaged}))
+        write_json(out / "run.json", run | {"unlike": damaged})
         ended = edp("monitor", "report", out)
         assert ended.code == 1
         assert "run the monitor again" in " ".join(ended.err.split())

@@ -7,8 +7,8 @@ import pytest
 
 from edp.cli import doctor as doctor_command
 from edp.storage import run_listing, write_bytes, write_json
-from edp.storage.headers import HASH, arrays_digest, header_digest
 from edp.storage.locks import hold
+from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 
 def run(folder, **files):
@@ -22,8 +22,8 @@ def run(folder, **files):
 def bundle(folder):
     """What a finished training leaves, as far as a listing looks."""
     write_bytes(folder / "bundle" / "weights.safetensors", b"weights")
-    header = {"schema": 8, "weights": {"file": "weights.safetensors", HASH: arrays_digest(b"weights")}}
-    write_json(folder / "bundle" / "bundle.json", header | {HASH: header_digest(header)})
+    header = {"schema": 8, "weights": {"file": "weights.safetensors", HASH: digest_of_bytes(b"weights")}}
+    write_json(folder / "bundle" / "bundle.json", header | {HASH: content_digest(header)})
     (folder / "config.toml").write_text("[task]\n")
 
 
@@ -114,8 +114,8 @@ def test_a_finished_run_of_which_a_part_is_damaged_or_gone_is_damaged(edp, folde
 
 def test_a_header_leads_to_no_file_outside_of_its_folder(edp, folder):
     (folder / "secret").write_bytes(b"weights")
-    header = {"weights": {"file": "../../secret", HASH: arrays_digest(b"weights")}}
-    write_json(folder / "one" / "bundle" / "bundle.json", header | {HASH: header_digest(header)})
+    header = {"weights": {"file": "../../secret", HASH: digest_of_bytes(b"weights")}}
+    write_json(folder / "one" / "bundle" / "bundle.json", header | {HASH: content_digest(header)})
     rows = {row["folder"]: row["state"] for row in edp("runs", folder, "--json").json["runs"]}
     assert rows[f"{folder}/one"] == "damaged"
 

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,6 +228,14 @@ def test_a_rollout_writes_measured_and_free_values_row_by_row(edp, logs, trained
     assert ended.json["velocity_mae"]["mean"] == pytest.approx(error, rel=1e-4)
 
 
+def numbers(value: Any, path: str = "") -> dict[str, float]:
+    """Return the numbers of a nested JSON value by their path."""
+    if isinstance(value, dict | list):
+        entries = value.items() if isinstance(value, dict) else enumerate(value)
+        return {key: leaf for name, part in entries for key, leaf in numbers(part, f"{path}/{name}").items()}
+    return {path: value} if isinstance(value, int | float) else {}
+
+
 def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, logs, trained, tmp_path):
     run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
     write_recording(sample_actuators(seed=9, ticks=500), other / "later.parquet")
@@ -239,7 +248,9 @@ def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, l
     save_bundle(make_bundle(build_model(task, model, data.scaler(), 0).eval(), data, names), tmp_path / "predictor")
     before = read_object(run / "free_run.json")
     again = edp("evaluate", run, "--json").json
-    assert again["models"] == before["models"]
+    assert again["models"]["twin"] == before["models"]["twin"]
+    # Floors are fitted again, by products whose rounding follows the alignment of arrays in memory.
+    assert numbers(again["models"]) == pytest.approx(numbers(before["models"]), rel=1e-3, abs=1e-9)
     judged = edp("evaluate", run, "--data", other, "--predictor", tmp_path / "predictor", "--json").json
     assert judged["folder"] == str(run / "on_other")
     twin = judged["models"]["twin"]

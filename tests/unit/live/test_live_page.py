@@ -4,11 +4,12 @@ import asyncio
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import DESK, Browser, serious_findings
+from browser import DESK, Browser, page_faults, serious_findings
 
 from edp.live import Forecast, LiveLayout, LiveSession, LiveTrace, Pace, write_session_page
 from edp.live.server import LiveServer
@@ -39,9 +40,8 @@ def stream(session: LiveSession, ticks: int) -> None:
         session.append(np.array(row, np.float32))
 
 
-@pytest.fixture
-def served() -> Iterator[LiveServer]:
-    server = LiveServer(session_of(), Pace(100.0))
+@contextmanager
+def serving(server: LiveServer) -> Iterator[None]:
     ready, started = threading.Event(), {}
 
     async def run() -> None:
@@ -51,9 +51,16 @@ def served() -> Iterator[LiveServer]:
     thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
     thread.start()
     assert ready.wait(20)
-    yield server
+    yield
     started["loop"].call_soon_threadsafe(started["stop"].set)
     thread.join(20)
+
+
+@pytest.fixture
+def served() -> Iterator[LiveServer]:
+    server = LiveServer(session_of(), Pace(100.0))
+    with serving(server):
+        yield server
 
 
 def harmless(page: Browser, address: str) -> None:
@@ -153,3 +160,53 @@ def test_a_saved_session_replays_without_a_server(browser, tmp_path: Path):
         # Nothing foretold of the session before is held against the one that began anew.
         page.wait(f"({residual} !== '–') === {str(shown).lower()}")
     harmless(page, file.as_uri())
+
+
+WIDTHS = (1280, 1366, 1440, 1920, 390)
+
+
+def test_plots_do_not_overlap_at_any_width(browser, served, tmp_path):
+    session = served.session
+    stream(session, 600)
+    session.event("note", "a note")
+    session.end("done")
+    for address in (served.address, write_session_page(session, tmp_path / "session.html")):
+        for width in WIDTHS:
+            browser.open(address, (width, 900), phone=width < 500)
+            browser.wait("window.edpLive && edpLive.frames > 0 && document.querySelectorAll('.u-wrap').length > 2")
+            for dark in (False, True):
+                browser.size(width, 900, width < 500, dark)
+                assert page_faults(browser) == [], (address, width, dark)
+        # Plots follow their figures when others come and go.
+        browser.size(1366, 900)
+        for _ in range(2):
+            browser.run("document.querySelector('#boxes input').click()")
+            assert page_faults(browser) == []
+
+
+def test_a_page_without_rows_says_what_it_waits_for(browser):
+    session = session_of()
+    session.preparing = "compiling"
+    server = LiveServer(session, Pace(100.0))
+    with serving(server):
+        browser.open(server.address)
+        browser.wait("document.getElementById('state').textContent.startsWith('compiling')")
+        session.preparing = ""
+        browser.wait("document.getElementById('state').textContent.startsWith('waiting for the first values')")
+        stream(session, 10)
+        browser.wait("document.getElementById('state').textContent.startsWith('live')")
+
+
+def test_a_source_that_is_late_is_told_as_long_as_it_is(browser):
+    clock = [0.0]
+    pace = Pace(100.0, clock=lambda: clock[0])
+    server = LiveServer(session_of(), pace)
+    with serving(server):
+        browser.open(server.address)
+        pace.wait(0)
+        clock[0] = 5.0
+        pace.wait(1)
+        stream(server.session, 10)
+        browser.wait("document.getElementById('notice').textContent.includes('behind real time')")
+        stream(server.session, 1100)
+        browser.wait("document.getElementById('notice').hidden")

@@ -33,10 +33,11 @@ from edp.workflows.live import SOURCES, LiveOrder, LiveRun, SourceOptions
 from edp.workflows.live.free_run import LiveTwin
 from edp.workflows.live.look_ahead import LiveNetwork, spread
 from edp.workflows.live.run_live import AT_ONCE
+from edp.workflows.live.sources.arrivals import RowClock, Step
 from edp.workflows.live.sources.base import LiveSource, Needs
 from edp.workflows.live.sources.log import LogSource
 from edp.workflows.live.sources.sim import SimSource, view_of_truth
-from edp.workflows.live.sources.udp import MOST_BYTES, RowClock, UdpSource, row_of
+from edp.workflows.live.sources.udp import MOST_BYTES, UdpSource, row_of
 from edp.workflows.live.watch import LiveMonitor
 
 FAST = float("inf")
@@ -264,11 +265,11 @@ def test_a_datagram_is_a_row_with_missing_values():
 
 def test_the_clock_of_rows_sees_gaps_other_rates_and_time_that_goes_back():
     clock = RowClock(100.0)
-    assert [clock.tick(k / 100) for k in range(60)] == [(0, False)] * 60
+    assert [clock.tick(k / 100) for k in range(60)] == [Step()] * 60
     assert clock.measured_hz == pytest.approx(100.0)
-    assert clock.tick(0.59 + 0.05) == (4, False)
-    assert clock.tick(0.0) == (0, True)
-    for k in range(200):
+    assert clock.tick(0.59 + 0.05) == Step(4)
+    assert clock.tick(0.0) == Step(restart="time went back")
+    for k in range(1, 200):
         clock.tick(k / 50)
     assert not clock.trusted
     assert clock.measured_hz == pytest.approx(50.0)
@@ -326,7 +327,7 @@ def test_rows_come_by_datagrams_and_odd_ones_are_told(datagrams):
     sender.rows(0, 100, speed=0.5, **{"<script>": 2.0, "other": 1.0})
     until(lambda: live.session.ticks == 100)
     assert live.session.read(0, 1)[1].tolist() == [[0.5, 2.0]]
-    assert "datagram 1 that is no row" in texts(live)
+    assert "row 1 that cannot be used" in texts(live)
     for _ in range(100):
         sender.send(b"{}")
     until(lambda: live.session.ticks == 200)  # an empty row misses all values

@@ -11,8 +11,8 @@ from edp.config.monitor import load_monitor_experiment
 from edp.errors import BundleError, ConfigError, DataError
 from edp.monitor.monitor_file import HEADER, load_monitor, save_monitor
 from edp.recording import Recording
+from edp.storage.seals import HASH, content_digest
 from edp.testing.monitor import rig_sessions
-from edp.training.bundle import HASH, header_digest
 from edp.workflows.monitor import fit_to_recordings
 from edp.workflows.monitor.fit_monitor import _divided
 
@@ -164,7 +164,7 @@ def resealed(folder, change):
     """Change a header and give it a hash that fits: what an attacker would do."""
     header = json.loads((folder / HEADER).read_text())
     change(header)
-    header[HASH] = header_digest(header)
+    header[HASH] = content_digest(header)
     (folder / HEADER).write_text(json.dumps(header))
 
 

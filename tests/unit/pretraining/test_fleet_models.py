@@ -10,6 +10,7 @@ from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageErr
 from edp.logs.source import DataSource
 from edp.report.fleet.facts import fleet_facts, headline, machine_sheet, verdict, worst_sheet
 from edp.report.fleet.page import render
+from edp.storage import write_json
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.delta import read_delta, with_delta
@@ -218,7 +219,7 @@ def test_damage_in_a_registry_is_told(own, run, tmp_path):
     next((top / "files" / fleet.id / "deltas").iterdir()).unlink()
     with pytest.raises(StorageError, match="holds other deltas"):
         check_entry(top, fleet)
-    (top / "entries" / f"{base.id}.json").write_text(json.dumps({"schema": 1}))
+    write_json(top / "entries" / f"{base.id}.json", {"schema": 1})
     entries, damaged = list_registry(top)
     assert [entry.name for entry in entries] == ["presses"]
     assert len(damaged) == 1
@@ -229,7 +230,7 @@ def test_damage_in_a_registry_is_told(own, run, tmp_path):
     shutil.copytree(own, tmp_path / "own")
     content = json.loads((tmp_path / "own" / FLEET).read_text())
     content["machines"][0]["delta"] = "../../secret"
-    (tmp_path / "own" / FLEET).write_text(json.dumps(content))
+    write_json(tmp_path / "own" / FLEET, content)
     with pytest.raises(StorageError, match="no fine-tuning writes"):
         add_to_registry(top, tmp_path / "own", "hostile")
 

@@ -14,6 +14,7 @@ from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.report import compare_runs, write_compare_page
 from edp.report.compare.page import error_sheet, model_sheet, render
 from edp.report.compare.runs import MEAN
+from edp.storage import write_json
 
 HORIZONS = (1, 5, 10)
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -29,7 +30,7 @@ def changed(folder, name, factors):
     for recording, by_horizon in recordings.items():
         for values in by_horizon.values():
             values["mean"]["mae"] *= by_name[recording]
-    (other / "scores.json").write_text(json.dumps(scores))
+    write_json(other / "scores.json", scores)
     arrays = load_file(other / "predictions.safetensors")
     for key in list(arrays):
         recording, _, part = key.partition("/")
@@ -51,7 +52,7 @@ def pair(make_run):
 def rewritten(folder, change):
     scores = json.loads((folder / "scores.json").read_text())
     change(scores)
-    (folder / "scores.json").write_text(json.dumps(scores))
+    write_json(folder / "scores.json", scores)
 
 
 def test_a_run_with_less_error_everywhere_is_told_apart(pair):

@@ -17,12 +17,13 @@ from edp.report.run.facts import (
     verdict_lines,
 )
 from edp.report.run.outputs import judged_line
+from edp.storage import write_json
 
 
 def edit_scores(folder, change):
     scores = json.loads((folder / "scores.json").read_text())
     change(scores)
-    (folder / "scores.json").write_text(json.dumps(scores))
+    write_json(folder / "scores.json", scores)
 
 
 def mae(value):
@@ -230,7 +231,7 @@ def limit_of(**changes):
 def test_the_limit_of_the_data_becomes_a_line(run_folder, tmp_path):
     data = tmp_path / "data"
     data.mkdir()
-    (data / "limit.json").write_text(json.dumps(limit_of()))
+    write_json(data / "limit.json", limit_of())
     assert not any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder)))
     for place in (data, data / "limit.json"):
         (line,) = [text for text in verdict_lines(read_facts(run_folder, place)) if "limit" in text]
@@ -238,14 +239,14 @@ def test_the_limit_of_the_data_becomes_a_line(run_folder, tmp_path):
         assert "its error would be 0.33" in line
     provenance = json.loads((run_folder / "provenance.json").read_text())
     provenance["data"]["reader"] = {"path": str(data)}
-    (run_folder / "provenance.json").write_text(json.dumps(provenance))
+    write_json(run_folder / "provenance.json", provenance)
     assert any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder)))
 
 
 @pytest.mark.parametrize("change", [{"horizons": [1, 20]}, {"rate_hz": 50.0}, {"targets": ["CylVels_1"]}])
 def test_a_limit_of_other_signals_or_horizons_is_not_shown(run_folder, tmp_path, change):
     path = tmp_path / "limit.json"
-    path.write_text(json.dumps(limit_of(**change)))
+    write_json(path, limit_of(**change))
     assert not any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder, path)))
 
 

@@ -9,6 +9,7 @@ from edp.errors import StorageError
 from edp.report import build_report
 from edp.report.run.facts import MAKERS, read_facts
 from edp.report.run.page import context, render
+from edp.storage import write_json
 
 LOADS = {"src", "href", "srcset", "data", "poster", "action", "formaction", "background"}
 
@@ -104,7 +105,7 @@ def test_names_from_files_cannot_become_markup(run_folder):
     scores["task"]["name"] = scores["models"]["ridge_arx"]["label"] = scores["targets"][0]["description"] = evil
     recordings = scores["models"]["network"]["recordings"]
     recordings[evil] = recordings.pop(next(iter(recordings)))
-    (run_folder / "scores.json").write_text(json.dumps(scores))
+    write_json(run_folder / "scores.json", scores)
     (run_folder / "config.toml").write_text(f'name = "{evil}"')
     text = render(read_facts(run_folder), title=evil)
     page = Page(text)
@@ -125,7 +126,7 @@ def test_unknown_keys_are_ignored_and_unscored_metrics_are_dashes(run_folder):
     scores = json.loads((run_folder / "scores.json").read_text())
     scores["models"]["persistence"]["integrated"] = {"10": {}}
     scores["models"]["persistence"]["overall"]["10"]["mean"]["r2"] = None
-    (run_folder / "scores.json").write_text(json.dumps(scores))
+    write_json(run_folder / "scores.json", scores)
     table = context(read_facts(run_folder))["comparisons"][0]
     r2 = [heading for heading, _ in table.columns].index("R²")
     assert next(row for row in table.rows if row[0] == "Persistence")[r2] == "–"
@@ -186,7 +187,7 @@ def test_names_stay_text_in_the_drawing(browser, run_folder):
     evil = "</script><img src=x onerror=alert(1)><b>&"
     scores = json.loads((run_folder / "scores.json").read_text())
     scores["models"]["ridge_arx"]["label"] = scores["targets"][0]["description"] = evil
-    (run_folder / "scores.json").write_text(json.dumps(scores))
+    write_json(run_folder / "scores.json", scores)
     page = build_report(run_folder)
     browser.open(page)
     browser.run("window.dispatchEvent(new Event('beforeprint'))")

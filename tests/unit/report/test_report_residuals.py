@@ -15,6 +15,7 @@ from edp.report.run.figures import prediction_lines, residual_histograms
 from edp.report.run.page import render
 from edp.report.run.residuals import correlations, correlogram, fit_table
 from edp.report.run.signals import signal_chart
+from edp.storage import write_json
 
 
 def test_fit_is_that_of_system_identification(run_folder):
@@ -30,7 +31,7 @@ def test_scores_without_r2_have_no_fit(run_folder):
     for by_output in scores["models"]["network"]["overall"].values():
         for values in by_output.values():
             values["r2"] = None
-    (run_folder / "scores.json").write_text(json.dumps(scores))
+    write_json(run_folder / "scores.json", scores)
     assert fit_table(read_facts(run_folder)) is None
 
 
@@ -115,7 +116,7 @@ def with_signals(folder, columns):
         {"name": "</script><b>lever", "unit": "1", "factor": 1.0},
         {"name": "p_head", "unit": "bar", "factor": 1e-5},
     ]
-    (folder / "scores.json").write_text(json.dumps(scores))
+    write_json(folder / "scores.json", scores)
 
     def keep(arrays):
         ticks = len(arrays["trench_01/truth"])

@@ -9,6 +9,7 @@ from edp.errors import EdpError, StorageError
 from edp.evaluation.scores_file import read_scores
 from edp.report.run.facts import read_facts
 from edp.report.run.page import context
+from edp.storage import write_json
 
 OTHERS = (None, 10**400, "x", {"x": 5}, {"10": None})
 """What a value may be changed to."""
@@ -60,7 +61,7 @@ def test_any_change_is_one_error_or_a_page(drawn, step):
         for other in (KeyError, *OTHERS)[number % step :: step]:
             if path == () and other is KeyError:
                 continue
-            file.write_text(json.dumps(changed(scores, path, other)))
+            write_json(file, changed(scores, path, other))
             try:
                 context(read_facts(drawn))
             except EdpError as error:
@@ -88,7 +89,7 @@ def test_any_change_is_one_error_or_a_page(drawn, step):
 )
 def test_the_message_names_the_value_and_what_to_do(drawn, path, other, message):
     file = drawn / "scores.json"
-    file.write_text(json.dumps(changed(json.loads(file.read_text()), path, other)))
+    write_json(file, changed(json.loads(file.read_text()), path, other))
     with pytest.raises(StorageError, match=message) as caught:
         read_scores(file)
     assert "remove it and run edp evaluate" in str(caught.value)

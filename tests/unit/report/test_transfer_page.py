@@ -1,7 +1,5 @@
 """The report of a transfer from what lies on disk: the thesis's own Table 4.10, odd names, nothing gained."""
 
-import json
-
 import numpy as np
 import pytest
 from browser import check_page
@@ -11,6 +9,7 @@ from edp.errors import StorageError
 from edp.report import read_transfer, write_transfer_page
 from edp.report.transfer import facts as transfer_facts
 from edp.report.transfer.page import render
+from edp.storage import write_json
 
 EVIL = "</script><script>alert(1)</script><b>&"
 PRINTED = {
@@ -61,7 +60,7 @@ def folder(tmp_path):
     """A folder with a transfer; called with a changed content it is written anew."""
 
     def write(held, name="drive"):
-        (tmp_path / "transfer.json").write_text(json.dumps(held))
+        write_json(tmp_path / "transfer.json", held)
         course = np.sin(np.arange(200) / 20).astype(np.float32).reshape(-1, 1, 1) * np.ones((1, 1, 3), np.float32)
         shown = {f"{name}/{key}": course.copy() for key in ("truth", "direct", "two_phase")}
         save_file(shown | {f"{name}/start": np.zeros(1, np.float32)}, tmp_path / "transfer_predictions.safetensors")

@@ -17,6 +17,7 @@ from edp.report.twin.charts import twin_charts
 from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles, verdict
 from edp.report.twin.page import render
 from edp.signals import Channel, Kind
+from edp.storage import write_json
 from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -164,7 +165,7 @@ def test_what_was_written_is_read(folder):
 def test_damaged_scores_are_refused_with_what_is_wrong(folder, change, message):
     content = json.loads((folder / "free_run.json").read_text())
     change(content)
-    (folder / "free_run.json").write_text(json.dumps(content))
+    write_json(folder / "free_run.json", content)
     with pytest.raises(StorageError, match=message):
         read_free_runs(folder)
 

@@ -9,6 +9,7 @@ from edp.config.experiment import load_experiment
 from edp.errors import BusyError, ConfigError, DataError, LostError, StorageError
 from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
+from edp.storage import write_json
 from edp.storage.ledger import Ledger, TrainingStatus
 from edp.storage.study_file import read_study
 from edp.workflows.executors.base import ended
@@ -264,7 +265,7 @@ def test_status_of_no_study_and_of_one_of_another_version(finished, tmp_path):
     with pytest.raises(StorageError, match="holds no study"):
         look_at(tmp_path)
     held = json.loads((finished.folder / "study.json").read_text())
-    (tmp_path / "study.json").write_text(json.dumps(held | {"schema": 99}))
+    write_json(tmp_path / "study.json", held | {"schema": 99})
     with pytest.raises(StorageError, match="schema 99"):
         look_at(tmp_path)
 

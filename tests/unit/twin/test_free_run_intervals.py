@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, calibrated, coverage_of, free_run_scores, free_runs
 from edp.networks.twin import FreeRunIntervals, calibrate
 from edp.networks.twin.static_map import StaticMap
+from edp.storage.seals import HASH, content_digest
 from edp.testing.twins import sample_series, sample_twin
-from edp.training.bundle import HASH, header_digest
 from edp.training.twin_bundle import HEADER, TwinBundle, load_twin, save_twin
 
 TICKS = 400
@@ -122,7 +122,7 @@ def test_they_come_back_with_the_twin_and_earlier_twins_have_none(tmp_path):
     assert load_twin(tmp_path).intervals is None
     header = json.loads((tmp_path / HEADER).read_text())
     header = {key: value for key, value in header.items() if key not in ("intervals", HASH)} | {"schema": 1}
-    (tmp_path / HEADER).write_text(json.dumps(header | {HASH: header_digest(header)}))
+    (tmp_path / HEADER).write_text(json.dumps(header | {HASH: content_digest(header)}))
     assert load_twin(tmp_path).intervals is None
 
 

@@ -18,10 +18,10 @@ from edp.networks.twin.grey.elements import CylinderElement, Elements, ValveElem
 from edp.networks.twin.grey.numbers import monomials, number_table
 from edp.networks.twin.grey.plausible import Travel
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
+from edp.storage.seals import HASH, content_digest
 from edp.testing.bench import bench_channels, bench_grey_box, bench_series
 from edp.testing.twins import sample_actuators
 from edp.training import grey_fit
-from edp.training.bundle import HASH, header_digest
 from edp.training.grey_fit import fit_grey_box
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
@@ -199,7 +199,7 @@ def test_a_bundle_that_names_no_stretches_has_five(bench, tmp_path):
     # As bundles were written before: the key is not there.
     assert header["twin"].pop("stretches") == 5
     del header[HASH]
-    path.write_text(json.dumps(header | {HASH: header_digest(header)}))
+    path.write_text(json.dumps(header | {HASH: content_digest(header)}))
     old = load_twin(tmp_path / "old").twin
     assert old.table.stretches == 5
     np.testing.assert_array_equal(old.numbers, machine.numbers)

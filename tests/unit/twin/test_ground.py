@@ -15,7 +15,7 @@ from edp.networks.twin.grey.ground import GROUNDS, GroundedRunner, check_grounde
 from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
 from edp.sim.machine.machine_files import load_machine
-from edp.training.bundle import HASH, header_digest
+from edp.storage.seals import HASH, content_digest
 from edp.training.ground_fit import logged_forces
 from edp.training.twin_bundle import GROUNDED, TwinBundle, load_twin, plant_bundle, save_twin
 
@@ -198,7 +198,7 @@ def test_a_damaged_ground_is_one_error(changes, says, twin, law, tmp_path):
     assert header["schema"] == GROUNDED
     header["ground"] |= changes
     del header[HASH]
-    path.write_text(json.dumps(header | {HASH: header_digest(header)}))
+    path.write_text(json.dumps(header | {HASH: content_digest(header)}))
     with pytest.raises(BundleError, match=says):
         load_twin(tmp_path / "twin")
 

@@ -15,6 +15,7 @@ from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
 from edp.report.twin.ground import ground_line
 from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.storage import write_json
 from edp.testing.control import sample_excavator_twin, sample_grey_box
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.deployment import load_exported
@@ -30,7 +31,7 @@ def start(tmp_path_factory):
     run = tmp_path_factory.mktemp("start")
     save_twin(replace(sample_grey_box(), scores={"twin": {}}), run / "twin")
     row = {"element": "pump", "name": "flow", "unit": "m^3/s", "value": 1.0, "low": 0.9, "high": 1.1, "excited": True}
-    (run / "datasheet.json").write_text(json.dumps({"schema": 1, "basis": "", "numbers": [row]}))
+    write_json(run / "datasheet.json", {"schema": 1, "basis": "", "numbers": [row]})
     for name in JUDGED:
         (run / name).write_bytes(f"what judged {name}".encode())
     return run

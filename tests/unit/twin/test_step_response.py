@@ -9,6 +9,7 @@ from edp.errors import StorageError
 from edp.evaluation.step_response import POINTS, step_responses
 from edp.networks.twin import TWINS
 from edp.report.twin.steps import FILE, read_steps, steps_chart
+from edp.storage import write_json
 from edp.testing.twins import sample_actuators, sample_twin
 
 
@@ -54,12 +55,12 @@ def test_a_command_that_never_moves_has_no_response(content):
 def test_what_is_on_disk_is_drawn_a_choice_for_each_command(content, tmp_path):
     _, _, found = content
     assert read_steps(tmp_path) == {}
-    (tmp_path / FILE).write_text(json.dumps(found), encoding="utf-8")
+    write_json(tmp_path / FILE, found)
     chart = steps_chart(read_steps(tmp_path))
     assert [value for value, _ in chart.choices[0].options] == [step["command"] for step in found["steps"]]
     assert len(chart.panels) == min(6, len(found["steps"][0]["answers"]))
     damaged = json.loads(json.dumps(found))
     damaged["steps"][0]["answers"][0]["median"].pop()
-    (tmp_path / FILE).write_text(json.dumps(damaged), encoding="utf-8")
+    write_json(tmp_path / FILE, damaged)
     with pytest.raises(StorageError, match="other lengths"):
         read_steps(tmp_path)

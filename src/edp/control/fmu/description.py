@@ -13,8 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from xml.parsers import expat
 
-from edp.control.fmu.archive import DESCRIPTION, plain
+from edp.control.fmu.archive import DESCRIPTION
 from edp.errors import DataError
+from edp.storage.archives import printable
 
 MOST_VARIABLES = 100_000
 MOST_ELEMENTS = 1_000_000
@@ -83,10 +84,10 @@ def read_description(content: bytes, where: str) -> FmuDescription:
     """
     root = _tree(content, where)
     if root.tag != "fmiModelDescription":
-        raise DataError(f"{where}: {DESCRIPTION} holds <{plain(root.tag)}>; fmiModelDescription must be its root")
+        raise DataError(f"{where}: {DESCRIPTION} holds <{printable(root.tag)}>; fmiModelDescription must be its root")
     text = root.get("fmiVersion", "")
     if text[:2] not in ("2.", "3."):
-        raise DataError(f"{where} is of FMI version '{plain(text)}'; 2.0 or 3.0 must hold")
+        raise DataError(f"{where} is of FMI version '{printable(text)}'; 2.0 or 3.0 must hold")
     version = int(text[0])
     simulated = root.find("CoSimulation")
     if simulated is None:
@@ -99,8 +100,8 @@ def read_description(content: bytes, where: str) -> FmuDescription:
     identifier = simulated.get("modelIdentifier", "")
     if not IDENTIFIER.fullmatch(identifier):
         raise DataError(
-            f"{where}: modelIdentifier '{plain(identifier)}' is no name of a library: letters, digits and underscores, "
-            "at most 128, must hold"
+            f"{where}: modelIdentifier '{printable(identifier)}' is not a name of a library; expected at most "
+            "128 letters, digits and underscores"
         )
     experiment = root.find("DefaultExperiment")
     sizes = (simulated.get("fixedInternalStepSize"), None if experiment is None else experiment.get("stepSize"))
@@ -144,7 +145,7 @@ def _tree(content: bytes, where: str) -> ET.Element:
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError, AssertionError) as error:
         raise DataError(
-            f"{where}: {DESCRIPTION} is not well-formed XML ({plain(str(error))}); export it again"
+            f"{where}: {DESCRIPTION} is not well-formed XML ({printable(str(error))}); export it again"
         ) from error
 
 
@@ -154,7 +155,7 @@ def _step(text: str, where: str) -> float:
     except ValueError:
         step = math.nan
     if not 1e-6 <= step <= 1e6:
-        raise DataError(f"{where}: stepSize '{plain(text)}'; a number of seconds above 0 must hold")
+        raise DataError(f"{where}: stepSize '{printable(text)}'; a number of seconds above 0 must hold")
     return step
 
 
@@ -169,11 +170,11 @@ def _variables(root: ET.Element, version: int, where: str) -> dict[str, FmuVaria
         name, reference = entry.get("name", ""), entry.get("valueReference", "")
         if not REFERENCE.fullmatch(reference) or int(reference) >= 1 << 32:
             raise DataError(
-                f"{where}: variable '{plain(name)}' has valueReference '{plain(reference)}'; a whole number from 0 to "
-                "4294967295 must hold"
+                f"{where}: variable '{printable(name)}' has valueReference '{printable(reference)}'; expected a "
+                "whole number from 0 to 4294967295"
             )
         if name in variables:
-            raise DataError(f"{where}: variable '{plain(name)}' stands twice; export it again")
+            raise DataError(f"{where}: variable '{printable(name)}' stands twice; export it again")
         number = entry.find("Real") if version == 2 else entry
         # An array of FMI 3.0 is not one number.
         real = number is not None and (version == 2 or (entry.tag == "Float64" and entry.find("Dimension") is None))

@@ -10,10 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from edp.control.fmu.archive import FmuArchive, plain
+from edp.control.fmu.archive import FmuArchive
 from edp.control.fmu.description import FmuDescription
 from edp.errors import ConfigError, DataError
 from edp.sim.scenario import SimulationError
+from edp.storage.archives import printable
 
 NAME = "plant"
 
@@ -46,7 +47,7 @@ class FmuInstance:
         binaries = archive.under("binaries")
         if library not in binaries:
             others = sorted({name.split("/")[1] for name in binaries})
-            listed = f"libraries for {', '.join(map(plain, others[:5]))}" if others else "no library at all"
+            listed = f"libraries for {', '.join(map(printable, others[:5]))}" if others else "no library at all"
             raise DataError(
                 f"{self._where} has no library for this computer ({platform}) but {listed}; export it for this system"
             )
@@ -136,21 +137,21 @@ class FmuInstance:
     def _note(self, message: bytes | None) -> None:
         """Keep the last message; the native code calls this, which must not raise."""
         # Twice what is shown, since a character may take several bytes.
-        self._message = plain((message or b"")[:400].decode("utf-8", "replace"))
+        self._message = printable((message or b"")[:400].decode("utf-8", "replace"))
 
     def _guarded(self, what: str, run: Callable[[], None]) -> None:
         try:
             run()
         except Exception as error:  # FMPy raises plain exceptions
             self._ending()
-            raise DataError(f"{self._where} cannot {what}: {plain(str(error))}{self._said()}") from error
+            raise DataError(f"{self._where} cannot {what}: {printable(str(error))}{self._said()}") from error
 
     def _call(self, what: str, run: Callable[[], Any]) -> Any:
         self._message = ""
         try:
             return run()
         except Exception as error:  # FMPy raises plain exceptions
-            raise SimulationError(f"{self._where} refuses {what}: {plain(str(error))}{self._said()}") from error
+            raise SimulationError(f"{self._where} refuses {what}: {printable(str(error))}{self._said()}") from error
 
     def _said(self) -> str:
         return f"; it says: {self._message}" if self._message else ""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from edp.control.fmu.archive import plain
 from edp.control.fmu.description import FmuDescription, FmuVariable
 from edp.control.plant import PILOTS, STROKES
 from edp.control.rest import check_plant_channels
 from edp.errors import ConfigError, DataError, closest
 from edp.networks.twin.plant import FLAG
 from edp.signals import VOCABULARY, Channel
+from edp.storage.archives import printable
 
 AHEAD = "_ahead_1"
 """Behind the name of an answer one tick after the inputs, as exported twins write it."""
@@ -73,7 +73,7 @@ def ports_of(description: FmuDescription, where: str) -> FmuPorts:
     if not commands:
         first = next(iter(inputs), "")
         raise ConfigError(
-            f"{where} has no input of a pilot pressure, such as BmUp{closest(plain(first), PILOTS)}; {change}"
+            f"{where} has no input of a pilot pressure, such as BmUp{closest(printable(first), PILOTS)}; {change}"
         )
     check_plant_channels(where, [channel.name for channel in commands], names, change)
     ports = [(inputs.get(name), inputs.get(name + FLAG)) for name in names]
@@ -108,7 +108,7 @@ def _check_unit(channel: Channel, entry: FmuVariable, where: str) -> None:
     """
     if not entry.real:
         raise DataError(
-            f"{where}: variable '{plain(entry.name)}' is no real number of double precision; export it as one"
+            f"{where}: variable '{printable(entry.name)}' is no real number of double precision; export it as one"
         )
     bases, expected = entry.bases, BASES.get(channel.unit)
     same = entry.unit in ("", channel.unit)
@@ -118,6 +118,6 @@ def _check_unit(channel: Channel, entry: FmuVariable, where: str) -> None:
         same = same and (powers == expected if expected is not None else entry.unit == channel.unit)
     if not same:
         raise DataError(
-            f"{where}: variable '{plain(entry.name)}' is in {plain(entry.unit)}; {channel.unit} must hold: export "
-            "it in SI units"
+            f"{where}: variable '{printable(entry.name)}' is in {printable(entry.unit)}; expected "
+            f"{channel.unit}: export it in SI units"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
+import binascii
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -373,5 +373,5 @@ def crc(graph: Graph) -> int:
     value = 0
     for layer in graph.layers:
         for name, values in layer.tensors().items():
-            value = zlib.crc32(little_endian(stored(layer, name, values)), value)
+            value = binascii.crc32(little_endian(stored(layer, name, values)), value)
     return value

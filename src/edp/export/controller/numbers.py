@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
+import binascii
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -57,7 +57,7 @@ class ConstantTables:
 
     def _check(self, name: str, values: np.ndarray) -> None:
         self.entries.append(f"{{{name}, {values.size}u, {values.itemsize}u}}")
-        self.crc = zlib.crc32(little_endian(values), self.crc)
+        self.crc = binascii.crc32(little_endian(values), self.crc)
         self.bytes += values.nbytes
 
     def finished(self) -> Code:

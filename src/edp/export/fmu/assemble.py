@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import uuid
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 
@@ -14,6 +12,7 @@ from edp.export.escape import Code, c_string, fill
 from edp.export.fmu.build import PLATFORMS, Sources, libraries
 from edp.export.fmu.describe import About, build_description, fmi2, fmi3
 from edp.export.fmu.page import page
+from edp.storage.archives import zip_bytes
 
 COMMON = ("edp_fmu.h", "edp_fmu.c")
 OWN: Mapping[int, tuple[str, ...]] = {
@@ -116,12 +115,5 @@ def c_files(names: Sequence[str]) -> list[str]:
 
 
 def _packed(content: Mapping[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path, data in content.items():
-            entry = zipfile.ZipInfo(path, DATE)
-            # Executable rights and Unix origin: without them the libraries cannot be loaded after unpacking on Linux.
-            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o755 << 16
-            entry.create_system = 3
-            archive.writestr(entry, data)
-    return buffer.getvalue()
+    # Executable rights: without them the libraries cannot be loaded after unpacking on Linux.
+    return zip_bytes(content.items(), DATE, 0o755)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
+import binascii
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -57,7 +57,7 @@ class MonitorTables:
         numbers: NDArray[np.float64] = np.asarray(values, dtype=np.float64).ravel()
         self.lines.append(array("double", name, map(double_number, numbers)))
         self.double_entries.append(f"{{{name}, {numbers.size}u}}")
-        self.crc = zlib.crc32(little_endian(numbers), self.crc)
+        self.crc = binascii.crc32(little_endian(numbers), self.crc)
         self.bytes += numbers.nbytes
 
     def singles(self, name: str, values: ArrayLike) -> None:
@@ -98,7 +98,7 @@ class MonitorTables:
 
     def _other(self, name: str, numbers: NDArray[np.generic]) -> None:
         self.entries.append(f"{{{name}, {numbers.size}u, {numbers.itemsize}u}}")
-        self.other_crc = zlib.crc32(little_endian(numbers), self.other_crc)
+        self.other_crc = binascii.crc32(little_endian(numbers), self.other_crc)
         self.bytes += numbers.nbytes
 
     def finished(self) -> Code:

@@ -18,8 +18,9 @@ from typing import Any, ClassVar
 from edp.errors import DataError, brief
 from edp.logs.formats.bag_memory import MemoryFile, NoFolder, place
 from edp.logs.formats.mcap_check import RATIO, SPARE, check_records
-from edp.logs.formats.unpack import unpack_to
 from edp.storage.memory import check_memory
+from edp.storage.paths import is_file_at, is_folder_at
+from edp.storage.unpacking import open_zstd, unpack_to
 
 _LONGEST_METADATA = 4 << 20
 """Bytes of a bag's metadata.yaml; a topic takes some 500."""
@@ -71,9 +72,9 @@ def open_reader(path: Path) -> Any:
         DataError: a part that is no regular file, or whose sizes cannot be.
     """
     reader1, reader2 = _readers()
-    if path.is_dir():
+    if is_folder_at(path):
         _check_folder(path)
-    return reader1(path) if path.suffix.lower() == ".bag" and path.is_file() else reader2(path)
+    return reader1(path) if path.suffix.lower() == ".bag" and is_file_at(path) else reader2(path)
 
 
 @cache
@@ -139,19 +140,7 @@ class _Zstd:
 
     @staticmethod
     def open(stream: Any, mode: str) -> Any:
-        from backports import zstd
-
-        packed = Path(stream.name).stat().st_size
-        limit = RATIO * packed + SPARE
-
-        class Bounded(zstd.ZstdFile):
-            def read(self, size: int | None = -1) -> bytes:
-                part = super().read(size)
-                if self.tell() > limit:
-                    raise DataError(f"a packed file of {packed} bytes that unpacks to more than {limit}")
-                return part
-
-        return Bounded(stream, mode)  # type: ignore[call-overload]
+        return open_zstd(stream, mode, RATIO * Path(stream.name).stat().st_size + SPARE)
 
 
 def _check_folder(folder: Path) -> None:

@@ -25,9 +25,9 @@ from edp.logs.formats.edp_metadata import LONGEST_FACTS, EdpMetadata, parse_edp_
 from edp.logs.formats.mcap_check import check_records
 from edp.logs.formats.names import only, told_apart
 from edp.logs.formats.rosbag_write import FACTS_TOPIC
-from edp.logs.formats.unpack import unpack_to
 from edp.storage.memory import check_memory
 from edp.storage.reading import parse_json
+from edp.storage.unpacking import unpack_to
 
 MAGIC_BYTES = 8
 ROS = ("ros1", "ros2")

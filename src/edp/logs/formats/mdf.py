@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import weakref
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
@@ -29,6 +28,7 @@ from edp.logs.formats.names import only, shown_name, told_apart
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
 from edp.signals import SignalMap
+from edp.storage.unpacking import unpack_to
 
 _MAGIC = (b"MDF     ", b"UnFinMF ")
 _FACTS = "edp_info.json"
@@ -256,7 +256,7 @@ def _embedded(attachment: Any, where: str) -> bytes:
         raise DataError(f"{where}: is not embedded as EDP embeds it; it is damaged: copy or export the file again")
     if packed:
         # One byte more than allowed tells that there is more.
-        data = zlib.decompressobj().decompress(data, _FACTS_BYTES + 1)
+        data = unpack_to("zlib", data, _FACTS_BYTES)
     if len(data) > _FACTS_BYTES:
         raise DataError(f"{where}: is larger than {_FACTS_BYTES} bytes; it is damaged: copy or export the file again")
     return data

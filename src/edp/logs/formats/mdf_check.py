@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edp.errors import DataError
-from edp.logs.formats.unpack import unpacked_size
 from edp.storage.memory import check_memory
+from edp.storage.unpacking import DEFLATE_RATIO, unpacked_size
 
 _HEAD = 24
 """Bytes of a block before its links: id 4, reserved 4, length 8, count of links 8."""
@@ -22,8 +22,6 @@ _FIRST = 64
 """Where the header block lies: behind the identification of the file."""
 _MAX_BLOCK = 1 << 31
 """Of unpacked bytes; larger data are lists of blocks."""
-_DEFLATE_RATIO = 1100
-"""Deflate packs no better than 1,032 to 1."""
 _COPIES = 3
 """A packed block is in memory as it was unpacked, transposed and as columns."""
 _DEEPEST_CONVERSION = 8
@@ -145,7 +143,7 @@ class _Walk:
         if block.id == b"##DZ":
             _, _, _, _, original, packed = struct.unpack_from("<2sBBIQQ", self.view, block.data_at)
             # 64 bytes more: the head of a packed stream weighs in the shortest ones.
-            fits = packed <= block.length and original <= min(_MAX_BLOCK, _DEFLATE_RATIO * (packed + 64))
+            fits = packed <= block.length and original <= min(_MAX_BLOCK, DEFLATE_RATIO * (packed + 64))
             if not fits:
                 raise self.broken(block.at, f"a packed block of {packed} bytes that claims to hold {original}")
             check_memory(self.path, _COPIES * original, "a packed block", "it may be damaged; record smaller blocks")

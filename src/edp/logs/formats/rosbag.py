@@ -28,6 +28,7 @@ from edp.logs.formats.ros_message import LongMessageError, columns_of, layout_of
 from edp.logs.formats.rosbag_write import FACTS_TOPIC, write_bag
 from edp.recording import Recording
 from edp.signals import VOCABULARY, SignalMap
+from edp.storage.paths import is_file_at, is_folder_at
 
 KEPT_BYTES = 1 << 29
 """Wanted columns up to this size are read in one go through the file; beyond, each topic in pieces."""
@@ -53,7 +54,7 @@ class BagFormat:
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read topics, types and each topic's first message; the others when their values are asked for."""
-        if self.name == "mcap" and path.is_file() and holds_json(path):
+        if self.name == "mcap" and is_file_at(path) and holds_json(path):
             return read_json_mcap(path)
         column_names = {entry.column for entry in signal_map.channels} or set(VOCABULARY)
         bag = _Bag(path, column_names, signal_map)
@@ -108,7 +109,7 @@ class _Bag:
                     raise DataError("a topic without a name")
                 by_topic.setdefault(connection.topic, []).append(connection)
             self.about = {name: sum(each.msgcount for each in group) for name, group in by_topic.items()}
-            check_counts(path, self.about, sorted(path.iterdir()) if path.is_dir() else [path])
+            check_counts(path, self.about, sorted(path.iterdir()) if is_folder_at(path) else [path])
             filled = {name: group for name, group in by_topic.items() if self.about[name]}
             self.topics = [_Topic(self, name, group) for name, group in filled.items() if name != FACTS_TOPIC]
             self.facts_from = filled.get(FACTS_TOPIC)

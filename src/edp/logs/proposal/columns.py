@@ -18,6 +18,7 @@ from edp.logs.formats.base import EXPERIMENTS, Column, RawLog, RawSignal
 from edp.logs.formats.csv import NAME_BY_PLACE
 from edp.logs.timebase import Clock, judge
 from edp.signals import Kind, SignalMap
+from edp.storage.paths import is_file_at, status_of
 
 TEXT_BYTES = 16_000_000
 """Of a text file that is looked at, 15 min of 20 channels at 100 Hz; text has no index, so this is its beginning."""
@@ -142,7 +143,7 @@ def names_in_log(path: Path) -> frozenset[str]:
 @contextmanager
 def _bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
     """The log itself, or a file with the first lines of a text of more than some bytes."""
-    size = path.stat().st_size if path.is_file() else 0
+    size = status_of(path).st_size if is_file_at(path) else 0
     if size <= most or format_for(path).name != "csv":
         yield path, ""
         return

@@ -12,6 +12,7 @@ from edp.errors import DataError
 from edp.logs.formats.base import Column
 from edp.logs.proposal.clocks import ClockGuess
 from edp.logs.proposal.columns import LogLook, names_in_log
+from edp.storage.paths import files_below, is_file_at, is_folder_at
 
 _LEAST_COLUMNS = 20
 """Columns without names from which a row may hold samples of one signal."""
@@ -96,15 +97,15 @@ def beside_notes(source: Path, paths: Collection[Path]) -> list[str]:
         source: what was asked about.
         paths: the logs that were found there.
     """
-    if not source.is_dir() or any(path.suffix.lower() == ".txt" for path in paths):
+    if not is_folder_at(source) or any(path.suffix.lower() == ".txt" for path in paths):
         return []
-    tables = [path for path in sorted(islice(source.rglob("*.txt"), _MOST_TEXTS)) if _is_table(path)]
+    tables = [path for path in sorted(islice(files_below(source, "*.txt"), _MOST_TEXTS)) if _is_table(path)]
     named = ", ".join(path.name[:40] for path in tables[:3])
     return [f"text files beside these logs are not looked at: {named}; give such logs on their own"] if tables else []
 
 
 def _is_table(path: Path) -> bool:
     try:
-        return path.is_file() and len(names_in_log(path)) > 1
+        return is_file_at(path) and len(names_in_log(path)) > 1
     except DataError:
         return False

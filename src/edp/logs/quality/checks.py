@@ -124,17 +124,6 @@ def place_of(row: int, rate_hz: float) -> str:
     return f"row {row} (t = {row / rate_hz:g} s)"
 
 
-def in_report_unit(channel: Channel, value: float) -> float:
-    """SI to report unit, offset included (K to degC)."""
-    unit = UNITS[KINDS[channel.kind].report_unit]
-    return (value - unit.offset) / unit.factor
-
-
-def size_in_report_unit(channel: Channel, size: float) -> float:
-    """A difference or deviation from SI to the report unit."""
-    return size / UNITS[KINDS[channel.kind].report_unit].factor
-
-
 def shown(value: float, channel: Channel) -> str:
     """A value in the report unit with that unit; a pure number stands alone."""
     unit = KINDS[channel.kind].report_unit
@@ -169,7 +158,7 @@ def _check_missing(at: Looked) -> list[Finding]:
 def _check_constant(at: Looked) -> list[Finding]:
     if len(at.good) < 2 or not at.constant:
         return []
-    what = f"constant at {shown(in_report_unit(at.channel, float(at.good[0])), at.channel)}"
+    what = f"constant at {shown(KINDS[at.channel.kind].to_report(float(at.good[0])), at.channel)}"
     advice = "a dead sensor or an absent signal teaches nothing: check it, or map a constant"
     return [Finding("warning", at.channel.name, what, len(at.good), "", advice)]
 
@@ -259,7 +248,7 @@ def _check_clipped(at: Looked) -> list[Finding]:
     for end, share, value in ends:
         if share < _CLIPPED_SHARE or value == 0:
             continue
-        limit = shown(in_report_unit(at.channel, float(value)), at.channel)
+        limit = shown(KINDS[at.channel.kind].to_report(float(value)), at.channel)
         what = f"clipped at its {end} end, {limit}, for {100 * share:.2g} % of the time"
         advice = "the range of the sensor or the data type ends here: what lies beyond was not recorded"
         row = int(np.flatnonzero(at.values == value)[0])
@@ -273,7 +262,7 @@ def _check_coarse(at: Looked) -> list[Finding]:
     step, levels, part = at.measures.quantum, at.measures.levels, _coarseness(at)
     if step is None or part < _COARSE_STEP:
         return []
-    size = shown(size_in_report_unit(at.channel, step), at.channel)
+    size = shown(KINDS[at.channel.kind].report_factor * step, at.channel)
     what = f"quantised in steps of {size}, {100 * part:.0f} % of its deviation ({levels} levels)"
     advice = "its differences are spikes of one step: log it finer, or derive nothing from it"
     return [Finding("warning", at.channel.name, what, levels, "", advice)]

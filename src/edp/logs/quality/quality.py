@@ -15,9 +15,7 @@ from edp.logs.quality.checks import (
     Finding,
     Looked,
     copies,
-    in_report_unit,
     look_at,
-    size_in_report_unit,
 )
 from edp.logs.quality.columns import columns
 from edp.recording import Recording
@@ -171,15 +169,16 @@ def plain(value: Any) -> Any:
 
 def _facts(looked: Looked, verdict: str) -> ChannelFacts:
     channel, good, measures = looked.channel, looked.good, looked.measures
-    unit = KINDS[channel.kind].report_unit
+    kind = KINDS[channel.kind]
+    unit = kind.report_unit
     nan = float("nan")
     low, high, mean, std = nan, nan, nan, nan
     if len(good):
         sums = good.astype(np.float64)
-        low, high, mean = (in_report_unit(channel, float(x)) for x in (good.min(), good.max(), sums.mean()))
+        low, high, mean = (kind.to_report(float(x)) for x in (good.min(), good.max(), sums.mean()))
         # The sum of a constant leaves rounding, which would pass for a deviation.
-        std = 0.0 if looked.constant else size_in_report_unit(channel, float(sums.std()))
-    noise = size_in_report_unit(channel, measures.noise)
+        std = 0.0 if looked.constant else kind.report_factor * float(sums.std())
+    noise = kind.report_factor * measures.noise
     return ChannelFacts(
         channel.name,
         str(channel.kind),
@@ -190,7 +189,7 @@ def _facts(looked: Looked, verdict: str) -> ChannelFacts:
         std,
         looked.samples - len(good),
         looked.constant,
-        None if measures.quantum is None else size_in_report_unit(channel, measures.quantum),
+        None if measures.quantum is None else kind.report_factor * measures.quantum,
         measures.levels,
         noise,
         20.0 * math.log10(std / noise) if noise > 0 and std > 0 else None,

@@ -53,6 +53,16 @@ from edp.storage import (
     remove_unfinished,
     replacing,
 )
+from edp.storage.paths import (
+    entries_of,
+    files_below,
+    full_path,
+    is_file_at,
+    is_folder_at,
+    is_link_at,
+    is_there,
+    status_of,
+)
 
 PART_SAMPLES = 1 << 16
 """Of a log that are in memory at a time."""
@@ -81,19 +91,19 @@ class StoredLog:
     @property
     def where(self) -> str:
         """Its address, or the path of the file in full."""
-        return str(self.path.resolve()) if self.remote is None else self.remote.address
+        return str(full_path(self.path)) if self.remote is None else self.remote.address
 
     @property
     def size(self) -> int:
         """Bytes of the file, or of the files of a folder."""
         if self.remote is not None:
             return self.remote.size
-        return sum(part.stat().st_size for part in self._files())
+        return sum(status_of(part).st_size for part in self._files())
 
     @property
     def key(self) -> str:
         """A hash of where it lies, of its size and time, and of how it is read."""
-        facts = [(str(part), part.stat().st_size, part.stat().st_mtime_ns) for part in self._files()]
+        facts = [(str(part), status_of(part).st_size, status_of(part).st_mtime_ns) for part in self._files()]
         if self.remote is not None:
             facts = [(self.remote.address, self.remote.size, self.remote.written_ns)]
         how = [plain_tree(self.signal_map), asdict(self.repair), self.name, self.rows, self.machine]
@@ -101,10 +111,10 @@ class StoredLog:
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def _files(self) -> list[Path]:
-        if self.path.is_dir():
-            return sorted(part for part in self.path.rglob("*") if part.is_file())
+        if is_folder_at(self.path):
+            return sorted(files_below(self.path))
         # One that is gone is refused when it is read.
-        return [self.path] if self.path.exists() else []
+        return [self.path] if is_there(self.path) else []
 
 
 @dataclass(frozen=True)
@@ -153,7 +163,7 @@ def build_store(
         BusyError: another process builds it.
     """
     top = Path(folder)
-    if top.exists() and not is_store(top) and any(top.iterdir()):
+    if is_there(top) and not is_store(top) and any(entries_of(top)):
         raise ConfigError(f"'{top}' is no store and not empty; give --out a new folder, or one that a store lies in")
     make_folder(top)
     lock = hold(top / LOCK)
@@ -163,13 +173,13 @@ def build_store(
         remove_unfinished(top)
         return _built(_distinct(logs), top, workers, on_progress or (lambda progress: None))
     finally:
-        release(top / LOCK, lock) if (top / INDEX).is_file() else lock.close()
+        release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
 
 
 def _built(
     logs: dict[str, StoredLog], top: Path, workers: int, on_progress: Callable[[StoreProgress], None]
 ) -> StoreIndex:
-    before = read_index(top) if (top / INDEX).is_file() else StoreIndex()
+    before = read_index(top) if is_file_at(top / INDEX) else StoreIndex()
     index = _without_replaced(_without_lost(before, top), logs)
     for record in _records_beside(top, index):
         index = _with_record(index, record, logs)
@@ -215,7 +225,7 @@ def _without_lost(index: StoreIndex, top: Path) -> StoreIndex:
 
 def _size(path: Path) -> int:
     """Bytes of a regular file; -1 for anything else."""
-    return path.stat().st_size if path.is_file() and not path.is_symlink() else -1
+    return status_of(path).st_size if is_file_at(path) and not is_link_at(path) else -1
 
 
 def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[LogBatch]:
@@ -277,7 +287,7 @@ def store_batch(batch: LogBatch) -> dict[str, Any]:
             index = replace(index, lists=tuple(lists), recordings=(*index.recordings, entry))
             first += entry.samples * len(channels)
     if index.recordings:
-        status = path.stat()
+        status = status_of(path)
         file = RowsFile(key=batch.key, bytes=status.st_size, written_ns=status.st_mtime_ns)
         index = replace(index, files=(file,))
     else:
@@ -316,7 +326,7 @@ def _stored(
         meta[MACHINE] = log.machine
     entry = StoreEntry(
         name=name,
-        log=str(log.path.resolve()),
+        log=str(full_path(log.path)),
         log_key=key,
         source=source,
         rate_hz=assembly.rate_hz,
@@ -348,8 +358,8 @@ def _check_digest(assembly: Assembly, digest: str) -> None:
 def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
     """Records of batches that an earlier build finished and no index lists; logs of a damaged one are read again."""
     present = {file.key for file in index.files}
-    for path in sorted((top / ROWS).glob("*.json")):
-        if path.stem in present or not rows_path(top, path.stem).is_file():
+    for path in entries_of(top / ROWS, "*.json"):
+        if path.stem in present or not is_file_at(rows_path(top, path.stem)):
             continue
         where = f"record of the store '{path}'"
         with suppress(DataError):
@@ -379,7 +389,7 @@ def _with_record(index: StoreIndex, record: dict[str, Any], logs: dict[str, Stor
 def _remove_unused(top: Path, index: StoreIndex) -> None:
     """Files that no recording lies in, and records of batches, which the index holds now."""
     used = {file.key for file in index.files}
-    for path in (top / ROWS).iterdir():
+    for path in entries_of(top / ROWS):
         if path.suffix == ".json" or (path.suffix == ".f32" and path.stem not in used):
             path.unlink(missing_ok=True)
 

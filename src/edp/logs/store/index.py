@@ -14,6 +14,7 @@ from edp.logs.formats.base import check_names
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel
 from edp.storage import object_with, parse_json, read_text, write_bytes
+from edp.storage.paths import is_file_at, is_folder_at
 
 INDEX, ROWS, LOCK = "store.json", "rows", ".lock"
 KIND, SCHEMA = "edp-store", 1
@@ -103,7 +104,7 @@ class StoreIndex:
 def is_store(path: str | Path) -> bool:
     """Whether a folder is a store, finished or not."""
     folder = Path(path)
-    return (folder / INDEX).is_file() or ((folder / ROWS).is_dir() and (folder / LOCK).is_file())
+    return is_file_at(folder / INDEX) or (is_folder_at(folder / ROWS) and is_file_at(folder / LOCK))
 
 
 def rows_path(folder: Path, key: str) -> Path:
@@ -121,7 +122,7 @@ def read_index(folder: str | Path) -> StoreIndex:
     where = f"index of the store '{folder}'"
     if not is_store(folder):
         raise DataError(f"'{folder}' is no store: it has no {INDEX}; `edp store build LOGS --out {folder}` makes one")
-    if not path.is_file():
+    if not is_file_at(path):
         raise DataError(
             f"the store '{folder}' is half built: it has no {INDEX} yet; give the same `edp store build` again, it "
             "goes on where it stopped"

@@ -25,6 +25,7 @@ from edp.logs.store.index import (
 )
 from edp.recording import FloatArray, Recording
 from edp.storage import object_with, parse_json
+from edp.storage.paths import is_file_at, is_link_at
 
 
 def read_store(folder: str | Path) -> list[Recording]:
@@ -101,7 +102,7 @@ def _status(folder: Path, file: RowsFile) -> os.stat_result:
             f"'{path}', a file of the store, cannot be read: {error.strerror or error}; copy the store again, or give "
             "the same `edp store build` again, which reads its logs anew"
         ) from error
-    if path.is_symlink() or not path.is_file():
+    if is_link_at(path) or not is_file_at(path):
         raise DataError(f"'{path}' must be a regular file of the store; it is a link, a folder or a device")
     return status
 

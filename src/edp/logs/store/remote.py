@@ -11,6 +11,7 @@ from edp.logs.buckets import BucketReader, RemoteFile, cache_folder, check_room
 from edp.logs.store.index import INDEX, INDEX_BYTES, LOCK, ROWS, StoreIndex, checked_index, rows_path
 from edp.logs.store.opening import check_store
 from edp.storage import hold, make_folder, write_bytes
+from edp.storage.paths import is_file_at, status_of
 
 
 def local_store(address: str) -> Path:
@@ -28,10 +29,10 @@ def local_store(address: str) -> Path:
     index = checked_index(text.decode(errors="replace"), f"index of the store '{address}'")
     name = hashlib.blake2b(address.encode() + b"\0" + text, digest_size=16).hexdigest()
     folder = make_folder(cache_folder() / name)
-    if (folder / INDEX).is_file():
+    if is_file_at(folder / INDEX):
         return folder
     with hold(folder / LOCK):
-        if not (folder / INDEX).is_file():
+        if not is_file_at(folder / INDEX):
             _fill(bucket, address, index, folder, text)
     return folder
 
@@ -56,7 +57,7 @@ def _fill(bucket: BucketReader, address: str, index: StoreIndex, folder: Path, t
 
 
 def _size(path: Path) -> int:
-    return path.stat().st_size if path.is_file() else -1
+    return status_of(path).st_size if is_file_at(path) else -1
 
 
 @lru_cache(maxsize=64)

@@ -15,6 +15,7 @@ from edp.monitor.diagnosis.causes import FaultClass, class_of
 from edp.monitor.diagnosis.evidence import Scatter
 from edp.monitor.diagnosis.structure import Confusion, confusion_of
 from edp.monitor.stored_arrays import read_stored, shaped, write_stored
+from edp.storage.paths import is_there
 
 Array = NDArray[np.float64]
 FILE, SCHEMA = "dictionary", 1
@@ -126,7 +127,7 @@ def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None
     Raises:
         StorageError: damaged, changed, or of another monitor.
     """
-    if not (folder / f"{FILE}.json").exists():
+    if not is_there(folder / f"{FILE}.json"):
         return None
     header, arrays = read_stored(folder, FILE, SCHEMA)
     where = f"'{folder / FILE}.json'"

@@ -228,12 +228,12 @@ class _Projections:
                 f"n4sid: {windows} windows of {2 * horizon} ticks came; {triangle.shape[1]} at least must hold: give "
                 "longer recordings, or set a smaller twin.horizon"
             )
-        own, across = (
-            triangle[future : future + past, future : future + past],
-            triangle[future : future + past, -outputs:],
-        )
-        left, sizes, _ = np.linalg.svd(across.T, full_matrices=False)
-        by_past = np.linalg.lstsq(own, across, rcond=SMALL)[0].T
+        # Windows repeat the constant and, where a lever is held, its command: dependent columns leave directions in the
+        # triangle that are rounding errors only, so each block is reduced to the directions above `SMALL`.
+        without_future = _without(triangle[:, future:], _directions(triangle[:, :future]))
+        own, across = without_future[:, :past], without_future[:, past:]
+        left, sizes, _ = np.linalg.svd((_directions(own).T @ across).T, full_matrices=False)
+        by_past = np.asarray(np.linalg.lstsq(own, across, rcond=SMALL)[0].T, dtype=np.float64)
         return _Projections(horizon, tuple(pairs), left, sizes, by_past)
 
     def model(self, order: int) -> dict[str, Doubles]:
@@ -248,6 +248,16 @@ class _Projections:
         b = _inputs_of(self.pairs, a, c)
         now, later, u, y = _states(self.pairs, self.horizon, to_states)
         return {"a": a, "b": b, "c": c, "k": _gain(a, c, later - now @ a.T - u @ b.T, y - now @ c.T)}
+
+
+def _directions(columns: Doubles) -> Doubles:
+    """Return an orthonormal basis of the column space, without directions below `SMALL` of the largest one."""
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, sizes > SMALL * sizes[0]])
+
+
+def _without(columns: Doubles, directions: Doubles) -> Doubles:
+    return columns - directions @ (directions.T @ columns)
 
 
 def _windows(pairs: Sequence[Pair], horizon: int) -> Iterator[Pair]:

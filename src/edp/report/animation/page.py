@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
-from edp.report.common.templates import template
-from edp.signals import GROUND_POINTS
+from edp.report.common.templates import asset, stylesheet, template
+from edp.signals import GROUND_POINTS, display_offset
 from edp.storage import write_bytes
 
 if TYPE_CHECKING:
@@ -129,7 +128,7 @@ def scene_of(
     soil = shown.has(*ground)
     points = math.ceil((sum(chosen.bodies.length) + BEYOND_M) / SPACING_M)
     index = np.arange(GROUND_POINTS) * (points - 1) // (GROUND_POINTS - 1)
-    extra = {"payload kg": ("Payload", 1.0, 0.0), "oil °C": ("OilTemperature", 1.0, -273.15)}
+    extra = {"payload kg": ("Payload", 1.0, 0.0), "oil °C": ("OilTemperature", 1.0, display_offset("degC"))}
     readings = {k: f * shown.take(n)[:, 0] + add for k, (n, f, add) in extra.items() if shown.has(n)}
     if shown.has("TipForceX", "TipForceY"):
         readings["tip force kN"] = np.hypot(*shown.take("TipForceX", "TipForceY").T) * 1e-3
@@ -249,7 +248,7 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
         name=scene.name,
         machine=f"{scene.machine.name}, {scene.machine.description}",
         stretch=f"{scene.start_s:g} to {scene.start_s + seconds:g} s",
-        style=Markup(asset("animation.css")),
+        style=Markup(stylesheet("animation.css")),
         **animation_parts(scene),
     )
     target = Path(output)
@@ -307,11 +306,6 @@ def geometry_of(machine: Machine) -> dict[str, Any]:
         "bucket": asdict(machine.bucket),
         "foot": machine.chassis.boom_foot_height,
     }
-
-
-def asset(name: str) -> str:
-    """Text of a file that pages carry with them: a script or a style."""
-    return resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def script_text(value: Any) -> str:

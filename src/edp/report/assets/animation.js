@@ -7,6 +7,10 @@
   const names = ["Boom", "Arm", "Bucket"];
   const side = edpSideView(g);
 
+  // Colours by their light ones, as in palette.css.
+  const named = (colour) => `var(--c${colour.slice(1)}, ${colour})`;
+  const paint = (colour) => getComputedStyle(document.documentElement).getPropertyValue(`--c${colour.slice(1)}`).trim() || colour;
+
   const at = (columns, frame) => {
     const k = Math.min(Math.floor(frame), frames - 2), w = frame - k;
     return columns.map((column) => (column[k] === null || column[k + 1] === null ? NaN : column[k] * (1 - w) + column[k + 1] * w));
@@ -38,7 +42,7 @@
     caption.append(head);
     const values = rows.map((row) => {
       const entry = document.createElement("span"), key = document.createElement("i"), value = document.createElement("span");
-      key.style.borderColor = row.colour;
+      key.style.borderColor = named(row.colour);
       if (row.dashed) key.className = "dashed";
       entry.append(key, `${row.name} `, value);
       caption.append(entry);
@@ -73,7 +77,7 @@
     const left = 40, right = width - 6, top = 6, bottom = height - 18;
     const px = (k) => left + ((k - first) / (last - first)) * (right - left);
     const py = (v) => bottom - ((v - it.low) / (it.high - it.low)) * (bottom - top);
-    c.font = "11.5px sans-serif"; c.fillStyle = "#66717d"; c.strokeStyle = "#e4e8ec"; c.lineWidth = 1;
+    c.font = "11.5px sans-serif"; c.fillStyle = paint("#66717d"); c.strokeStyle = paint("#e4e8ec"); c.lineWidth = 1;
     const step = nice(it.low, it.high);
     c.textAlign = "right";
     for (let v = Math.ceil(it.low / step) * step; v <= it.high; v += step) {
@@ -92,7 +96,7 @@
     it.rows.forEach((row) => {
       if (row.band) {
         const [lower, upper] = row.band;
-        c.fillStyle = row.colour; c.globalAlpha = 0.16;
+        c.fillStyle = paint(row.colour); c.globalAlpha = 0.16;
         for (let k = begin; k < end; k++) {
           if ([lower[k], upper[k], lower[k + 1], upper[k + 1]].includes(null)) continue;
           c.beginPath(); c.moveTo(px(k), py(lower[k])); c.lineTo(px(k + 1), py(lower[k + 1]));
@@ -100,7 +104,7 @@
         }
         c.globalAlpha = 1;
       }
-      c.strokeStyle = row.colour; c.lineWidth = row.dashed ? 1.4 : 1.8; c.setLineDash(row.dashed ? [4, 3] : []);
+      c.strokeStyle = paint(row.colour); c.lineWidth = row.dashed ? 1.4 : 1.8; c.setLineDash(row.dashed ? [4, 3] : []);
       c.beginPath();
       let drawing = false;
       for (let k = begin; k <= end; k++) {
@@ -111,7 +115,7 @@
       c.stroke();
     });
     c.setLineDash([]); c.restore();
-    c.strokeStyle = "#b3261e"; c.lineWidth = 1;
+    c.strokeStyle = paint("#b3261e"); c.lineWidth = 1;
     c.beginPath(); c.moveTo(px(frame), top); c.lineTo(px(frame), bottom); c.stroke();
     const places = Math.max(0, Math.min(6, 2 - Math.floor(Math.log10(it.high - it.low))));
     it.rows.forEach((row, i) => {
@@ -160,6 +164,7 @@
     if (event.key === "ArrowRight" || event.key === "ArrowLeft") seek(position + (event.key === "ArrowRight" ? 1 : -1) * rate);
   });
   window.addEventListener("resize", draw);
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   const wanted = /^#t=([\d.]+)$/.exec(window.location.hash);
   if (wanted) { setPlaying(false); position = Math.max(0, Math.min(frames - 1, (Number(wanted[1]) - scene.start) * rate)); }
   draw();

@@ -19,9 +19,12 @@ const FigureMarks = (function () {
   };
   const STROKED = ["x", "cross", "line-ns", "line-ew"];
 
+  // The colour of a drawing in the palette of the page, which knows what stands for it in the dark.
+  const themed = (colour) => (/^#[0-9a-f]{6}$/i.test(colour) ? `var(--c${colour.slice(1).toLowerCase()}, ${colour})` : colour);
+
   function element(parent, name, attributes, text) {
     const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-    Object.entries(attributes || {}).forEach(([key, value]) => made.setAttribute(key, value));
+    Object.entries(attributes || {}).forEach(([key, value]) => made.setAttribute(key, key === "fill" || key === "stroke" ? themed(value) : value));
     if (text !== undefined) made.textContent = text;
     if (parent) parent.appendChild(made);
     return made;
@@ -168,6 +171,7 @@ const FigureMarks = (function () {
   function cells(box, series, panel) {
     const [across, up] = [edges(panel.x, series.x), edges(panel.y, series.y)];
     series.edges = [across, up];
+    const group = element(box, "g", { class: "scaled" });
     series.z.forEach((row, r) => row.forEach((value, c) => {
       if (value === null || !Number.isFinite(value)) return;
       const share = Math.min(Math.max((value - series.zmin) / (series.zmax - series.zmin || 1), 0), 1);
@@ -175,9 +179,9 @@ const FigureMarks = (function () {
       const [w, h] = [Math.abs(across[c + 1] - across[c]), Math.abs(up[r + 1] - up[r])];
       const fill = mixed(series.colorscale, share);
       const less = series.xgap ? 1 : -0.3; // a little overlap hides seams between cells without gaps
-      element(box, "rect", { x: x.toFixed(1), y: y.toFixed(1), width: Math.max(w - less, 0.5).toFixed(1), height: Math.max(h - less, 0.5).toFixed(1), fill: fill.text });
+      element(group, "rect", { x: x.toFixed(1), y: y.toFixed(1), width: Math.max(w - less, 0.5).toFixed(1), height: Math.max(h - less, 0.5).toFixed(1), fill: fill.text });
       if (series.texttemplate && w > 24 && h > 10) {
-        words(box, x + w / 2, y + h / 2 + 3.5, value.toFixed(2), { colour: fill.dark ? "#fff" : "#26303a", size: 9, more: { "text-anchor": "middle" } });
+        words(group, x + w / 2, y + h / 2 + 3.5, value.toFixed(2), { colour: fill.dark ? "#fff" : "rgb(38, 48, 58)", size: 9, more: { "text-anchor": "middle" } });
       }
     }));
   }
@@ -187,7 +191,7 @@ const FigureMarks = (function () {
     const shade = element(element(svg, "defs"), "linearGradient", { id, x1: 0, y1: 1, x2: 0, y2: 0 });
     series.colorscale.forEach(([at, colour]) => element(shade, "stop", { offset: at, "stop-color": colour }));
     top += 16; // the unit stands above
-    element(svg, "rect", { x, y: top, width: 10, height: bottom - top, fill: `url(#${id})`, stroke: "#e4e8ec" });
+    element(svg, "rect", { x, y: top, width: 10, height: bottom - top, fill: `url(#${id})`, class: "scaled" });
     const axis = new FigureAxes.Axis("y", { ...series.colorbar, range: [series.zmin, series.zmax], type: "-" });
     axis.settle();
     axis.span(bottom, top);
@@ -209,5 +213,5 @@ const FigureMarks = (function () {
     }
   }
 
-  return { bars, cells, element, scaleBar, scatter, shape, symbols, words, DASHES };
+  return { bars, cells, element, scaleBar, scatter, shape, symbols, themed, words, DASHES };
 })();

@@ -2,7 +2,7 @@
 // One figure: its panels, legend, values under the pointer, and zoom. On a narrow screen panels stand below each other.
 const Figure = (function () {
   const { Axis, number, plain, values } = FigureAxes;
-  const { bars, cells, element, scaleBar, scatter, shape, symbols, words, DASHES } = FigureMarks;
+  const { bars, cells, element, scaleBar, scatter, shape, symbols, themed, words, DASHES } = FigureMarks;
   const NARROW = 620;
   const [INK, SOFT, RULE] = ["#26303a", "#5b6671", "#e4e8ec"];
   const ruler = document.createElement("canvas").getContext("2d");
@@ -145,7 +145,7 @@ const Figure = (function () {
         panel.share = [panel.x, panel.y].map((axis) => axis.options.domain[1] - axis.options.domain[0]);
       });
       // Panels that share their rows, such as names and what is said of them, stay beside each other.
-      const stacked = narrow && columns.length > 1 && !panels.some((panel) => panel.y.options.matches);
+      const stacked = narrow && columns.length > 1 && (columns.length > 3 || !panels.some((panel) => panel.y.options.matches));
       if (stacked) {
         panels.sort((a, b) => a.row - b.row || a.column - b.column).forEach((panel, i) => Object.assign(panel, { column: 0, row: i, share: [1, 1] }));
       }
@@ -192,6 +192,7 @@ const Figure = (function () {
       this.edge = across[grid.columns - 1][1];
       panels.forEach((panel) => {
         [panel.left, panel.right] = across[panel.column];
+        panel.room = (panel.column + 1 < grid.columns ? across[panel.column + 1][0] - 8 : grid.wide) - panel.left;
         [panel.top, panel.bottom] = down[panel.row];
         panel.x.span(panel.left, panel.right);
         [panel.y, panel.second].filter(Boolean).forEach((axis) => axis.span(panel.bottom, panel.top));
@@ -263,7 +264,7 @@ const Figure = (function () {
     rulers(svg, panel) {
       const { x, y, second, left, right, top, bottom } = panel;
       const line = (d, colour) => element(svg, "path", { d, stroke: colour, fill: "none", "shape-rendering": "crispEdges" });
-      if (panel.title) words(svg, left, top - 9, fitting(panel.title, right - left + 40, 13), { colour: INK, size: 13 });
+      if (panel.title) words(svg, left, top - 9, fitting(panel.title, panel.room, 13), { colour: INK, size: 13 });
       if (y.options.visible !== false) {
         const rows = y.ticks(bottom - top);
         const every = y.categories ? Math.ceil((rows.length * 13) / Math.max(bottom - top, 1)) : 1;
@@ -390,7 +391,7 @@ const Figure = (function () {
       picked.slice(0, 12).forEach((hit) => {
         const row = html(this.tip, "div");
         const colour = hit.trace.line?.color || (Array.isArray(hit.trace.marker?.color) ? hit.trace.marker.color[hit.i] : hit.trace.marker?.color);
-        if (colour) html(row, "i", { style: `background: ${colour}` });
+        if (colour) html(row, "i", { style: `background: ${themed(colour)}` });
         html(row, "span", {}, hit.text);
       });
       this.tip.hidden = false;

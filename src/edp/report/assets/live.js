@@ -8,7 +8,7 @@
   window.edpLive = stats; // what benchmarks and tests read
   let layout = null, store = null, charts = null, side = null, steered = false, socket = null, ended = "", asked = -1;
   let following = true, position = 0, playing = true, dirty = false, drawn = 0, stamp = 0, arrived = 0, retry = 500, closed = false;
-  let state = { paused: false, skipped: 0, late: 0, oldest: 0, viewers: 1 };
+  let state = { paused: false, skipped: 0, late: false, preparing: "", oldest: 0, viewers: 1 };
   let breaks = session.breaks || [];
   const chosen = new Set(), groups = new Map();
 
@@ -23,11 +23,6 @@
     return palette;
   }
   dark.addEventListener("change", () => { palette = null; dirty = true; });
-  const DARK = {
-    soil: "#3a3128", surface: "#9a7f5c", level: "#4a5560", tick: "#333c45", text: "#a3aeb8", deck: "#5b6671", cab: "#7d8893",
-    track: "#3d464e", trackEdge: "#59636d", pin: "#e8ecf0", link: "#b6c0c9", bucket: "#8a949e", teeth: "#e8ecf0", path: "242, 147, 140", tip: "#f2938c",
-    steel: "#d9ae45", cylinders: ["#8ab4f8", "#e0a458", "#74c7a5"],
-  };
 
   /* Whether the session began anew after a tick and up to another: what was foretold before says nothing of it. */
   function parted(from, to) {
@@ -36,7 +31,7 @@
   }
   /* What a forecast said of a tick: it was made `ticks` before. */
   const foretold = (forecast, column) => (tick) => (
-    parted(tick - forecast.ticks, tick) ? NaN : store.at(tick - forecast.ticks, column) * forecast.factor
+    parted(tick - forecast.ticks, tick) ? NaN : store.at(tick - forecast.ticks, column) * forecast.factor + forecast.offset
   );
   const measured = (column, factor, offset = 0) => (tick) => store.at(tick, column) * factor + offset;
 
@@ -48,11 +43,11 @@
       if (one.lower !== null) {
         lines.push({ name: "upper", bound: "upper", values: foretold(one, one.upper) }, { name: "lower", bound: "lower", values: foretold(one, one.lower) });
       }
-      if (one.measured !== null) lines.unshift({ name: "measured", values: measured(one.measured, one.factor), colour: "measured" });
+      if (one.measured !== null) lines.unshift({ name: "measured", values: measured(one.measured, one.factor, one.offset), colour: "measured" });
       const interval = one.lower === null ? "" : `, ${Math.round(100 * one.coverage)} % interval`;
       plots.push({ id: `${id}|${one.ticks}`, choice: id, title: `${one.name}${interval}`, unit: one.unit, lines });
       if (one.measured !== null) {
-        const actual = measured(one.measured, one.factor), said = foretold(one, one.column);
+        const actual = measured(one.measured, one.factor, one.offset), said = foretold(one, one.column);
         plots.push({
           id: `${id}|${one.ticks}|rest`, choice: id, title: `${one.name}: measured less ${one.model === "network" ? "predicted" : one.model}`, unit: one.unit, height: 90,
           lines: [{ name: "residual", values: (tick) => actual(tick) - said(tick), colour: "rest" }],
@@ -184,7 +179,7 @@
           if (last && Math.hypot(tip[0] - last[0], tip[1] - last[1]) > 0.1 * side.reach) path.length = 0;
           path.push(tip);
         }
-        side.draw(element("front"), { angles, path, colours: dark.matches ? DARK : {} });
+        side.draw(element("front"), { angles, path });
       }
     }
     drawLevers(tick);
@@ -214,6 +209,7 @@
     else if (ended) parts.push(ended);
     else if (state.paused) parts.push("source paused");
     else if (arrived && Date.now() - arrived > 1500) parts.push(`no new values for ${Math.round((Date.now() - arrived) / 1000)} s`);
+    else if (!store.end) parts.push(state.preparing || "waiting for the first values");
     else parts.push(following ? "live" : "looking back");
     const lags = stats.lags.slice(-100).sort((a, b) => a - b);
     parts.push(`${layout.rate_hz} Hz`, `${layout.traces.length} channels`);
@@ -222,7 +218,7 @@
     const told = [];
     if (stats.dropped) told.push(`this page was too slow: ${stats.dropped} ticks were not sent to it (the source lost none)`);
     if (state.skipped) told.push(`${state.skipped} ticks of running ahead were sent to nobody`);
-    if (state.late) told.push(`the source fell behind ${state.late} times: its models take longer than real time`);
+    if (state.late && !ended) told.push(`the source is behind real time${layout.forecasts.length || layout.statistics.length ? ": its models take longer" : ""}`);
     notice.textContent = told.join("; "); notice.hidden = !told.length;
     const paused = session.mode === "saved" ? !playing : steered ? state.paused : !following;
     play.textContent = paused ? (session.mode === "saved" || steered ? "Play" : "Back to now") : "Pause";
@@ -288,7 +284,7 @@
     if (event.key === " ") { event.preventDefault(); play.click(); }
     if (event.key === "ArrowRight" || event.key === "ArrowLeft") seek(shownTick() + (event.key === "ArrowRight" ? 1 : -1) * layout.rate_hz);
   });
-  window.addEventListener("resize", () => { if (charts) charts.resize(); dirty = true; });
+  window.addEventListener("resize", () => { dirty = true; });
 
   let before = null;
   function tick(now) {

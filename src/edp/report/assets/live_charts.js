@@ -7,6 +7,12 @@ function edpCharts(holder, colours, redraw) {
     const chart = [...charts.values()].find((one) => one.figure === entry.target);
     if (chart && chart.visible !== entry.isIntersecting) { chart.visible = entry.isIntersecting; redraw(); }
   }));
+  // A figure is narrower once another one stands in its row, which is after its plot was made.
+  const sized = new ResizeObserver((entries) => entries.forEach((entry) => {
+    const chart = [...charts.values()].find((one) => one.figure === entry.target);
+    if (chart && chart.plot.width !== widthOf(chart.figure)) { chart.plot.setSize({ width: widthOf(chart.figure), height: chart.plot.height }); redraw(); }
+  }));
+  const widthOf = (figure) => Math.max(160, figure.clientWidth);
   let span = [0, 1];
 
   function figure(spec) {
@@ -34,7 +40,7 @@ function edpCharts(holder, colours, redraw) {
     });
     const bands = spec.lines.findIndex((line) => line.bound === "upper");
     const plot = new uPlot({
-      width: Math.max(160, box.clientWidth), height: spec.height || 150, legend: { show: false }, cursor: { show: false },
+      width: widthOf(box), height: spec.height || 150, legend: { show: false }, cursor: { show: false },
       padding: [6, 8, 0, 0],
       scales: { x: { time: false, range: () => span }, y: { range: (u, low, high) => padded(low, high, spec.least) } },
       axes: [{ ...axis(24), values: (u, ticks) => ticks.map((s) => `${+s.toFixed(2)} s`) }, { ...axis(50), space: 26 }],
@@ -45,7 +51,7 @@ function edpCharts(holder, colours, redraw) {
       bands: bands < 0 ? [] : [{ series: [bands + 1, bands + 2], fill: () => colours().band }],
     }, [[0, 1], ...spec.lines.map(() => [null, null])], box);
     const chart = { figure: box, plot, spec, values, visible: true };
-    seen.observe(box);
+    seen.observe(box); sized.observe(box);
     return chart;
   }
   function padded(low, high, least) {
@@ -60,7 +66,7 @@ function edpCharts(holder, colours, redraw) {
       const names = new Set(specs.map((spec) => spec.id));
       charts.forEach((chart, id) => {
         if (names.has(id)) return;
-        seen.unobserve(chart.figure); chart.plot.destroy(); chart.figure.remove(); charts.delete(id);
+        seen.unobserve(chart.figure); sized.unobserve(chart.figure); chart.plot.destroy(); chart.figure.remove(); charts.delete(id);
       });
       specs.forEach((spec) => {
         if (!charts.has(spec.id)) charts.set(spec.id, make(spec));
@@ -91,6 +97,5 @@ function edpCharts(holder, colours, redraw) {
         });
       });
     },
-    resize() { charts.forEach((chart) => chart.plot.setSize({ width: Math.max(160, chart.figure.clientWidth), height: chart.spec.height || 150 })); },
   };
 }

@@ -22,6 +22,12 @@ function edpSideView(g) {
     rod: "#8a949e", steel: "#f0c75e", steelEdge: "#8c6a12", link: "#4d5862", bucket: "#c7ced4", loaded: "#b59a74",
     teeth: "#1c252e", pin: "#2a333c", tip: "#b3261e", path: "179, 38, 30",
   };
+  const DARK = {
+    soil: "#3a3128", surface: "#9a7f5c", level: "#4a5560", tick: "#333c45", text: "#a3aeb8", deck: "#5b6671", cab: "#7d8893",
+    track: "#3d464e", trackEdge: "#59636d", pin: "#e8ecf0", link: "#b6c0c9", bucket: "#8a949e", teeth: "#e8ecf0", path: "242, 147, 140", tip: "#f2938c",
+    steel: "#d9ae45", cylinders: ["#8ab4f8", "#e0a458", "#74c7a5"],
+  };
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const polar = (r, a) => [r * Math.cos(a), r * Math.sin(a)];
   const add = (p, q) => [p[0] + q[0], p[1] + q[1]];
   const turn = (p, a) => [p[0] * Math.cos(a) - p[1] * Math.sin(a), p[0] * Math.sin(a) + p[1] * Math.cos(a)];
@@ -57,9 +63,9 @@ function edpSideView(g) {
   const view = { left: -0.47 * reach, right: 1.06 * reach, bottom: -g.foot - 0.66 * reach, top: 0.86 * reach };
 
   /* Draw `shown`: angles (rad), and where there are any path (points before and above the boom foot, m), heights of the
-     ground at heightsX, whether the bucket is loaded, and other colours. */
+     ground at heightsX, whether the bucket is loaded. */
   function draw(canvas, shown) {
-    const paint = { ...LIGHT, ...shown.colours };
+    const paint = { ...LIGHT, ...(dark.matches ? DARK : {}) };
     const wide = canvas.clientWidth;
     const scale = wide / (view.right - view.left);
     const [c, width, height] = edpCanvas(canvas, Math.round((view.top - view.bottom) * scale));

@@ -1,12 +1,17 @@
-"""The pages' templates: one environment, where a missing value is an error and text is escaped."""
+"""Templates, styles and scripts of pages: one environment, where a missing value is an error and text is escaped."""
 
 from __future__ import annotations
 
+import re
 from functools import cache
+from importlib import resources
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
+
+
+_HEX = re.compile(r"#[0-9a-fA-F]{6}")
 
 
 def template(name: str) -> Template:
@@ -14,15 +19,32 @@ def template(name: str) -> Template:
     return _environment().get_template(name)
 
 
+def asset(name: str) -> str:
+    """Return the text of a file that pages carry with them: a script or a style."""
+    return resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def stylesheet(*names: str) -> str:
+    """Return the style of a page: the colours of all pages, light and dark, then these files."""
+    return "\n".join(asset(name) for name in ("palette.css", *names))
+
+
+def themed(colour: str) -> str:
+    """Return a colour (``#26303a``) as the palette's variable for this colour, which has another value in the dark."""
+    return f"var(--c{colour[1:].lower()}, {colour})" if _HEX.fullmatch(colour) else colour
+
+
 @cache
 def _environment() -> Environment:
     # Here, since every command that may write a page imports this module.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    return Environment(
+    environment = Environment(
         loader=PackageLoader("edp.report", "assets"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["themed"] = themed
+    return environment

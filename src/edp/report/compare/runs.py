@@ -15,6 +15,7 @@ from edp.errors import ConfigError, DataError
 from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
 from edp.report.twin.facts import TWIN, holds_free_runs, read_free_runs
 from edp.storage import read_object
+from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import unfinished_text
 
 MOST_RUNS = 12
@@ -113,7 +114,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
     paths = [Path(folder) for folder in folders]
     if not 2 <= len(paths) <= MOST_RUNS:
         raise ConfigError(f"{len(paths)} run(s) came; edp compare takes 2 to {MOST_RUNS} run folders")
-    real = [path.resolve() for path in paths]
+    real = [full_path(path) for path in paths]
     for position, path in enumerate(real):
         if path in real[:position]:
             raise ConfigError(f"'{paths[position]}' came twice; name each run once")
@@ -147,8 +148,8 @@ def _network(path: Path, name: str) -> ComparedRun:
         raise DataError(unfinished_text(path) or f"'{path}' was not judged; run edp evaluate {path}")
     # What edp evaluate --data writes is a folder in the run, which has the rest.
     whole = facts
-    if facts.provenance is None and (path.resolve().parent / "provenance.json").is_file():
-        whole = read_facts(path.resolve().parent)
+    if facts.provenance is None and is_file_at(full_path(path).parent / "provenance.json"):
+        whole = read_facts(full_path(path).parent)
     errors: dict[Measure, dict[str, float]] = {}
     horizons = {str(horizon) for horizon in facts.horizons}
     for recording, by_horizon in facts.models[NETWORK].get("recordings", {}).items():
@@ -232,14 +233,14 @@ def _twin(path: Path, name: str) -> ComparedRun:
         label=str(_table(read_object(path / HEADER).get("twin")).get("kind", TWIN)) if _has_header(path) else TWIN,
         errors=errors,
         curves=curves,
-        history=read_history(history) if history.is_file() else (),
+        history=read_history(history) if is_file_at(history) else (),
         costs=_positive({"Parameters": facts.provenance.get("parameters")}),
         digest=_digest(facts.provenance),
     )
 
 
 def _has_header(path: Path) -> bool:
-    return (path / HEADER).is_file()
+    return is_file_at(path / HEADER)
 
 
 def _add(errors: dict[Measure, dict[str, float]], row: Mapping[str, Any], recording: str, what: str, at: float) -> None:

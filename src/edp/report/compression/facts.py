@@ -11,6 +11,7 @@ from edp.errors import StorageError
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
+from edp.storage.paths import is_file_at
 
 RESULT, SCHEMA = "compression.json", 2
 LIMITS = {"cycles": "cycles", "parameter_bytes": "parameters", "ram_bytes": "memory", "flash_bytes": "flash"}
@@ -80,7 +81,7 @@ def read_compression(folder: str | Path) -> CompressionFacts:
         StorageError: nothing, or something of another version.
     """
     file = Path(folder) / RESULT
-    if not file.is_file():
+    if not is_file_at(file):
         raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp compress")
     content = read_json(file)
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:

@@ -14,6 +14,7 @@ from edp.report.compression.charts import compression_charts
 from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.run.page import shown
 from edp.storage import write_bytes
+from edp.storage.paths import full_path
 
 
 def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
@@ -47,7 +48,7 @@ def sheets(facts: CompressionFacts) -> list[Sheet]:
 def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
     """The page's text."""
     context: dict[str, Any] = {
-        "title": facts.folder.resolve().name,
+        "title": full_path(facts.folder).name,
         "headline": unbroken(words.headline(facts)),
         "verdict": words.verdict(facts),
         "tiles": words.tiles(facts),

@@ -10,12 +10,11 @@ from markupsafe import Markup
 
 from edp.monitor.alarms import episodes
 from edp.monitor.diagnosis.sentences import clock
-from edp.report.common.templates import template
+from edp.report.common.templates import stylesheet, template
 from edp.report.common.wording import unbroken
 from edp.report.monitor import facts as words
 from edp.report.monitor.drawing import LEVEL_TEXTS, MARKS, SHADES_OF_LEVELS, evidence, overview, timeline
 from edp.report.monitor.facts import MOST_ALARMS, MonitorFacts
-from edp.report.run.page import asset
 from edp.storage import write_bytes
 
 MOST_TIMELINES = 16
@@ -54,7 +53,7 @@ def render(facts: MonitorFacts) -> str:
         "classes": facts.classes,
         "confusions": words.confusion_sheet(facts).table() if facts.confusions else None,
         "provenance": facts.provenance,
-        "style": Markup(asset("page.css")),
+        "style": Markup(stylesheet("page.css")),
     }
     return template("monitor.html.jinja").render(**context)
 

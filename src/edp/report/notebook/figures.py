@@ -18,7 +18,7 @@ from edp.report.run.facts import Facts
 from edp.report.run.figures import downsample
 from edp.report.search.charts import study_charts
 from edp.report.search.facts import StudyFacts
-from edp.signals import KINDS, UNITS, Channel
+from edp.signals import KINDS, Channel
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -103,7 +103,9 @@ def _rows(name: str, panels: Sequence[Panel]) -> Chart:
 
 
 def _row(channel: Channel, marks: Sequence[Mark]) -> Panel:
-    return Panel(tuple(marks), ChartAxis("Time [s]"), title=with_unit(short_label(channel.name), _unit(channel)[0]))
+    return Panel(
+        tuple(marks), ChartAxis("Time [s]"), title=with_unit(short_label(channel.name), KINDS[channel.kind].report_unit)
+    )
 
 
 def _line(channel: Channel, values: Array, rate_hz: float, name: str, colour: str, width: float) -> DataSeries:
@@ -120,17 +122,8 @@ def _small(values: Array) -> NDArray[np.float32]:
     return values.astype(np.float32)
 
 
-def _unit(channel: Channel) -> tuple[str, float]:
-    """The unit of reports and its factor; the SI unit where a factor alone does not lead there (degrees Celsius)."""
-    facts = KINDS[channel.kind]
-    unit = UNITS.get(facts.report_unit)
-    # A factor alone does not lead from kelvin to degrees Celsius.
-    shifted = unit is not None and unit.offset != 0
-    return (facts.si_unit, 1.0) if shifted else (facts.report_unit, facts.report_factor)
-
-
 def _in_report_unit(values: Array, channel: Channel) -> Array:
-    return np.asarray(values * _unit(channel)[1], dtype=np.float64)
+    return np.asarray(KINDS[channel.kind].to_report(values.astype(np.float64)), dtype=np.float64)
 
 
 def _figure(chart: Chart, title: str = "") -> go.Figure:

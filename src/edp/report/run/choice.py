@@ -13,6 +13,7 @@ from edp.report.common.wording import MISSING, decimals_for, number, percent
 from edp.report.run.facts import NETWORK, Facts, Target, horizon_text, label_of, score
 from edp.report.run.figures import horizons_shown
 from edp.storage import read_object, write_json
+from edp.storage.paths import is_file_at
 
 FILE = "auto.json"
 FLOOR, PERSISTENCE = "linear", "persistence"
@@ -26,7 +27,7 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
         StorageError: the file does not hold what the preset auto writes.
     """
     path = folder / FILE
-    if not path.is_file():
+    if not is_file_at(path):
         return None
     content = read_object(path, ("key", "sentence", "minutes", "chosen", "candidates", "excess", "persistence"))
     candidates, excess = content["candidates"], content["excess"]

@@ -17,7 +17,10 @@ from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
+from edp.signals import display_offset
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
+from edp.storage.headers import check_files
+from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.runs import unfinished_text
 
 NETWORK = "network"
@@ -41,12 +44,20 @@ METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 @dataclass(frozen=True)
 class Target:
-    """One output of the model: `factor` takes its SI value to `unit`, the unit of the report."""
+    """One output of the model.
+
+    Values in `unit` are SI values times `factor` plus `offset`; differences have no offset.
+    """
 
     name: str
     description: str
     unit: str
     factor: float
+
+    @property
+    def offset(self) -> float:
+        """See `edp.signals.display_offset`."""
+        return display_offset(self.unit)
 
 
 @dataclass(frozen=True)
@@ -129,13 +140,13 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         DataError: the arrays of predictions do not fit the scored task.
     """
     folder = Path(run_folder)
-    if not folder.is_dir():
+    if not is_folder_at(folder):
         raise StorageError(f"no run folder at '{folder}'; give the folder that `edp train` wrote")
-    if (folder / "twin" / "twin.json").is_file():
+    if is_file_at(folder / "twin" / "twin.json"):
         raise StorageError(
             f"'{folder}' holds a twin, not a network that predicts; edp report writes its page, edp rollout runs it"
         )
-    absent = tuple(name for name in MAKERS if not (folder / name).is_file())
+    absent = tuple(name for name in MAKERS if not is_file_at(folder / name))
     if len(absent) == len(MAKERS):
         raise StorageError(f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}")
 
@@ -155,6 +166,8 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         limit=read_limit(None if limit is None else Path(limit), provenance),
         foundation=_read_foundation(folder),
     )
+    if facts.scores is not None and facts.predictions:
+        check_files(facts.scores, folder, f"write it again with `edp evaluate {folder}`")
     _check_predictions(facts)
     return facts
 
@@ -197,7 +210,7 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
 def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
     """What `edp pretrain` found; None where the run is another."""
     path = folder / "foundation.json"
-    if not path.is_file():
+    if not is_file_at(path):
         return None
     foundation = read_object(path)
     unseen = foundation.get("unseen")

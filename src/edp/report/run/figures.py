@@ -130,7 +130,7 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
         first = busiest_start(truth, length)
         for model, horizon, values in _series(facts, recording, horizons):
             for output, target in enumerate(facts.targets):
-                y = np.asarray(values[:, output] * target.factor, dtype=np.float32)
+                y = np.asarray(values[:, output] * target.factor + target.offset, dtype=np.float32)
                 ends = _ends(facts, recording, model, horizon, output)
                 selected, cut = downsample(y, points), slice(first, first + length)
                 at = (selected / rate).astype(np.float32)
@@ -163,9 +163,9 @@ def _ends(facts: Facts, recording: str, model: str, horizon: int | None, output:
     parts = facts.predictions[recording]
     if model != NETWORK or horizon is None or LOW not in parts or HIGH not in parts:
         return None, None
-    column, factor = facts.horizons.index(horizon), facts.targets[output].factor
+    column, target = facts.horizons.index(horizon), facts.targets[output]
     ends = (aligned(parts[name][:, column, output], horizon) for name in (LOW, HIGH))
-    return tuple(np.asarray(end * factor, dtype=np.float32) for end in ends)
+    return tuple(np.asarray(end * target.factor + target.offset, dtype=np.float32) for end in ends)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from edp.data.splits import kind_of_name
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_object
+from edp.storage.paths import is_file_at
 
 SHOWN = 4
 """Outputs or logs that a sentence names."""
@@ -63,7 +64,7 @@ def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None)
 def minutes_of(folder: Path) -> float | None:
     """That the preset auto was given for a run; None where another training made it."""
     path = folder / "auto.json"
-    minutes = read_object(path).get("minutes") if path.is_file() else None
+    minutes = read_object(path).get("minutes") if is_file_at(path) else None
     return float(minutes) if isinstance(minutes, int | float) else None
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from markupsafe import Markup
 
 from edp.report.common import tables
 from edp.report.common.chart import Chart
-from edp.report.common.templates import template
+from edp.report.common.templates import asset, stylesheet, template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
 from edp.report.run.charts import DOTS_AT_MOST, run_charts
@@ -22,6 +21,7 @@ from edp.report.run.residuals import correlogram, fit_table
 from edp.report.run.signals import signal_chart, signals_of
 from edp.report.run.situations import situation_sheet
 from edp.storage import write_bytes
+from edp.storage.paths import full_path
 
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
 """Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""
@@ -64,9 +64,9 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
     task = (facts.scores or {}).get("task", {})
     network = run.label_of(facts, run.NETWORK) if run.NETWORK in facts.models else ""
     return {
-        "title": title or task.get("name") or facts.folder.resolve().name,
+        "title": title or task.get("name") or full_path(facts.folder).name,
         "network": network,
-        "run_name": facts.folder.resolve().name,
+        "run_name": full_path(facts.folder).name,
         "created": moment((facts.provenance or {}).get("created")),
         "headline": unbroken(run.headline(facts)),
         "verdict": run.verdict_lines(facts),
@@ -134,15 +134,10 @@ def shown(charts: Iterable[Chart]) -> dict[str, Any]:
     return {
         "plots": drawn,
         "specs": script_json([plot.spec() for plot in drawn.values()]),
-        "style": Markup(asset("page.css")),
+        "style": Markup(stylesheet("page.css")),
         "script": Markup(asset("page.js")),
         "drawing": Markup("\n".join(asset(name) for name in DRAWING)),
     }
-
-
-def asset(name: str) -> str:
-    """A file of the page's own, as text."""
-    return resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def script_json(value: Any) -> Markup:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from edp.errors import StorageError
 from edp.report.common.wording import number
 from edp.storage import read_json
+from edp.storage.paths import is_file_at, is_folder_at
 
 if TYPE_CHECKING:
     from edp.report.run.facts import Facts
@@ -27,9 +28,9 @@ def read_limit(path: Path | None, provenance: Mapping[str, Any] | None) -> Mappi
         data = (provenance or {}).get("data", {})
         source = Path(str((data.get("reader") or {}).get("path") or data.get("source") or ""))
         path = source / FILE
-        if not source.is_dir() or not path.is_file():
+        if not is_folder_at(source) or not is_file_at(path):
             return None
-    elif path.is_dir():
+    elif is_folder_at(path):
         path = path / FILE
     limit = read_json(path)
     complete = isinstance(limit, dict) and {"unit", "rate_hz", "horizons", "targets", *KINDS} <= limit.keys()

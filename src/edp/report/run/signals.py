@@ -8,6 +8,7 @@ from edp.report.common.chart import BLUE, SHADES, Chart, ChartAxis, DataSeries, 
 from edp.report.common.wording import short_labels
 from edp.report.run.facts import INPUTS, Facts
 from edp.report.run.figures import downsample
+from edp.signals import display_offset
 
 MOST_PANELS, MOST_SERIES = 6, 7
 """Units that have a panel, and signals in one: more lines nobody tells apart."""
@@ -32,7 +33,7 @@ def signal_chart(facts: Facts) -> Chart | None:
         marks: list[Mark] = []
         labels = short_labels(channels[column]["name"] for column in columns[:MOST_SERIES])
         for label, column, colour in zip(labels, columns, (BLUE, *SHADES)):
-            y = np.asarray(values[:, column] * channels[column]["factor"], dtype=np.float32)
+            y = np.asarray(values[:, column] * channels[column]["factor"] + display_offset(unit), dtype=np.float32)
             selected = downsample(y, POINTS)
             x = (selected / rate).astype(np.float32)
             marks.append(DataSeries(x=x, y=y[selected], name=label, colour=colour, width=1.2))

@@ -24,6 +24,7 @@ from edp.report.common.chart import (
 )  # fmt: skip
 from edp.report.common.wording import short_label
 from edp.report.transfer.facts import SOURCE, TARGET, Transfer
+from edp.signals import display_offset
 
 AHEAD, RECORDING = "horizon", "recording"
 DOMAINS = {TARGET: "On the target's logs", SOURCE: "On the source's recordings"}
@@ -69,7 +70,8 @@ def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
             time_s = Evenly(float(facts.shown[f"{name}/start"][0]), 1 / facts.content["task"]["rate_hz"])
             for order, horizon in enumerate(facts.horizons):
                 for key, (label, colour, width) in curves:
-                    values = (facts.shown[f"{name}/{key}"][:, order, column] * target["factor"]).round(3)
+                    values = facts.shown[f"{name}/{key}"][:, order, column] * target["factor"]
+                    values = (values + display_offset(target["unit"])).round(3)
                     when = {RECORDING: name, AHEAD: horizon}
                     marks.append(DataSeries(x=time_s, y=values, name=label, colour=colour, width=width, when=when))
         title = with_unit(short_label(facts.name(target)), target["unit"])

@@ -17,6 +17,8 @@ from edp.evaluation.guard import ErrorOutcome, ErrorVerdict
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
+from edp.storage.headers import check_files
+from edp.storage.paths import is_file_at
 
 RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 2
 TARGET, SOURCE, MEAN = "target", "source", "mean"
@@ -97,11 +99,12 @@ def read_transfer(folder: str | Path) -> Transfer:
         StorageError: nothing, something of another version, or damaged excerpts.
     """
     file = Path(folder) / RESULT
-    if not file.is_file():
+    if not is_file_at(file):
         raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp finetune")
     content = read_json(file)
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise StorageError(f"'{file}' is of another version of EDP; run edp finetune again")
+    check_files(content, folder, "run edp finetune again")
     try:
         shown = load_file(Path(folder) / SHOWN)
     except (OSError, SafetensorError) as error:

@@ -14,6 +14,7 @@ from edp.report.transfer import facts as words
 from edp.report.transfer.charts import picture_charts, transfer_charts
 from edp.report.transfer.facts import Transfer, read_transfer
 from edp.storage import write_bytes
+from edp.storage.paths import full_path
 
 
 def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
@@ -38,7 +39,7 @@ def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
 def render(facts: Transfer, tables: list[Sheet]) -> str:
     """The page's text."""
     context: dict[str, Any] = {
-        "title": facts.folder.resolve().name,
+        "title": full_path(facts.folder).name,
         "network": facts.content["network"],
         "headline": unbroken(words.headline(facts)),
         "verdict": words.verdict(facts),

@@ -8,6 +8,7 @@ from typing import Any
 
 from edp.evaluation.scores_file import COUNT, NUMBER, REAL, KeyedObject, Leaf, Listed, read_shaped
 from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.storage.paths import is_file_at
 
 CANDIDATES = "candidates.json"
 MOST_CANDIDATES = 100
@@ -32,7 +33,7 @@ def read_candidates(folder: str | Path) -> list[dict[str, Any]]:
         StorageError: the file is damaged.
     """
     path = Path(folder) / CANDIDATES
-    rows: list[dict[str, Any]] = read_shaped(path, SHAPE)["candidates"] if path.is_file() else []
+    rows: list[dict[str, Any]] = read_shaped(path, SHAPE)["candidates"] if is_file_at(path) else []
     return rows[:MOST_CANDIDATES]
 
 

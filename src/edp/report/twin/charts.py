@@ -28,7 +28,7 @@ from edp.report.common.picture import write_pictures
 from edp.report.common.wording import short_label
 from edp.report.twin.facts import PARTS, TWIN, FreeRunFacts
 from edp.report.twin.steps import steps_chart
-from edp.signals import KINDS, Kind
+from edp.signals import KINDS, Kind, display_offset
 
 RECORDING, MODEL = "recording", "model"
 DIGITS = 4
@@ -59,7 +59,8 @@ def runs_chart(facts: FreeRunFacts, part: str) -> Chart:
         marks: list[Mark] = []
         for name in facts.names:
             when, factor = {RECORDING: name}, channel["factor"]
-            answers, truth = (factor * facts.shown[f"{name}/{key}"][:, column] for key in ("answers", "truth"))
+            offset = display_offset(channel["unit"])
+            answers, truth = (factor * facts.shown[f"{name}/{key}"][:, column] + offset for key in ("answers", "truth"))
             if half is not None:
                 reach = factor * half[:, column]
                 low, high = (np.array(_short(ends), dtype=float) for ends in (answers - reach, answers + reach))
@@ -144,7 +145,7 @@ def _rollout_chart(name: str, rollout: Recording, columns: list[str], suffix: st
     for column in columns:
         facts = KINDS[rollout.channels[rollout.index(column)].kind]
         names = (column, f"{column}{suffix}", f"{column}{suffix}_low", f"{column}{suffix}_high")
-        drawn = [facts.report_factor * rollout.column(n)[at] for n in names if n in rollout.channel_names]
+        drawn = [facts.to_report(rollout.column(n)[at]) for n in names if n in rollout.channel_names]
         marks: list[Mark] = []
         if len(drawn) == len(names):
             marks.append(Range(x=time_s, low=drawn[2], high=drawn[3], name="interval"))

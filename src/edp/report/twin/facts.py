@@ -34,6 +34,8 @@ from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_ca
 from edp.report.twin.ground import ground_line
 from edp.report.twin.steps import read_steps
 from edp.storage import read_object
+from edp.storage.headers import check_files
+from edp.storage.paths import full_path, is_file_at
 
 CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
 TWIN = "twin"
@@ -173,7 +175,7 @@ class FreeRunFacts:
 
 def holds_free_runs(folder: str | Path) -> bool:
     """Whether a folder is the run folder of a twin, or one in it with the judgement of other recordings."""
-    return any((Path(folder) / name).is_file() for name in (CONTENT, "twin/twin.json"))
+    return any(is_file_at(Path(folder) / name) for name in (CONTENT, "twin/twin.json"))
 
 
 def read_free_runs(folder: str | Path) -> FreeRunFacts:
@@ -183,20 +185,21 @@ def read_free_runs(folder: str | Path) -> FreeRunFacts:
         StorageError: nothing, something of another version, or damaged content.
     """
     path = Path(folder)
-    if not (path / CONTENT).is_file():
+    if not is_file_at(path / CONTENT):
         raise StorageError(f"'{folder}' holds no {CONTENT}; run edp evaluate {folder}")
     schema = read_object(path / CONTENT).get("schema")
     if isinstance(schema, bool) or schema != SCHEMA:
         raise StorageError(f"'{path / CONTENT}' is of another version of EDP; run edp evaluate {folder}")
     content = read_shaped(path / CONTENT, SHAPE)
+    check_files(content, path, f"run edp evaluate {folder}")
     try:
         shown = load_file(path / RUNS)
     except (OSError, SafetensorError) as error:
         raise StorageError(f"cannot read '{path / RUNS}' ({error}); run edp evaluate {folder}") from error
     header = path / "twin" / "twin.json"
-    provenance = read_object(header).get("provenance") if header.is_file() else {}
+    provenance = read_object(header).get("provenance") if is_file_at(header) else {}
     origin = provenance if isinstance(provenance, dict) else {}
-    facts = FreeRunFacts(path.resolve().name, content, shown, origin, read_candidates(path), read_steps(path))
+    facts = FreeRunFacts(full_path(path).name, content, shown, origin, read_candidates(path), read_steps(path))
     _check_arrays(facts, path / RUNS)
     return facts
 

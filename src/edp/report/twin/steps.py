@@ -12,6 +12,7 @@ from edp.errors import StorageError
 from edp.evaluation.scores_file import COUNT, NAME, REAL, SIZE, KeyedObject, Listed, read_shaped
 from edp.report.common.chart import Chart, ChartAxis, Control, DataSeries, Mark, Panel, Range, with_unit
 from edp.report.common.wording import short_label
+from edp.storage.paths import is_file_at
 
 FILE, COMMAND = "step_response.json", "command"
 MOST_PANELS = 6
@@ -35,7 +36,7 @@ def read_steps(folder: Path) -> Mapping[str, Any]:
         StorageError: damaged content.
     """
     path = folder / FILE
-    if not path.is_file():
+    if not is_file_at(path):
         return {}
     content: Mapping[str, Any] = read_shaped(path, SHAPE)
     count = len(content["seconds"])

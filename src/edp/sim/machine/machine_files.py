@@ -14,6 +14,7 @@ from edp.sim.machine.family import MASSES_T, WIDEST, Draws, member_mass, member_
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.storage import SETTINGS_BYTES, parse_toml, read_text
+from edp.storage.paths import full_path
 
 FAMILY = re.compile(
     r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?(?:-X(\d(?:P\d{1,3})?))?"
@@ -45,7 +46,7 @@ def load_machine(name: str) -> Machine:
                 f"or one of the names {', '.join(machine_names())}"
             ) from error
         # Resolved, since a relative name means another file once the current folder has changed.
-        return _from_file(path.resolve(), changed)
+        return _from_file(full_path(path), changed)
     return _built_in(name.upper())
 
 

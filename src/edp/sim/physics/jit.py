@@ -8,6 +8,7 @@ from typing import Any
 
 from edp.signals import GROUND_POINTS
 from edp.storage.machine_code import Compiler, files_with
+from edp.storage.paths import is_there
 from edp.storage.portable import lock as lock_file
 
 # No "nnan"/"ninf": a diverging state must stay visible as NaN.
@@ -60,12 +61,12 @@ class WarmUp:
             play()
             return
         complete = folder / self.part
-        if complete.exists():
+        if is_there(complete):
             return
         with (folder / "lock").open("w") as lock:
             lock_file(lock, wait=True)
             # Asked again under the lock: another process may have filled the cache meanwhile.
-            if not complete.exists():
+            if not is_there(complete):
                 play()
                 # Marked last: a rehearsal that was killed is repeated.
                 complete.touch()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import StorageError
+from edp.errors import DataError, StorageError
 from edp.storage import object_with, parse_json, read_bytes, replacing
+from edp.storage.archives import ArchiveLimits, ZipReader
 
 SCHEMA = 4
 MOST_BYTES = 1 << 30
 """Largest file of a snapshot: days of a simulation's log."""
 _FACTS = "facts"
+_LIMITS = ArchiveLimits(MOST_BYTES, MOST_BYTES, 100_000)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +66,14 @@ class Snapshot:
         """
         where = f"snapshot '{path}'"
         try:
-            with zipfile.ZipFile(io.BytesIO(read_bytes(path, MOST_BYTES, where))) as packed:
-                _check_members(packed, where)
-                stored = {name.removesuffix(".npy"): _array(packed, name) for name in packed.namelist()}
+            content = read_bytes(path, MOST_BYTES, where)
+            with ZipReader(content, where, _LIMITS, "save the simulation again") as archive:
+                # Nothing packed, so that no small file unpacks to a large one.
+                if any(entry.size != entry.packed or entry.method for entry in archive.entries.values()):
+                    raise StorageError(
+                        f"{where} holds packed arrays, which EDP never writes; save the simulation again"
+                    )
+                stored = {name.removesuffix(".npy"): _array(archive, name) for name in archive.entries}
             facts = object_with(
                 parse_json(stored[_FACTS].tobytes().decode(), where), ("schema", "scenario", "samples", "state"), where
             )
@@ -78,22 +84,13 @@ class Snapshot:
             return Snapshot(
                 facts["scenario"], int(facts["samples"]), facts["state"], arrays, (log,) if len(log) else ()
             )
-        except (ValueError, KeyError, TypeError, OverflowError, zipfile.BadZipFile) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, DataError) as error:
             raise StorageError(f"'{path}' is not a snapshot of a simulation, or is damaged: {error}") from error
 
 
-def _check_members(packed: zipfile.ZipFile, where: str) -> None:
-    """Hold the members to what `save` writes: nothing packed, so that no small file unpacks to a large one."""
-    names = packed.namelist()
-    if len(set(names)) < len(names):
-        raise StorageError(f"{where} holds an array twice; it is damaged")
-    if any(member.compress_type != zipfile.ZIP_STORED for member in packed.infolist()):
-        raise StorageError(f"{where} holds packed arrays, which EDP never writes; save the simulation again")
-
-
-def _array(packed: zipfile.ZipFile, name: str) -> NDArray[Any]:
+def _array(archive: ZipReader, name: str) -> NDArray[Any]:
     """One array; its header must announce the bytes that are there, before NumPy takes memory for it."""
-    data = io.BytesIO(packed.read(name))
+    data = io.BytesIO(archive.read(name))
     version = np.lib.format.read_magic(data)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(data)

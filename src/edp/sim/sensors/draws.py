@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
+import binascii
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +37,7 @@ def instance_of(machine: Machine) -> Instance:
     """The fixed instance of a machine, drawn from its name and ``instance_seed``."""
     own = machine.sensors
     # crc32, since hash() of a text differs from process to process.
-    rng = np.random.default_rng([zlib.crc32(machine.name.encode()), int(own.instance_seed)])
+    rng = np.random.default_rng([binascii.crc32(machine.name.encode()), int(own.instance_seed)])
     return Instance(
         rng.choice([-1.0, 1.0], 6) * rng.uniform(*own.pressure_offset, 6),
         rng.uniform(0.0, 1.0, len(ECUS)),

@@ -11,6 +11,7 @@ from typing import IO
 from edp.errors import BusyError, StorageError
 from edp.storage.ledger.record import FINAL, RECORD_BYTES, Record
 from edp.storage.locks import hold, release
+from edp.storage.paths import entries_of
 from edp.storage.reading import read_bytes
 from edp.storage.writing import make_folder, write_bytes
 
@@ -49,7 +50,7 @@ class Claim:
 
 def free_dead_claims(folder: str | Path) -> None:
     """Remove the claims of processes that were killed."""
-    for file in Path(folder, "claims").glob("*.lock"):
+    for file in entries_of(Path(folder, "claims"), "*.lock"):
         # A claim whose process is gone can be locked, and leaving it removes its file.
         with contextlib.suppress(BusyError), claim(folder, file.stem):
             pass

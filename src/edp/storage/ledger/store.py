@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -16,6 +15,7 @@ from edp.storage.ledger.claims import free_dead_claims, whole
 from edp.storage.ledger.record import FINAL, RECORD_BYTES, SCHEMA, Record, TrainingStatus, body_of, canonical, digest_of
 from edp.storage.ledger.states import SUFFIX, left_state, read_state
 from edp.storage.locks import check_held, hold
+from edp.storage.paths import entries_of, is_entry_at, is_file_at, is_there
 from edp.storage.reading import object_with, read_bytes, read_object
 from edp.storage.writing import make_folder, remove_unfinished, storage_error, write_bytes, write_json
 
@@ -48,8 +48,7 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
     """Bytes of the whole records by key, not yet taken apart: with ten thousand that is most of the time."""
     record_bytes: dict[str, bytes] = {}
     damaged = []
-    names = sorted(name for name in os.listdir(folder) if name.endswith(".json")) if folder.is_dir() else []
-    for name in names:
+    for name in (entry.name for entry in entries_of(folder, "*.json")):
         key, file = name[: -len(".json")], f"{folder}/{name}"
         try:
             data = read_bytes(file, RECORD_BYTES)
@@ -63,9 +62,9 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
         except (ValueError, KeyError, TypeError) as error:
             damaged.append(Damage(Path(file), str(error)))
         except StorageError as error:
-            if not os.path.lexists(file):  # set apart by its holder since it was listed
+            if not is_entry_at(file):  # set apart by its holder since it was listed
                 continue
-            if os.path.isfile(file):
+            if is_file_at(file):
                 raise
             damaged.append(Damage(Path(file), str(error)))
     return record_bytes, damaged
@@ -195,7 +194,7 @@ class Ledger:
     def state(self, key: str) -> Path | None:
         """The file with the state that a training left, where it is whole; a damaged one is set apart."""
         file = self.path / "states" / f"{key}{SUFFIX}"
-        if not file.exists():
+        if not is_there(file):
             return None
         if read_state(file) is None:
             self._move(file, "quarantine")
@@ -204,7 +203,7 @@ class Ledger:
 
     def keep_states(self, keys: Collection[str]) -> None:
         """Remove all states but those of some trainings; records stay."""
-        for file in (self.path / "states").glob(f"*{SUFFIX}"):
+        for file in entries_of(self.path / "states", f"*{SUFFIX}"):
             if file.stem not in keys:
                 file.unlink(missing_ok=True)
 
@@ -230,7 +229,7 @@ class Ledger:
         # For its refusals only: what JSON would change could never be compared again.
         canonical(facts)
         expected = json.loads(json.dumps(facts))
-        if not file.exists():
+        if not is_there(file):
             write_json(file, expected)
             return False
         stored = read_object(file)
@@ -270,22 +269,22 @@ class Ledger:
 
     def openings(self, name: str | None = None) -> list[Opening]:
         """Openings of one sealed test set or of all, oldest first."""
-        openings = [_opening(file) for file in sorted((self.path / "openings").glob("*.json"))]
+        openings = [_opening(file) for file in entries_of(self.path / "openings", "*.json")]
         return [one for one in openings if name in (None, one.test_set)]
 
     def _enter_arrivals(self) -> None:
         """Enter what workers had finished when the last coordinator was killed."""
-        for file in sorted((self.path / "arrived").glob("*.json")):
+        for file in entries_of(self.path / "arrived", "*.json"):
             target = self.path / "records" / file.name
             if whole(file) is None:
                 self._move(file, "quarantine")
             elif whole(target) is None:  # absent, damaged or of a lost training
-                if os.path.lexists(target) and not target.is_file():
+                if is_entry_at(target) and not is_file_at(target):
                     self._move(target, "quarantine")
                 file.replace(target)
             else:
                 file.unlink()
-        for file in (self.path / "arrived").glob(f"*{SUFFIX}"):
+        for file in entries_of(self.path / "arrived", f"*{SUFFIX}"):
             if whole(self.path / "records" / f"{file.stem}.json") is None:  # it will be trained again
                 file.unlink()
             else:
@@ -294,7 +293,7 @@ class Ledger:
     def _take_state(self, key: str) -> None:
         file = left_state(self.path, key)
         try:
-            if file.exists():
+            if is_there(file):
                 file.replace(self.path / "states" / file.name)
         except OSError as error:
             raise storage_error(file, error, "move") from error
@@ -302,7 +301,7 @@ class Ledger:
     def _move(self, file: Path, folder: str) -> None:
         target = make_folder(self.path / folder)
         # Numbered: the same training may be damaged or set aside more than once.
-        number = len(list(target.glob(f"{file.stem}.*")))
+        number = len(entries_of(target, f"{file.stem}.*"))
         try:
             file.replace(target / f"{file.stem}.{number}{file.suffix}")
         except OSError as error:

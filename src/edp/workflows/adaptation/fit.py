@@ -20,6 +20,7 @@ from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import Kind
 from edp.storage import write_bytes, write_json
+from edp.storage.paths import is_file_at, is_there
 from edp.storage.runs import RunFolder
 from edp.training import save_bundle
 from edp.workflows.adaptation.replay import replay
@@ -48,12 +49,12 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     folder = Path(run)
     bundle, _, provenance, data = trained_run(folder)
     # A trained run in the folder would be lost: its bundle has the same name.
-    if (Path(out) / "run.json").exists():
+    if is_there(Path(out) / "run.json"):
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
     adaptation = fit_adaptation(bundle.predictor, data, spec or AdaptationSpec())
     with RunFolder(out) as target:
         for name in COPIED:
-            if (folder / name).is_file():
+            if is_file_at(folder / name):
                 write_bytes(target.file(name), (folder / name).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))

@@ -21,6 +21,7 @@ from edp.report import Facts, read_facts
 from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, text_of
 from edp.signals import KINDS
+from edp.storage.paths import is_file_at
 from edp.training import load_bundle
 from edp.workflows import deployment, train_evaluate
 from edp.workflows.api.predictions import Predictions
@@ -112,7 +113,7 @@ class TrainedPredictor:
             ConfigError: an unknown baseline, or what a bundle alone cannot give.
         """
         recordings = None if test is None else as_recordings(test)
-        if not (self.folder / PROVENANCE).is_file():
+        if not is_file_at(self.folder / PROVENANCE):
             return self._judged_alone(recordings, baselines)
         source = None if recordings is None else recordings.source or _memory(recordings)
         names = BASELINES if baselines is None else tuple(baselines)

@@ -17,6 +17,7 @@ from edp.logs.write import write_recording
 from edp.recording import Recording
 from edp.settings.tree import Table, merged, read_toml
 from edp.storage import make_folder
+from edp.storage.paths import is_there
 from edp.training import Diverged, TrainingProgress
 from edp.workflows import train_evaluate
 from edp.workflows.api.predictor import TrainedPredictor
@@ -196,5 +197,5 @@ def _write(source: DataSource) -> None:
     for number, recording in enumerate(source.recordings):
         file = folder / f"{number:05d}.parquet"  # read back in this order
         # A resumed training finds the same files; writing them again would cost minutes of a large set.
-        if not file.exists():
+        if not is_there(file):
             write_recording(recording, file)

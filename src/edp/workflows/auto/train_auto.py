@@ -19,6 +19,7 @@ from edp.recording import FloatArray, Recording
 from edp.report.run.choice import FILE, FLOOR, read_choice
 from edp.signals import Kind
 from edp.storage import make_folder, read_object, write_json
+from edp.storage.paths import is_file_at, is_there
 from edp.storage.runs import run_key
 from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
@@ -131,9 +132,9 @@ def _finished(folder: Path, key: str) -> AutoResult | None:
     facts = read_choice(folder)
     if facts is not None and facts["key"] == key:
         status = folder / "status.json"
-        finished = status.is_file() and read_object(status).get("status") == "finished"
+        finished = is_file_at(status) and read_object(status).get("status") == "finished"
         return AutoResult(load_bundle(folder), dict(facts)) if finished else None
-    if facts is not None or (folder / "run.json").exists():
+    if facts is not None or is_there(folder / "run.json"):
         raise StorageError(
             f"run folder '{folder}' holds another run (other settings, data or version); nothing was changed. Choose "
             "another folder with --out, or remove this one"

@@ -12,6 +12,7 @@ from edp.data.prepared import Prepared
 from edp.errors import EdpError, LostError
 from edp.sandbox.helpers import Helpers
 from edp.storage import make_folder, read_object, write_json
+from edp.storage.paths import is_file_at
 from edp.storage.runs import KeyedRun, RunFolder, run_key
 from edp.training import Diverged, Fitted, TrainingProgress
 from edp.training.bagging.fit import fit_bagged
@@ -189,7 +190,7 @@ class _Display:
 def _noted(job: CandidateTraining) -> TrainingProgress | None:
     names = ("epoch", "epochs", "update", "updates", "targets_per_s", "seconds_left")
     note = job.folder / NOTE
-    if not note.is_file():
+    if not is_file_at(note):
         return None
     try:
         row = read_object(note, names)

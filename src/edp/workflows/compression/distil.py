@@ -18,6 +18,7 @@ from edp.networks.losses import LOSSES
 from edp.networks.predictor import Predictor
 from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, integer
 from edp.settings.tree import SettingsTree
+from edp.storage.paths import is_file_at
 from edp.storage.runs import read_provenance
 from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
@@ -142,7 +143,7 @@ def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor
     folder = _run_folder(run)
     bundle = load_bundle(folder)
     for name in ("config.toml", "provenance.json"):
-        if not (folder / name).is_file():
+        if not is_file_at(folder / name):
             raise StorageError(
                 f"'{folder}' is not a run folder: it has no {name}, which says how the network was trained; give the "
                 "folder of edp train"
@@ -168,7 +169,7 @@ def _run_folder(run: str | Path) -> Path:
     """The folder of a run, or of the run that a bundle lies in."""
     folder = Path(run)
     # Both a run folder and the bundle inside it are accepted.
-    inside = (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file()
+    inside = is_file_at(folder.parent / "config.toml") and not is_file_at(folder / "config.toml")
     return folder.parent if inside else folder
 
 

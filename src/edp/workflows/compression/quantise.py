@@ -10,6 +10,7 @@ from edp.export.c.sizes import constant_bytes
 from edp.networks.integer import integer_predictor
 from edp.networks.running import mean_error
 from edp.storage import check_writable, write_bytes, write_json
+from edp.storage.paths import is_file_at, is_there
 from edp.storage.runs import RunFolder
 from edp.training import save_bundle
 from edp.workflows.train_evaluate import trained_run
@@ -36,7 +37,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     bundle, _, provenance, data = trained_run(folder)
     if bundle.predictor.number_format != "float32":
         raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
-    if (Path(out) / "run.json").exists():
+    if is_there(Path(out) / "run.json"):
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
     check_writable(out)
     integer_network = integer_predictor(bundle.predictor, data.train, ticks)
@@ -47,7 +48,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     }
     with RunFolder(out) as target:
         for name in ("config.toml", "history.jsonl", "footprint.json"):
-            if (folder / name).is_file():
+            if is_file_at(folder / name):
                 write_bytes(target.file(name), (folder / name).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"number_format": integer_network.number_format})
         # Scores are those of the float network; they would be wrong for the integer one.

@@ -19,6 +19,7 @@ from edp.settings.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_coun
 from edp.signals import KINDS
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.ledger import Ledger
+from edp.storage.paths import is_file_at
 from edp.storage.runs import RunFolder, run_key
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
@@ -137,7 +138,7 @@ class DiskBench(Bench):
         run = self.folder / order.name
         done, self.done = self.done, self.done + 1
         # A finished run with the same facts is read: a search that goes on trains nothing twice.
-        status = read_object(run / "status.json", ("status",))["status"] if (run / "status.json").is_file() else ""
+        status = read_object(run / "status.json", ("status",))["status"] if is_file_at(run / "status.json") else ""
         if status == "finished":
             bundle = load_bundle(run)
             if bundle.provenance.get("strategy") == facts:
@@ -243,7 +244,7 @@ def _held_out_test_of(source: DataSource, experiment: Experiment, data: Prepared
     if not any(session.digest in there for session in split.second):
         return _HeldOutTest(data, opened_before=any(session.digest in there for session in split.test))
     study = Path(split.study)
-    recorded = split.study and (study / "study.json").is_file() and (study / "ledger" / "about.json").is_file()
+    recorded = split.study and is_file_at(study / "study.json") and is_file_at(study / "ledger" / "about.json")
     opened = prepare_data(source, replace(experiment, split=split.opened()))
     return _HeldOutTest(opened, SECOND_TEST_SET, study if recorded else None)
 
@@ -366,7 +367,7 @@ def _seen(run: Path, source: DataSource | None, own: DataSource, held_out: _Held
     """Whether the sealed test set is the test part and was judged before, by ``edp evaluate``."""
     # The test part of the same data that `edp evaluate` has judged is no sealed set any more.
     same = held_out.name == TEST_PART and (source is None or source.to_plain() == own.to_plain())
-    return same and (run / "scores.json").is_file()
+    return same and is_file_at(run / "scores.json")
 
 
 def _plain(

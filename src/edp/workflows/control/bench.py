@@ -19,6 +19,7 @@ from edp.control.plants import plant_of, twin_of
 from edp.control.tasks import draw_task
 from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_map
 from edp.errors import ConfigError
+from edp.storage.paths import is_folder_at
 from edp.training.bundle import load_bundle
 
 
@@ -148,7 +149,7 @@ def _bundle_of(run: Path) -> Path:
     Raises:
         ConfigError: there is no such folder.
     """
-    if not run.is_dir():
+    if not is_folder_at(run):
         raise ConfigError(f"--predictor {run}: there is no such folder; give the run folder of edp train")
     inner = run / "bundle"
-    return inner if inner.is_dir() else run
+    return inner if is_folder_at(inner) else run

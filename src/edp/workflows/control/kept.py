@@ -31,9 +31,11 @@ from edp.signals import TABLE_A1, Channel, Kind
 from edp.sim.environment import NominalMachine
 from edp.sim.machine.machine_checks import MACHINE_FILE
 from edp.sim.machine.machine_files import load_machine
-from edp.storage import make_folder, object_with, read_json, write_bytes, write_json
+from edp.storage import make_folder, write_bytes, write_json
+from edp.storage.headers import read_header
+from edp.storage.paths import entries_of, is_file_at
 from edp.storage.runs import unfinished_text
-from edp.training.bundle import as_damage, check_hash, read_arrays, sealed, write_arrays
+from edp.training.bundle import as_damage, check_hash, read_arrays, with_plugins, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 KEPT, HEADER, MACHINE, TWIN = "controller", "controller.json", "machine.toml", "twin"
@@ -109,8 +111,8 @@ def keep_controller(
         "twin": twin is not None,
         "arrays": write_arrays(folder, "arrays", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()})),
     }
-    write_json(folder / HEADER, sealed(header))
-    for old in folder.glob("arrays-*.safetensors"):
+    write_json(folder / HEADER, with_plugins(header))
+    for old in entries_of(folder, "arrays-*.safetensors"):
         if old.name != header["arrays"]["file"]:  # type: ignore[index]
             old.unlink(missing_ok=True)
     return folder
@@ -126,14 +128,14 @@ def load_kept(run: str | Path) -> KeptController:
     """
     path = Path(run)
     folder = path / KEPT
-    if not (folder / HEADER).is_file():
+    if not is_file_at(folder / HEADER):
         raise StorageError(
             unfinished_text(path)
             or f"'{path}' has no {KEPT}/{HEADER}: it is not a run of edp control, or one of an earlier version; run "
             "edp control again, in a new folder"
         )
     with as_damage(folder):
-        header = object_with(read_json(folder / HEADER), ("schema",), f"'{folder / HEADER}'")
+        header = read_header(folder / HEADER, ("schema",))
         if header["schema"] != SCHEMA:
             raise BundleError(
                 f"controller '{folder}' has schema {str(header['schema'])[:40]}, this EDP ({__version__}) reads "

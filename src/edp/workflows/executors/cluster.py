@@ -18,6 +18,7 @@ from typing import Any
 from edp.errors import ConfigError, LostError
 from edp.storage import write_bytes
 from edp.storage.ledger import Record, TrainingStatus, code_version, left_state
+from edp.storage.paths import is_there
 from edp.storage.runs import environment
 from edp.workflows.executors.base import (
     EXECUTORS,
@@ -223,7 +224,7 @@ def _perform_there(job: Job, threads: int, start: _StateFile | None) -> tuple[by
         if record is None:
             raise RuntimeError("the pool of a node gave a training up without a word")
         left = left_state(folder, job.key)
-        return record.to_bytes(), left.read_bytes() if left.exists() else None
+        return record.to_bytes(), left.read_bytes() if is_there(left) else None
 
 
 def _state_there(threads: int) -> dict[str, str]:

@@ -19,6 +19,7 @@ from typing import Any
 
 from edp.errors import EdpError, LostError, StorageError
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, code_version, read_state
+from edp.storage.paths import is_folder_at
 from edp.storage.runs import environment
 from edp.workflows.executors.base import START, Executor, Job, Workforce, complete
 
@@ -132,7 +133,7 @@ def _ledger(folder: str | Path | None) -> Iterator[Ledger]:
 
 def forget_units(folder: str | Path) -> None:
     """Remove results of units, once what they were for is on disk."""
-    if Path(folder, "records").is_dir():
+    if is_folder_at(Path(folder, "records")):
         shutil.rmtree(folder, ignore_errors=True)
 
 

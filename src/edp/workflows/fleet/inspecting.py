@@ -21,6 +21,7 @@ from edp.recording import Recording
 from edp.settings.tree import build, plain_tree
 from edp.signals import SignalMap
 from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path, is_file_at, is_there, status_of
 from edp.workflows.covering import coverage
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.packing import packed, unpacked
@@ -127,8 +128,8 @@ def _units_of_logs(source: DataSource) -> list[WorkUnit]:
             }
         )
         keys.append(stored.key)
-        places.append({"path": str(log.path.resolve()), "shown": str(log.path)})
-        size += log.path.stat().st_size if log.path.is_file() else 0
+        places.append({"path": str(full_path(log.path)), "shown": str(log.path)})
+        size += status_of(log.path).st_size if is_file_at(log.path) else 0
         if size >= UNIT_BYTES or number == len(listed) - 1:
             label, where = places[0]["shown"], {"logs": places}
             units.append(WorkUnit(f"{__name__}:look_at_logs", label, {"logs": logs}, " ".join(keys), where))
@@ -148,7 +149,7 @@ def _look(log: Mapping[str, Any], at: Mapping[str, str]) -> tuple[QualityReport,
     signal_map = None if log["map"] is None else build(SignalMap, log["map"], f"map of '{at['shown']}'")
     # The path as it was given stands in messages; where it leads nowhere on this node, the resolved one is read.
     shown = Path(at["shown"])
-    path = shown if shown.exists() else Path(at["path"])
+    path = shown if is_there(shown) else Path(at["path"])
     span = None if log["rows"] is None else (log["rows"][0], log["rows"][1])
     repair = None if log["repair"] is None else build(Repair, log["repair"], f"repairs of '{at['shown']}'")
     try:
@@ -165,7 +166,7 @@ def _units_of_store(source: DataSource, recordings: Sequence[Recording]) -> list
     for first in range(0, len(recordings), each):
         part = recordings[first : first + each]
         arguments = {"first": first, "count": len(part), "at_most_h": source.at_most_h}
-        where = {"store": str(source.store_folder().resolve())}
+        where = {"store": str(full_path(source.store_folder()))}
         label = str(source.path / part[0].name)
         units.append(WorkUnit(f"{__name__}:look_at_stored", label, arguments, digest, where))
     return units

@@ -23,6 +23,7 @@ from edp.report.fleet.page import write_fleet_page
 from edp.signals import KINDS
 from edp.storage import check_writable, read_bytes, write_json
 from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import files_below, full_path, status_of
 from edp.training import Bundle, load_bundle
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
@@ -106,7 +107,7 @@ def report_fleet(
         "machines": rows,
     }
     write_json(folder / RESULT, content)
-    facts = fleet_facts(content, Path(question.store).resolve().name)
+    facts = fleet_facts(content, full_path(Path(question.store)).name)
     write_fleet_page(facts, folder / PAGE)
     forget_units(folder / UNITS)
     return facts
@@ -127,10 +128,10 @@ def _unit(machine: StoredMachine, digest: str, question: FleetQuestion, delta: P
         "monitor": None if monitor is None else _state_of(monitor),
     }
     where = {
-        "network": str(question.network.resolve()),
-        "store": str(question.store.resolve()),
-        "delta": None if delta is None else str(delta.resolve()),
-        "monitor": None if monitor is None else str(monitor.resolve()),
+        "network": str(full_path(question.network)),
+        "store": str(full_path(question.store)),
+        "delta": None if delta is None else str(full_path(delta)),
+        "monitor": None if monitor is None else str(full_path(monitor)),
     }
     label = f"machine '{machine.name}'"
     return WorkUnit(f"{__name__}:judge_machine", label, arguments, " ".join(machine.digests), where)
@@ -142,8 +143,8 @@ def _hash(content: bytes) -> str:
 
 def _state_of(folder: Path) -> str:
     """Names, sizes and times of the files of a folder, as one hash."""
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    facts = [(str(file.relative_to(folder)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    files = sorted(files_below(folder))
+    facts = [(str(file.relative_to(folder)), status_of(file).st_size, status_of(file).st_mtime_ns) for file in files]
     return _hash(repr(facts).encode())
 
 

@@ -13,6 +13,7 @@ from edp.evaluation.judge import JudgedModel, JudgedPart, JudgeSpec, ModelBench,
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path
 from edp.storage.runs import read_provenance
 from edp.training.blas import one_blas_thread
 from edp.workflows.executors import Workforce
@@ -55,7 +56,7 @@ def evaluate_with(
         names, spec = [*reversed(by_effort(bench.spec.baselines))], bench.spec
         parts = network_parts(bench.data)
         source_fields = None if source is None else source.to_plain()
-        at = {"run": str(folder.resolve()), "source": source_fields, "at_most_h": at_most_h}
+        at = {"run": str(full_path(folder)), "source": source_fields, "at_most_h": at_most_h}
         models = [_unit(f"model '{name}'", {"model": name}, spec, digest, at) for name in names]
         runs = [
             _unit(f"network, part {part + 1} of {parts}", {"part": part}, spec, digest, at) for part in range(parts)

@@ -20,6 +20,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import KINDS
 from edp.storage import check_writable, make_folder, object_with, read_object, write_bytes, write_json
 from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import unfinished_text
 from edp.training.bundle import load_bundle, save_bundle, weights_digest
 from edp.training.delta import DELTA_BYTES, SUFFIX, delta_from_bytes, delta_of, read_delta, with_delta
@@ -112,8 +113,8 @@ def finetune_fleet(
         "schema": SCHEMA,
         "edp": __version__,
         "base": digest,
-        "source": str(Path(source).resolve()),
-        "store": str(Path(store).resolve()),
+        "source": str(full_path(Path(source))),
+        "store": str(full_path(Path(store))),
         "method": order.method,
         "most_bytes": order.most_bytes,
         "unit": _unit_of(base),
@@ -171,7 +172,7 @@ def read_fleet(folder: str | Path) -> dict[str, Any]:
         ConfigError: of another schema.
     """
     file = Path(folder, FLEET)
-    if not file.is_file() and (unfinished := unfinished_text(folder)):
+    if not is_file_at(file) and (unfinished := unfinished_text(folder)):
         raise StorageError(unfinished)
     content = object_with(read_object(file), ("schema", "base", "source", "machines"), f"'{file}'")
     if content["schema"] != SCHEMA:
@@ -196,7 +197,7 @@ def _unit(machine: StoredMachine, digest: str, source: str | Path, store: str | 
         "changes": changes,
         "most_bytes": order.most_bytes,
     }
-    where = {"source": str(Path(source).resolve()), "store": str(Path(store).resolve())}
+    where = {"source": str(full_path(Path(source))), "store": str(full_path(Path(store)))}
     label = f"machine '{machine.name}'"
     return WorkUnit(f"{__name__}:tune_machine", label, arguments, " ".join(machine.digests), where)
 

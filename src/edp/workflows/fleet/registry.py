@@ -28,6 +28,7 @@ from edp.storage import (
     write_bytes,
     write_json,
 )
+from edp.storage.paths import entries_of, is_file_at, is_folder_at
 from edp.storage.runs import read_provenance
 from edp.training import Bundle, load_bundle, save_bundle
 from edp.training.bundle import weights_digest
@@ -93,7 +94,7 @@ def add_to_registry(registry: str | Path, source: str | Path, name: str) -> Regi
     top = check_writable(registry)
     lock = hold(top / LOCK)
     try:
-        if (folder / FLEET).is_file():
+        if is_file_at(folder / FLEET):
             return _add_fleet(top, folder, name)
         return _add_network(top, folder, name)
     finally:
@@ -167,7 +168,7 @@ def _plain_name(file: str) -> str:
 
 
 def _is_there(top: Path, digest: str) -> bool:
-    return (top / ENTRIES / f"{digest}.json").is_file()
+    return is_file_at(top / ENTRIES / f"{digest}.json")
 
 
 def _entered(top: Path, entry: RegistryEntry) -> RegistryEntry:
@@ -209,7 +210,7 @@ def _recordings(parts: Sequence[Mapping[str, Any]]) -> int:
 def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
     """Errors of the run's own test part beside the best baseline, as ``scores.json`` has them."""
     file = folder / SCORES
-    if not file.is_file():
+    if not is_file_at(file):
         return {}
     scores = object_with(read_object(file), ("models", "task", "targets"), f"'{file}'")
     try:
@@ -223,7 +224,7 @@ def _judge_of(folder: Path, bundle: Bundle) -> dict[str, Any]:
     for horizon in errors.get("network", {}):
         others = {name: by[horizon] for name, by in errors.items() if name != "network" and horizon in by}
         best[horizon] = min(others.items(), key=lambda pair: pair[1]) if others else None
-    provenance = read_provenance(folder) if (folder / "provenance.json").is_file() else {}
+    provenance = read_provenance(folder) if is_file_at(folder / "provenance.json") else {}
     data = provenance.get("data", {})
     test = data.get("test", {}) if isinstance(data, Mapping) else {}
     return {
@@ -245,10 +246,10 @@ def list_registry(registry: str | Path) -> tuple[list[RegistryEntry], list[str]]
         ConfigError: no registry.
     """
     top = Path(registry)
-    if not (top / ENTRIES).is_dir():
+    if not is_folder_at(top / ENTRIES):
         raise ConfigError(f"'{registry}' is no registry; `edp registry add {registry} RUN --name NAME` makes one")
     entries, damaged = [], []
-    for file in sorted((top / ENTRIES).glob("*.json")):
+    for file in entries_of(top / ENTRIES, "*.json"):
         try:
             entries.append(read_entry(top, file.stem))
         except EdpError as error:
@@ -324,7 +325,7 @@ def check_entry(registry: str | Path, entry: RegistryEntry) -> None:
             raise StorageError(f"'{folder}' holds another network than its entry; restore it")
         return
     state = hashlib.blake2b(digest_size=16)
-    for file in sorted(folder.glob("deltas/*.delta")):
+    for file in entries_of(folder / "deltas", "*.delta"):
         state.update(f"deltas/{file.name}\0".encode() + read_bytes(file, MOST_BYTES))
     if state.hexdigest() != entry.id:
         raise StorageError(f"'{folder}' holds other deltas than its entry; restore it")

@@ -14,6 +14,7 @@ from edp.sim.data_set import Simulated, SimulationOrder, simulate_data_set
 from edp.sim.scenario import Scenario, plain
 from edp.sim.simulate import simulate
 from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import full_path, is_folder_at, is_there
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 
@@ -45,9 +46,9 @@ def simulate_with(
 
         def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
             scenario = by_name[str(result.values["name"])]
-            if not (folder / f"{scenario.name}{order.suffix}").exists():
+            if not is_there(folder / f"{scenario.name}{order.suffix}"):
                 raise StorageError(
-                    f"'{scenario.name}' was written on another node, and is not in '{folder.resolve()}' here; give a "
+                    f"'{scenario.name}' was written on another node, and is not in '{full_path(folder)}' here; give a "
                     "folder that all nodes see under the same path"
                 )
             wrote(scenario)
@@ -59,7 +60,7 @@ def simulate_with(
 
 def _unit(scenario: Scenario, folder: Path, order: SimulationOrder) -> WorkUnit:
     arguments = {"scenario": plain(scenario), "suffix": order.suffix, "files": asdict(order.files())}
-    where = {"folder": str(folder.resolve())}
+    where = {"folder": str(full_path(folder))}
     return WorkUnit(f"{__name__}:write_one", f"recording '{scenario.name}'", arguments, _machine(scenario), where)
 
 
@@ -76,9 +77,9 @@ def write_one(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str,
             f"machine '{scenario.machine}' has other numbers on this node; all nodes must see the same file there"
         )
     folder = Path(where["folder"])
-    if not folder.is_dir():
+    if not is_folder_at(folder):
         raise StorageError(f"'{folder}' is not on this node; give a folder that all nodes see under the same path")
     path = folder / f"{scenario.name}{identity.config['suffix']}"
-    if not path.exists():
+    if not is_there(path):
         write_recording(simulate(scenario), path, WriteOptions(**identity.config["files"]))
     return {"name": scenario.name}

@@ -22,6 +22,7 @@ from edp.settings.tree import build, plain_tree
 from edp.signals import SignalMap
 from edp.storage import check_writable, hold, make_folder, read_object, release
 from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import entries_of, full_path, is_file_at, is_folder_at, is_there
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 
@@ -48,14 +49,14 @@ def store_with(
     """
     logs = {log.key: log for log in stored_logs(source)}
     top = Path(folder)
-    if logs and (not top.exists() or is_store(top) or not any(top.iterdir())):
+    if logs and (not is_there(top) or is_store(top) or not any(entries_of(top))):
         make_folder(top)
         lock = hold(top / LOCK)
         try:
             check_writable(make_folder(top / ROWS))
             _read_batches(logs, top, workforce, on_progress or (lambda progress: None))
         finally:
-            release(top / LOCK, lock) if (top / INDEX).is_file() else lock.close()
+            release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
     # It enters what the units left, and says what stands against a folder that is no store.
     return source.store(folder, 1, on_progress)
 
@@ -88,9 +89,9 @@ def _read_batches(
     counted = {"logs": len(logs) - len(missing), "refused": 0}
 
     def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-        if result.values["stored"] and not rows_path(top, unit.data).is_file():
+        if result.values["stored"] and not is_file_at(rows_path(top, unit.data)):
             raise StorageError(
-                f"{unit.label} was stored on another node, and is not in '{top.resolve()}' here; give a folder that "
+                f"{unit.label} was stored on another node, and is not in '{full_path(top)}' here; give a folder that "
                 "all nodes see under the same path"
             )
         counted["logs"] += len(unit.arguments["logs"])
@@ -102,10 +103,10 @@ def _read_batches(
 
 def _stored_keys(top: Path) -> set[str]:
     """Keys of logs whose rows are in the store, or lie in it from a build that was stopped."""
-    keys = {entry.log_key for entry in read_index(top).recordings} if (top / INDEX).is_file() else set()
-    for record in (top / ROWS).glob("*.json"):
+    keys = {entry.log_key for entry in read_index(top).recordings} if is_file_at(top / INDEX) else set()
+    for record in entries_of(top / ROWS, "*.json"):
         with suppress(DataError, StorageError, KeyError, TypeError):
-            if rows_path(top, record.stem).is_file():
+            if is_file_at(rows_path(top, record.stem)):
                 keys |= {str(entry["log_key"]) for entry in read_object(record)["recordings"]}
     return keys
 
@@ -123,7 +124,7 @@ def _batches(logs: dict[str, StoredLog], top: Path, readers: int) -> list[LogBat
             room = bound
         groups[-1].append((key, log))
         room -= sizes[key]
-    return [LogBatch(top.resolve(), _batch_key(group), tuple(group)) for group in groups]
+    return [LogBatch(full_path(top), _batch_key(group), tuple(group)) for group in groups]
 
 
 def _batch_key(group: list[tuple[str, StoredLog]]) -> str:
@@ -134,7 +135,7 @@ def _unit(batch: LogBatch) -> WorkUnit:
     logs = [
         {
             "key": key,
-            "path": str(log.path.resolve()),
+            "path": str(full_path(log.path)),
             "map": plain_tree(log.signal_map),
             "repair": asdict(log.repair),
             "name": log.name,
@@ -153,15 +154,17 @@ def read_batch(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str
         ConfigError: a log is not the same file on this node, or the store is not on it.
     """
     folder = Path(where["folder"])
-    if not (folder / ROWS).is_dir():
+    if not is_folder_at(folder / ROWS):
         raise ConfigError(f"the store '{folder}' is not on this node; give a folder that all nodes see")
     logs = tuple((entry["key"], _log(entry)) for entry in identity.config["logs"])
     for key, log in logs:
-        if log.path.exists() and log.key != key:
+        if is_there(log.path) and log.key != key:
             raise ConfigError(
                 f"'{log.path}' has another size or time on this node; all nodes must see the same file under that path"
             )
-    if rows_path(folder, identity.data).is_file() and rows_path(folder, identity.data).with_suffix(".json").is_file():
+    if is_file_at(rows_path(folder, identity.data)) and is_file_at(
+        rows_path(folder, identity.data).with_suffix(".json")
+    ):
         return {"stored": True, "refused": 0}  # by a worker that was killed before it could say so
     record = store_batch(LogBatch(folder, identity.data, logs))
     return {"stored": bool(record["recordings"]), "refused": len(record["refused"])}

@@ -14,6 +14,7 @@ from edp.config.experiment import Experiment, build, plain_tree
 from edp.errors import ConfigError
 from edp.logs.source import DataSource
 from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import full_path, is_file_at
 from edp.training import Diverged
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
@@ -44,8 +45,8 @@ def pretrain_with(
     arguments = {"experiment": plain_tree(experiment), "method": order.method, "meta": asdict(order.meta)}
     where = {
         "source": source.to_plain(),
-        "out": str(Path(out).resolve()),
-        "begun_from": None if order.start is None else str(Path(order.start).resolve()),
+        "out": str(full_path(Path(out))),
+        "begun_from": None if order.start is None else str(full_path(Path(order.start))),
     }
     unit = WorkUnit(f"{__name__}:pretrain_there", f"pretraining in '{out}'", arguments, keys_of(source), where)
     values = dict(run_units([unit], workforce)[0].values)
@@ -92,9 +93,9 @@ def finetune_with(
     names = trained_methods(source, order)
     changes = [change if isinstance(change, str) else dict(change) for change in order.changes]
     where = {
-        "source": str(Path(source).resolve()),
+        "source": str(full_path(Path(source))),
         "logs": logs.to_plain(),
-        "out": str(Path(out).resolve()),
+        "out": str(full_path(Path(out))),
     }
     units = []
     for name in names:
@@ -129,8 +130,8 @@ def _check_seen(out: Path) -> None:
     Raises:
         ConfigError: it is not here.
     """
-    if not (out / "config.toml").is_file():
+    if not is_file_at(out / "config.toml"):
         raise ConfigError(
-            f"the run was written on another node, and is not in '{out.resolve()}' here; give a folder that all nodes "
+            f"the run was written on another node, and is not in '{full_path(out)}' here; give a folder that all nodes "
             "see under the same path"
         )

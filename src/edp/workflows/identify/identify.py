@@ -28,6 +28,7 @@ from edp.signals import Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine, parse_machine
 from edp.storage import check_writable, write_bytes, write_json
+from edp.storage.paths import is_there
 from edp.training.free_run import FreeRunProgress
 from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.twin_bundle import load_twin
@@ -186,7 +187,7 @@ def _new_file(out: str | Path) -> Path:
         raise ConfigError(f"--out {out}: a machine file ends in .toml; edp simulate reads it")
     for file in (target, target.with_suffix(".json")):
         # It may be what a tape measure told, and the very file of --machine.
-        if file.exists():
+        if is_there(file):
             raise StorageError(f"--out {out}: '{file}' is there already and is not written over; choose another name")
     check_writable(target.parent)
     return target

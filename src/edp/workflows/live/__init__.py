@@ -1,6 +1,7 @@
 """A machine live: sources, models beside them, and a page in the browser."""
 
-from edp.workflows.live.run_live import LiveOrder, LiveResult, LiveRun, run_live
-from edp.workflows.live.sources import SOURCES, SourceOptions
+from edp.workflows.live.run_live import LiveOrder, LiveResult, LiveRun
+from edp.workflows.live.serve_live import run_live
+from edp.workflows.live.sources import SOURCES, SourceOptions, check_options
 
-__all__ = ["SOURCES", "LiveOrder", "LiveResult", "LiveRun", "SourceOptions", "run_live"]
+__all__ = ["SOURCES", "LiveOrder", "LiveResult", "LiveRun", "SourceOptions", "check_options", "run_live"]

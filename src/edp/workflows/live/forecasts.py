@@ -58,7 +58,7 @@ def _line(one: Forecast, measured: int, rows: NDArray[np.float32], rate_hz: floa
     def shown(column: int, ticks: int) -> NDArray[np.float64]:
         later = np.full(len(rows), np.nan)
         later[ticks:] = rows[: len(rows) - ticks, column]
-        return later * one.factor
+        return later * one.factor + one.offset
 
     ends = {
         name: None if column is None else shown(column, one.ticks)

@@ -36,6 +36,8 @@ class LiveTwin(LivePart):
         self._bundle, self._twin, self._note = bundle, twin, note
         parts = (twin.channels.commands, twin.channels.answers)
         self._commands, self._answers = (columns_of([c.name for c in part], channels, "the twin") for part in parts)
+        limits = np.array([KINDS[channel.kind].plausible for channel in twin.channels.commands])
+        self._low, self._high = limits[:, 0], limits[:, 1]
         self._most = max(1, round(free_s * twin.channels.rate_hz))
         self._prefix: deque[Row] = deque(maxlen=twin.prefix_ticks)
         answers = len(twin.channels.answers)
@@ -47,16 +49,23 @@ class LiveTwin(LivePart):
 
     def step(self, row: Row, missed: int) -> Row:
         """See `LivePart`: what the twin says of the next tick, then lower and upper bounds."""
-        if missed or not np.isfinite(row[self._commands]).all():
+        commands = row[self._commands]
+        possible = bool(((commands >= self._low) & (commands <= self._high)).all())
+        if missed or not possible:
             # A twin has no other source for a command, and no time without one.
             self.reset()
-            if not np.isfinite(row[self._commands]).all():
+            if not possible:
                 return np.full(self.width, np.nan, np.float32)
         if self._state is None or self._ticks >= self._most:
             self._begin()
         answer = np.full(self.width, np.nan, np.float32)
         if self._state is not None:
             answers, self._state = self._twin.step(row[None, self._commands], self._state)
+            if not np.isfinite(answers).all():
+                # A state that is not finite never becomes finite again.
+                self.reset()
+                self._note("warning", "the twin's outputs are not finite: it begins anew", "not finite")
+                return answer
             parts = [answers[0]]
             if self._half is not None:
                 parts += [answers[0] - self._half[self._ticks], answers[0] + self._half[self._ticks]]

@@ -23,9 +23,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from edp.errors import ConfigError
+from edp.errors import ConfigError, brief
 from edp.live.layout import LiveLayout
 from edp.live.session import LiveSession
+from edp.storage.paths import is_there
 
 LOOPBACK = "127.0.0.1"
 PIECE_S = 0.5
@@ -97,9 +98,12 @@ class RerunMirror:
         self._files.close()
 
     def _follow(self) -> None:
-        while not self._over.wait(PIECE_S):
+        try:
+            while not self._over.wait(PIECE_S):
+                self._give()
             self._give()
-        self._give()
+        except Exception as error:  # Rerun's own errors have no common base
+            self._session.event("warning", f"Rerun shows nothing more ({brief(error)}); this page goes on")
 
     def _give(self) -> None:
         session, rerun = self._session, self._rerun
@@ -140,7 +144,7 @@ def entities(layout: LiveLayout, escaped: Any = str) -> Mapping[str, tuple[int, 
         for end, at_column in ends.items():
             if at_column is not None:
                 path = f"predicted/{escaped(what + end)}"
-                paths[path] = (at_column, one.factor, 0.0, one.ticks / layout.rate_hz)
+                paths[path] = (at_column, one.factor, one.offset, one.ticks / layout.rate_hz)
     for name, at_column in (layout.statistics or {}).items():
         paths[f"monitor/{escaped(name)}"] = (at_column, 1.0, 0.0, 0.0)
     return paths
@@ -180,7 +184,7 @@ def _program() -> Path:
         raise ConfigError("rerun-sdk is installed without its command line; install it from its wheel")
     folder = Path(spec.origin).parent
     names = ("rerun.exe",) if sys.platform == "win32" else ("Rerun.app/Contents/MacOS/Rerun", "rerun")
-    return next((folder / name for name in names if (folder / name).exists()), folder / names[-1])
+    return next((folder / name for name in names if is_there(folder / name)), folder / names[-1])
 
 
 def _last(text: bytes) -> str:

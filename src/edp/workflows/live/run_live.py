@@ -1,27 +1,26 @@
-"""A live session: a source and its models in a thread of their own, page and viewers beside it."""
+"""A live session without its page: a source, its models, and the rows and events that they give."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import signal
-import threading
-from collections.abc import Callable, Iterator
+import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from edp.errors import ConfigError, EdpError
+from edp.errors import ConfigError, EdpError, brief
+from edp.live.addresses import LOOPBACK, resolve_bind
 from edp.live.layout import Forecast, LiveLayout, LiveTrace, label, sentence
-from edp.live.pace import Pace
+from edp.live.pace import Pace, checked_speed
 from edp.live.saved import write_session_page
-from edp.live.server import LOOPBACK, LiveServer
-from edp.live.session import HISTORY_BYTES, LiveSession
+from edp.live.session import HISTORY_BYTES, MOST_TEXT, LiveSession
 from edp.monitor.monitor_file import load_monitor
+from edp.settings.bounds import check_bounds, span
+from edp.storage.paths import full_path
+from edp.workflows.live.bounded import Repetition, RowBounds, bound_missed
 from edp.workflows.live.free_run import FREE_S, LiveTwin
 from edp.workflows.live.look_ahead import LiveNetwork
-from edp.workflows.live.mirror import RerunMirror
 from edp.workflows.live.models import LiveModels, check_rate, levers_of, models_of, needs_of
 from edp.workflows.live.parts import LiveFront, LivePart, Row
 from edp.workflows.live.record import McapRecorder
@@ -30,8 +29,7 @@ from edp.workflows.live.watch import LiveMonitor
 
 AT_ONCE = 25
 """Rows that models are asked for at once where the source is behind: they cost a network little more than one."""
-STOP_S = 5.0
-"""To wait for the thread of a source, which may be within a tick."""
+MAX_FREE_S = 86_400.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class LiveOrder:
         run: run folder of a network or twin; None shows what is measured alone.
         monitor: folder of the monitor that raises alarms.
         speed: factor on real time of a source that can be steered.
-        free_s: length of a twin's free runs.
+        free_s: length of a twin's free runs (s); None takes `FREE_S`.
         host: address to listen on; `port` likewise, 0 for a free one.
         port: see `host`.
         save: page to write at the end.
@@ -59,7 +57,7 @@ class LiveOrder:
     run: Path | None = None
     monitor: Path | None = None
     speed: float = 1.0
-    free_s: float = FREE_S
+    free_s: float | None = None
     host: str = LOOPBACK
     port: int = 0
     save: Path | None = None
@@ -67,6 +65,11 @@ class LiveOrder:
     rerun: bool = False
     until_end: bool = False
     history_bytes: int = HISTORY_BYTES
+
+    def __post_init__(self) -> None:
+        check_bounds("the live view", self, free_s=span(0.1, MAX_FREE_S))
+        checked_speed(self.speed)
+        resolve_bind(self.host, "--bind")
 
 
 @dataclass
@@ -102,7 +105,7 @@ class LiveRun:
         source: of the rows.
         session: that is filled.
         pace: of the source.
-        failure: of the source or a model, None while there is none.
+        failure: error that ended the source or a model; None while there is none.
 
     Raises:
         EdpError: source, models or files do not fit together.
@@ -118,16 +121,25 @@ class LiveRun:
             raise ConfigError(f"--save {order.save}: the page of a session ends in .html")
         self.order, self._on_event = order, on_event or (lambda kind, text: None)
         self.failure: EdpError | None = None
+        self._repetition, self._left_out = Repetition(), 0
         self._waiting: list[tuple[str, str, str]] = []
         self._recorder: McapRecorder | None = None
         self._due: list[Row] = []
         self._trusted, self._ahead = True, 0
         models = models_of(order.run)
+        if models.twin is None and order.free_s is not None:
+            raise ConfigError(
+                "--free-s belongs to a twin, and no run folder of edp twin was given; leave --free-s out, or give one"
+            )
+        preparing = (source or SOURCES[order.source]).preparing
+        if preparing:
+            self._on_event("preparing", preparing)
         self.source = source or SOURCES[order.source].of(order.options, needs_of(models, order.monitor))
         try:
             self._parts, layout = self._assembled(models)
             self.pace = Pace(self.source.rate_hz, order.speed)
-            self.session = LiveSession(layout, order.history_bytes)
+            self.session = LiveSession(layout, order.history_bytes, preparing)
+            self._bounds = RowBounds(self.source.channels)
             if order.record is not None:
                 self._recorder = McapRecorder(order.record, self.source.channels, layout)
         except BaseException:
@@ -143,9 +155,17 @@ class LiveRun:
         return self.pace.stopped
 
     def take(self, row: Row, missed: int = 0, trusted: bool = True, more: bool = False) -> None:
-        """A row of the source: wait until it is due; ask the models and keep it, with those that are due with it."""
+        """Take a row of the source: wait until it is due, ask the models and store it, with those due with it.
+
+        Raises:
+            DataError: the row has another shape, or is not of numbers.
+        """
         if self.pace.stopped:
             raise SourceStopped
+        row, impossible = self._bounds.check(row)
+        for name in impossible:
+            self.note("warning", f"{name}: its value is impossible and counts as missing", f"impossible {name}")
+        missed = bound_missed(missed)
         following = self.session.ticks + len(self._due) + 1
         if self.source.steered:
             if not self.pace.wait(following - 1):
@@ -190,12 +210,19 @@ class LiveRun:
             part.reset()
         self.session.break_off()
 
+    def leave_out(self, reason: str) -> None:
+        """See `edp.workflows.live.sources.Sink`."""
+        self._left_out += 1
+        self.note("warning", f"row {self._left_out} that cannot be used and is left out: {reason}", "left out")
+
     def note(self, kind: str, text: str, group: str = "") -> None:
-        """An event."""
+        """An event; messages of one group are shown as often as `Repetition` says, alarms always."""
         if not hasattr(self, "session"):
             self._waiting.append((kind, text, group))
             return
-        shown_text, at = sentence(text), self.session.ticks + self._ahead
+        shown_text, at = sentence(text[:MOST_TEXT]), self.session.ticks + self._ahead
+        if kind != "alarm" and not self._repetition.is_due(group, at):
+            return
         self.session.event(kind, shown_text, group, at)
         if kind == "alarm":
             self.alarms += 1
@@ -204,20 +231,33 @@ class LiveRun:
         self._on_event(kind, shown_text)
 
     def play(self) -> None:
-        """Give all rows of the source; returns when there are no more, or the session is over."""
+        """Give all rows of the source; returns when there are no more, the session is over, or something failed."""
         try:
-            self.source.run(self)
-            self.show()
-            self.note("note", self.source.ending)
-            self.session.end(self.source.ending)
-        except SourceStopped:
-            self.show()
-            self.session.end("the session was ended")
+            ending = self._played()
         except EdpError as error:
-            self.failure = error
+            self._fail(error)
+        except Exception as error:  # a fault of a source or a model: nobody would see what its thread raises
+            self._fail(EdpError(f"{where_raised(error)}; start the session again, and report this if it comes again"))
+        else:
+            self.session.end(ending)
+
+    def _played(self) -> str:
+        """Give all rows of the source; return why there are no more."""
+        try:
+            self.source.prepare()
+            self.source.run(self)
+        except SourceStopped:
+            return "the session was ended"
+        finally:
             self.show()
-            self.note("warning", f"the source has stopped: {error}")
-            self.session.end(f"the source has stopped: {error}")
+        self.note("note", self.source.ending)
+        return self.source.ending
+
+    def _fail(self, error: EdpError) -> None:
+        self.failure = error
+        text = f"the source has stopped: {error}"
+        self.note("warning", text)
+        self.session.end(sentence(text))
 
     def close(self) -> LiveResult:
         """End the session, and write what is to be written.
@@ -255,7 +295,7 @@ class LiveRun:
             network = LiveNetwork(models.bundle, source.channels, self.note)
             forecasts += network.forecasts(add(network))
         if models.twin is not None:
-            free = LiveTwin(models.twin, source.channels, self.note, order.free_s)
+            free = LiveTwin(models.twin, source.channels, self.note, order.free_s or FREE_S)
             forecasts += free.forecasts(add(free))
         if order.monitor is not None:
             watch = LiveMonitor(
@@ -270,7 +310,7 @@ class LiveRun:
             geometry, angles = front.geometry, range(width, width + LiveFront.width)
             add(front)
         return parts, LiveLayout(
-            title=label(order.run.resolve().name if order.run is not None else source.text.split(",")[0]),
+            title=label(full_path(order.run).name if order.run is not None else source.text.split(",")[0]),
             source=label(source.text),
             rate_hz=source.rate_hz,
             width=width,
@@ -285,96 +325,7 @@ class LiveRun:
         )
 
 
-def run_live(
-    order: LiveOrder,
-    on_ready: Callable[[LiveServer], None] | None = None,
-    on_event: Callable[[str, str], None] | None = None,
-    source: LiveSource | None = None,
-    on_mirror: Callable[[str], None] | None = None,
-) -> LiveResult:
-    """Serve a session until Ctrl-C, a request to end, or with `LiveOrder.until_end` the end of the source.
-
-    Args:
-        order: what to show.
-        on_ready: called once the page can be opened.
-        on_event: called with kind and text of each event.
-        source: of the rows, in place of the order's.
-        on_mirror: called with the address of Rerun's page, where that is asked for.
-
-    Raises:
-        EdpError: source, models, port or files cannot be used.
-    """
-    live = LiveRun(order, on_event, source)
-    mirror = _mirrored(live, on_mirror)
-    playing = threading.Thread(target=live.play, name="edp-live-source", daemon=True)
-    try:
-        asyncio.run(_served(live, playing, on_ready))
-    finally:
-        live.pace.stop()
-        if playing.ident is not None:
-            playing.join(STOP_S)
-        if mirror is not None:
-            mirror.close()
-        result = live.close()
-    if live.failure is not None:
-        raise live.failure
-    return result
-
-
-def _mirrored(live: LiveRun, on_mirror: Callable[[str], None] | None) -> RerunMirror | None:
-    if not live.order.rerun:
-        return None
-    try:
-        mirror = RerunMirror(live.session)
-    except BaseException:
-        live.close()
-        raise
-    if on_mirror is not None:
-        on_mirror(mirror.address)
-    return mirror
-
-
-async def _served(live: LiveRun, playing: threading.Thread, on_ready: Callable[[LiveServer], None] | None) -> None:
-    stop, order = asyncio.Event(), live.order
-    server = LiveServer(live.session, live.pace if live.source.steered else None, order.host, order.port)
-
-    def ready(one: LiveServer) -> None:
-        if on_ready is not None:
-            on_ready(one)
-        # Once the port is open: a port in use is refused before anything is played or recorded.
-        playing.start()
-
-    async def watch_end() -> None:
-        while not stop.is_set():
-            await asyncio.sleep(0.1)
-            if playing.ident is not None and not playing.is_alive():
-                stop.set()
-
-    with _interrupts(stop):
-        ending = asyncio.create_task(watch_end()) if order.until_end else None
-        try:
-            await server.run(stop, ready)
-        finally:
-            if ending is not None:
-                ending.cancel()
-
-
-@contextlib.contextmanager
-def _interrupts(stop: asyncio.Event) -> Iterator[None]:
-    """Ctrl-C and the system's request end the session, and files are finished; only the main thread hears them."""
-    loop = asyncio.get_running_loop()
-    signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    handlers_before = {number: signal.getsignal(number) for number in signals}
-    for number in signals:
-        try:
-            loop.add_signal_handler(number, stop.set)
-        except NotImplementedError:  # the loops of Windows, which a plain handler has to wake
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
-    try:
-        yield
-    finally:
-        for number in signals:
-            with contextlib.suppress(NotImplementedError):
-                loop.remove_signal_handler(number)
-            # None: a handler that is not Python's cannot be set again.
-            signal.signal(number, handlers_before[number] or signal.SIG_DFL)
+def where_raised(error: Exception) -> str:
+    """Return kind, text and place of an unexpected error, on one line."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"unexpected {type(error).__name__} in {Path(frame.filename).name}, line {frame.lineno}: {brief(error)}"

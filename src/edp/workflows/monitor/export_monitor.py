@@ -42,6 +42,7 @@ from edp.monitor.residuals.virtual_sensors import VirtualSensors
 from edp.monitor.watches import Watch
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import IntegerTwinPlant, TwinPlant
+from edp.storage.paths import is_file_at
 from edp.training.bundle import Bundle
 from edp.training.twin_bundle import plant_bundle
 from edp.workflows.monitor.export_flows import flow_part
@@ -59,7 +60,7 @@ NO_RESIDUALS = GoldenResiduals(*(np.zeros((0, 0), np.float32),) * 2, np.zeros(0,
 
 def holds_monitor(path: str | Path) -> bool:
     """Whether a folder is one that edp monitor fit wrote."""
-    return (Path(path) / HEADER).is_file()
+    return is_file_at(Path(path) / HEADER)
 
 
 def export_monitor(

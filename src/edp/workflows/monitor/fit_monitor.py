@@ -30,6 +30,7 @@ from edp.recording import Recording
 from edp.sandbox.helpers import Helpers
 from edp.signals import Channel
 from edp.storage import check_writable, write_bytes
+from edp.storage.paths import is_there
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
@@ -131,7 +132,7 @@ def _network_of(run: str | Path) -> Bundle | TwinBundle:
     try:
         return load_twin(run) if holds_twin(run) else load_bundle(run)
     except BundleError as error:
-        if any((Path(run) / name).exists() for name in ("bundle", "bundle.json", "run.json", "twin")):
+        if any(is_there(Path(run) / name) for name in ("bundle", "bundle.json", "run.json", "twin")):
             raise
         raise BundleError(f"{error}; healthy logs are the last argument alone: put them into one folder") from error
 

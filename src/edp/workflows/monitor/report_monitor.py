@@ -16,6 +16,8 @@ from edp.monitor.traces import read_traces
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts, provenance_rows
 from edp.report.monitor.page import write_monitor_page
 from edp.storage import JSON_BYTES, object_with, parse_json, read_object, read_text
+from edp.storage.headers import check_files
+from edp.storage.paths import full_path, is_there
 from edp.workflows.monitor.run_monitor import ALARM_LOG, RUN
 
 PAGE = "report.html"
@@ -50,11 +52,12 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     Raises:
         StorageError: it is no run of a monitor, or is damaged.
     """
-    if not (folder / RUN).exists():
+    if not is_there(folder / RUN):
         raise StorageError(
             f"'{folder}' is no run of a monitor: it has no {RUN}; give a folder that edp monitor run wrote"
         )
     content = read_object(folder / RUN, ("promise", "monitor", "classes", "confusions"))
+    check_files(content, folder, "run the monitor again")
     where = f"'{folder / RUN}'"
     pairs, classes = content["confusions"], content["classes"]
     if not isinstance(pairs, list) or len(pairs) > MOST_PAIRS or type(classes) is not int or classes < 0:
@@ -64,7 +67,7 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     except DataError as error:
         raise StorageError(f"{error}; run the monitor again") from error
     return MonitorFacts(
-        title or folder.resolve().name,
+        title or full_path(folder).name,
         read_traces(folder),
         read_alarms(folder / ALARM_LOG),
         _text(content["promise"], where),

@@ -23,6 +23,7 @@ from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
 from edp.recording import Recording
 from edp.report.monitor.facts import start_time
 from edp.storage import check_writable, write_bytes, write_json
+from edp.storage.headers import FILES, digests_of
 
 ALARM_LOG, RUN = "alarms.jsonl", "run.json"
 START = "start"
@@ -199,7 +200,7 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
         "classes": 0 if dictionary is None else len(dictionary.classes),
         "confusions": [] if dictionary is None else [asdict(pair) for pair in dictionary.confusions],
     }
-    write_json(folder / RUN, facts)
+    write_json(folder / RUN, facts | {FILES: digests_of(folder, ALARM_LOG)})
 
 
 def write_alarms(alarms: tuple[MonitorAlarm, ...], out: str | Path) -> tuple[Path, Path]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from edp.storage.paths import is_file_at
+
 RUN = ("run.json", "provenance.json")
 """Training and distillation write both beside a bundle, quantisation and adaptation the second; a bundle that is passed
 on has neither."""
@@ -21,7 +23,7 @@ def from_own_run(path: str | Path) -> bool:
     folder = Path(path)
     return any(
         # The bundle of a run lies one folder below it.
-        (candidate / name).is_file()
+        is_file_at(candidate / name)
         for candidate in (folder, *([folder.parent] if folder.name == "bundle" else []))
         for name in RUN
     )

@@ -17,6 +17,7 @@ from edp.evaluation.footprint import footprint
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.storage import make_folder, write_json
+from edp.storage.paths import full_path
 from edp.storage.runs import RunFolder, command_line, environment, run_key
 from edp.training import make_bundle, save_bundle
 from edp.workflows.search.context import SearchContext
@@ -44,7 +45,7 @@ def frozen_split(folder: Path, context: SearchContext, digests: Mapping[str, str
         second=known(context.second),
         validation=known(context.validation),
         train=known(context.training),
-        study=str(folder.resolve()),
+        study=str(full_path(folder)),
     )
 
 

@@ -11,6 +11,7 @@ from edp.config.experiment import Table
 from edp.errors import StorageError
 from edp.storage import held_by, read_json, write_json
 from edp.storage.ledger import Opening, Record, digest_of
+from edp.storage.paths import entries_of
 from edp.storage.study_file import FILE, SCHEMA, read_study
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import MODULES, title_of
@@ -229,7 +230,7 @@ def look_at(folder: str | Path) -> Table:
     ledger = Path(folder, "ledger")
     holder = held_by(ledger / ".lock")
     # Claims of a dead coordinator are stale.
-    claims = list((ledger / "claims").glob("*.lock")) if holder else []
+    claims = entries_of(ledger / "claims", "*.lock") if holder else []
     if study["state"] == "running" and holder is None:
         study["state"] = "killed"
     return study | {"holder": holder, "running": len(claims)}

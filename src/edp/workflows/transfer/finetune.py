@@ -20,6 +20,7 @@ from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes, write_json
+from edp.storage.headers import FILES, digests_of
 from edp.training import Diverged, TrainingProgress
 from edp.training.bundle import weights_digest
 from edp.workflows.transfer.case import TransferCase, tuned
@@ -141,7 +142,7 @@ def finetune(
     result, shown = _result(begun, data, experiment, order, results)
     result |= {"logs": str(logs.path), "notes": notes}
     write_bytes(make_folder(folder) / SHOWN, save(shown))
-    write_json(folder / RESULT, result)
+    write_json(folder / RESULT, result | {FILES: digests_of(folder, SHOWN)})
     return result
 
 

@@ -27,6 +27,7 @@ from edp.data.task import Task
 from edp.errors import BundleError, ConfigError, EdpError
 from edp.networks.predictor import Predictor
 from edp.settings.tree import combined
+from edp.storage.paths import is_file_at
 from edp.training import Bundle, load_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.train_evaluate import trained_run
@@ -81,7 +82,7 @@ def read_source(path: str | Path, recordings: bool = True) -> SourceModel:
     """
     folder = Path(path)
     # A bundle inside of its run folder finds the run beside it.
-    if (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file():
+    if is_file_at(folder.parent / "config.toml") and not is_file_at(folder / "config.toml"):
         folder = folder.parent
     bundle = load_bundle(path)
     if bundle.predictor.number_format != "float32":
@@ -89,7 +90,7 @@ def read_source(path: str | Path, recordings: bool = True) -> SourceModel:
             f"'{path}' is a network in {bundle.predictor.number_format}, which cannot be trained on; give the run in "
             "float32 that it was made of, and quantise what comes out"
         )
-    if not (folder / "config.toml").is_file():
+    if not is_file_at(folder / "config.toml"):
         return SourceModel(
             bundle, load_experiment(), None, f"'{path}' is a bundle without the run that it was trained in"
         )

@@ -20,6 +20,7 @@ from edp.recording import Recording
 from edp.report.common.picture import file_name
 from edp.signals import Channel
 from edp.storage import replacing_folder
+from edp.storage.paths import entries_of, is_folder_at, is_there
 from edp.training.twin_bundle import TwinBundle, load_twin
 
 AHEAD = "_in_"
@@ -119,7 +120,7 @@ def _columns(twin: Twin, answers: Sequence[str]) -> list[int]:
 
 def _refuse_used(folder: Path) -> None:
     """See before the work that nothing will be lost."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if is_there(folder) and (not is_folder_at(folder) or any(entries_of(folder))):
         raise ConfigError(f"--out '{folder}' holds something already; name a folder that is new or empty")
 
 

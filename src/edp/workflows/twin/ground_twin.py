@@ -15,6 +15,7 @@ from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
 from edp.networks.twin.grey.ground import check_grounded
 from edp.networks.twin.greybox import GreyBox
 from edp.storage import object_with, read_json, write_bytes, write_json
+from edp.storage.paths import is_file_at
 from edp.storage.runs import RunFolder, run_key
 from edp.training.ground_fit import fit_ground
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
@@ -78,7 +79,7 @@ def ground_twin(
         bundle = replace(base.bundle, ground=fitted.law, provenance={**base.bundle.provenance, **facts})
         for name in JUDGED:
             # In free air it is the twin that was judged there, so its page needs no evaluation of its own.
-            if (base.folder / name).is_file():
+            if is_file_at(base.folder / name):
                 write_bytes(run.file(name), (base.folder / name).read_bytes())
         save_twin(bundle, run.file(FOLDER))
         run.write_status("finished")
@@ -108,7 +109,7 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
 def _known_rows(run: Path) -> list[dict[str, Any]]:
     """Rows of the datasheet of a run; none where it has none."""
     file = run / f"{DATASHEET}.json"
-    if not file.is_file():
+    if not is_file_at(file):
         return []
     rows = object_with(read_json(file), ("numbers",), f"'{file}'")["numbers"]
     # A ground that is fitted anew replaces the one before.

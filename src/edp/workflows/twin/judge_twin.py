@@ -29,6 +29,7 @@ from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinSpec
 from edp.recording import Recording
 from edp.signals import KINDS, Channel
 from edp.storage import check_writable, make_folder, write_bytes, write_json
+from edp.storage.headers import FILES, digests_of
 from edp.training import load_bundle
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
@@ -94,9 +95,8 @@ def write_scores(
         StorageError: a file cannot be written.
     """
     write_bytes(folder / SHOWN, save(shown_runs(runs, intervals)))
-    write_json(
-        folder / SCORES, {"schema": 2, "channels": channel_facts(runs.channels), **(more or {}), "models": scores}
-    )
+    content = {"schema": 2, "channels": channel_facts(runs.channels), **(more or {}), "models": scores}
+    write_json(folder / SCORES, content | {FILES: digests_of(folder, SHOWN)})
 
 
 def channel_facts(channels: TwinChannels) -> dict[str, list[dict[str, Any]]]:

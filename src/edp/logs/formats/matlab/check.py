@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,12 @@ import numpy as np
 
 from edp.errors import DataError, brief
 from edp.storage.memory import check_memory
+from edp.storage.unpacking import DEFLATE_RATIO, unpack_start
 
 _HEADER = 128
 _PACKED, _MATRIX = 15, 14
 _COPIES = 2
 """An array is in memory as it was unpacked and as a column."""
-_DEFLATE_RATIO = 1100
-"""Deflate packs no better than 1,032 to 1."""
 _UNSTORED_BYTES = 1 << 20
 """What an array may claim beyond that: HDF5 need not store what was never written."""
 _MOST_OBJECTS = 1_000_000
@@ -69,7 +67,7 @@ def _announced_v5(path: Path) -> tuple[int, int]:
                     f"ends after {size}; copy or export it again"
                 )
             array_bytes = _unpacked(stream.read(min(length, 256)), order) if kind == _PACKED else length
-            if array_bytes > _DEFLATE_RATIO * (length + 64):
+            if array_bytes > DEFLATE_RATIO * (length + 64):
                 raise _impossible(path, f"the variable at byte {at}", array_bytes, length)
             total += array_bytes
             objects += 1
@@ -79,11 +77,8 @@ def _announced_v5(path: Path) -> tuple[int, int]:
 
 def _unpacked(start: bytes, order: str) -> int:
     """Bytes that a packed element announces; 0 where it is damaged, which its reader finds."""
-    try:
-        # Eight bytes unpacked tell the length, whatever the rest would lead to.
-        head = zlib.decompressobj().decompress(start, 8)
-    except zlib.error:
-        return 0
+    # Eight bytes unpacked tell the length, whatever the rest would lead to.
+    head = unpack_start(start, 8)
     if len(head) < 8:
         return 0
     kind, length = struct.unpack(f"{order}II", head)
@@ -161,7 +156,7 @@ class _Walk:
         chunk = math.prod(part.chunks or (0,))
         # A chunk is unpacked whole, even where an array uses a corner of it.
         memory_bytes = max(size, chunk if stored else 0) * part.dtype.itemsize
-        if memory_bytes > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
+        if memory_bytes > DEFLATE_RATIO * stored + _UNSTORED_BYTES:
             raise _impossible(self.path, f"the array {_shown(name)}", memory_bytes, stored)
         self.total += memory_bytes
         if size and h5py.check_ref_dtype(part.dtype) is not None:

@@ -5,6 +5,14 @@ from edp.workflows.live.sources import loop as loop
 from edp.workflows.live.sources import ros2 as ros2
 from edp.workflows.live.sources import sim as sim
 from edp.workflows.live.sources import udp as udp
-from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Sink, SourceOptions, SourceStopped
+from edp.workflows.live.sources.base import (
+    SOURCES,
+    LiveSource,
+    Needs,
+    Sink,
+    SourceOptions,
+    SourceStopped,
+    check_options,
+)
 
-__all__ = ["SOURCES", "LiveSource", "Needs", "Sink", "SourceOptions", "SourceStopped"]
+__all__ = ["SOURCES", "LiveSource", "Needs", "Sink", "SourceOptions", "SourceStopped", "check_options"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -16,9 +16,12 @@ from edp.errors import ConfigError
 from edp.logs.source import load_signal_map
 from edp.recording import Recording
 from edp.registry import Registry
+from edp.settings.bounds import check_bounds, span
 from edp.signals import Channel, SignalMap
 
 Row = NDArray[np.float32]
+RATES_HZ = (0.01, 100_000.0)
+"""Lowest and highest rate of a live source."""
 
 
 class SourceStopped(Exception):
@@ -55,6 +58,10 @@ class Sink(Protocol):
         """What follows does not continue what came: models forget."""
         ...
 
+    def leave_out(self, reason: str) -> None:
+        """Count a row that cannot be used, and tell why; the first ones are told, then one in a thousand."""
+        ...
+
     def note(self, kind: str, text: str, group: str = "") -> None:
         """An event, see `edp.live.session.LiveEvent`."""
         ...
@@ -68,7 +75,7 @@ class SourceOptions:
         value: of the source's option: a path, a machine, a task, a port.
         map_file: signal map.
         machine: name or file, where it is not that of the source.
-        seed: of what is drawn.
+        seed: of what is drawn; None for the source's own.
         rate_hz: of a source that does not know its own; None takes that of the model.
         settings: further values by name, as a source's `of` explains.
     """
@@ -76,9 +83,12 @@ class SourceOptions:
     value: str
     map_file: Path | None = None
     machine: str | None = None
-    seed: int = 0
+    seed: int | None = None
     rate_hz: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_bounds("the live source", self, rate_hz=span(*RATES_HZ))
 
     def signal_map(self) -> SignalMap | None:
         """The map, read."""
@@ -105,6 +115,8 @@ class LiveSource(ABC):
 
     Attributes:
         steered: whether it can be paused and run at another speed.
+        options: of the command line that apply to this source, without dashes.
+        preparing: what happens before the first row, in words; empty where that takes no time.
         channels: of a row, in order, SI units.
         rate_hz: rows a second.
         text: what it is, in words.
@@ -115,6 +127,8 @@ class LiveSource(ABC):
     """
 
     steered: ClassVar[bool] = True
+    options: ClassVar[frozenset[str]] = frozenset()
+    preparing: ClassVar[str] = ""
     channels: tuple[Channel, ...]
     rate_hz: float
     text: str
@@ -131,6 +145,9 @@ class LiveSource(ABC):
         Raises:
             EdpError: there is none, or it does not give what the models read.
         """
+
+    def prepare(self) -> None:  # noqa: B027  most sources need nothing
+        """Do what would otherwise delay the second row, such as compiling."""
 
     @abstractmethod
     def run(self, sink: Sink) -> None:
@@ -159,3 +176,22 @@ def chosen_rate(options: SourceOptions, needs: Needs, what: str) -> float:
     if rate is None:
         raise ConfigError(f"{what} does not say its rate, and no model is given that has one; give --rate in Hz")
     return rate
+
+
+def check_options(source: str, names: Iterable[str]) -> None:
+    """Refuse options that do not apply to a source.
+
+    Args:
+        source: name of the source.
+        names: options that the user gave, without dashes; those that belong to no source are not looked at.
+
+    Raises:
+        ConfigError: an option belongs to other sources.
+    """
+    for name in names:
+        owners = [f"--{one}" for one, kind in SOURCES.items() if name in kind.options]
+        if owners and name not in SOURCES[source].options:
+            raise ConfigError(
+                f"--{name} does not apply to --{source}; it belongs to {' and '.join(owners)}: leave it out, or choose "
+                "another source"
+            )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 from edp.data.derived_velocities import matched
 from edp.logs.source import DataSource, read_with_truth
@@ -15,6 +16,8 @@ SIMULATED = "sim:"
 @SOURCES.register("log")
 class LogSource(LiveSource):
     """One log, from its first row to its last."""
+
+    options: ClassVar[frozenset[str]] = frozenset({"map", "machine", "speed"})
 
     def __init__(self, recording: Recording, machine: str | None = None) -> None:
         self.recording: Recording = recording

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from edp.config.control import load_control_experiment
-from edp.control.loop import LEVERS, REFERENCE, run_loop
+from edp.control.loop import LEVERS, REFERENCE, run_loop, start_options
 from edp.control.plants import plant_of
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Sink, SourceOptions
+from edp.workflows.live.sources.sim import COMPILING
 
 
 @SOURCES.register("loop")
@@ -25,6 +26,11 @@ class LoopSource(LiveSource):
     Raises:
         EdpError: settings or models cannot be used.
     """
+
+    options: ClassVar[frozenset[str]] = frozenset(
+        {"controller", "twin", "plant", "predictor", "machine", "seed", "speed", "yes"}
+    )
+    preparing: ClassVar[str] = COMPILING
 
     def __init__(self, bench: ControlBench, sources: ControlSources) -> None:
         bench.check()
@@ -50,12 +56,18 @@ class LoopSource(LiveSource):
             table["machine"] = options.machine
         if options.settings.get("controller"):
             table["controller"] = {"kind": options.settings["controller"]}
-        if options.seed:
+        if options.seed is not None:
             table["seed"] = options.seed
         experiment = load_control_experiment(file if is_file else None, [], table)
         plant, twin, predictor = (options.settings.get(name) for name in ("plant", "twin", "predictor"))
         sources = ControlSources(plant, twin, predictor, trusted=True)
         return cls(ControlBench(experiment, sources), sources)
+
+    def prepare(self) -> None:
+        """See `LiveSource`: compile the plant; each loop begins with a reset of its own."""
+        task = self._bench.tasks[0]
+        self._env.reset(seed=task.seed, options=start_options(task, self._bench.plant.geometry))
+        self._env.step(np.zeros(len(LEVERS), np.float32))
 
     def run(self, sink: Sink) -> None:
         """See `LiveSource`."""
@@ -88,7 +100,7 @@ class _Tapped:
         """As the environment's; the row of before, with reference and levers, is shown first."""
         at = min(self._tick, self._reference.ticks - 1)
         parts = [self._observation, self._reference.strokes[at], self._reference.tip[at], levers]
-        self._sink.take(np.concatenate(parts).astype(np.float32))
+        self._sink.take(np.concatenate(parts))
         self._tick += 1
         result = self._env.step(levers)
         self._observation = result[0]

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import importlib
-import math
-import time
 from typing import Any, ClassVar
 
 import numpy as np
 
-from edp.errors import ConfigError
+from edp.errors import ConfigError, DataError, brief
 from edp.signals import VOCABULARY, Channel, Kind
+from edp.workflows.live.sources.arrivals import Arrivals
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
-from edp.workflows.live.sources.udp import SILENT_S, RowClock
 
 JOINTS, PRESSURES = "joint_states", "pressures"
 """Topics: sensor_msgs/JointState, whose names are channels, and sensor_msgs/FluidPressure, whose frame_id is one."""
@@ -24,6 +22,8 @@ FIELDS = {
 }
 """Where a channel of a kind stands in a JointState; any other is an effort."""
 SPIN_S = 0.1
+MAX_JOINTS = 4096
+"""Joints of one message."""
 
 
 @SOURCES.register("ros2")
@@ -41,6 +41,7 @@ class Ros2Source(LiveSource):
     """
 
     steered: ClassVar[bool] = False
+    options: ClassVar[frozenset[str]] = frozenset({"rate", "machine"})
     ending = "the node has ended"
 
     def __init__(
@@ -49,8 +50,9 @@ class Ros2Source(LiveSource):
         self._ros, messages, qos = _ros2()
         self.channels, self.rate_hz = channels, rate_hz
         self.text = f"ROS 2, {joints} and {pressures}"
+        self._names = frozenset(channel.name for channel in channels)
         self._pressures: dict[str, float] = {}
-        self._rows: list[tuple[float, Row]] = []
+        self._messages: list[Any] = []
         self._ros.init(args=[])
         self._node = self._ros.create_node("edp_live")
         profile = qos.qos_profile_sensor_data
@@ -67,29 +69,19 @@ class Ros2Source(LiveSource):
 
     def run(self, sink: Sink) -> None:
         """See `LiveSource`."""
-        clock, heard, silent, trusted = RowClock(self.rate_hz), time.monotonic(), False, True
+        arrivals = Arrivals(sink, self.rate_hz)
         while not sink.stopped:
             self._ros.spin_once(self._node, timeout_sec=SPIN_S)
-            rows, self._rows = self._rows, []
-            if not rows and not silent and time.monotonic() - heard > SILENT_S:
-                silent = True
-                sink.note(
-                    "warning", f"no joints for {SILENT_S:g} s: nothing is predicted until they come again", "silent"
-                )
-            for seconds, row in rows:
-                heard, silent = time.monotonic(), False
-                missed, back = clock.tick(seconds)
-                if back:
-                    sink.begin_anew()
-                if clock.trusted != trusted:
-                    trusted = clock.trusted
-                    sink.note(
-                        "warning",
-                        f"joints come at {clock.measured_hz or math.nan:.4g} Hz; {self.rate_hz:g} Hz are right",
-                        "rate",
-                    )
-                    sink.begin_anew()
-                sink.take(row, missed, trusted)
+            messages, self._messages = self._messages, []
+            if not messages:
+                arrivals.wait()
+            for message in messages:
+                try:
+                    seconds, row = self._row(message)
+                except (DataError, TypeError, ValueError, OverflowError, AttributeError) as error:
+                    sink.leave_out(brief(error))
+                else:
+                    arrivals.take(row, seconds)
 
     def close(self) -> None:
         """See `LiveSource`."""
@@ -97,19 +89,28 @@ class Ros2Source(LiveSource):
         self._ros.try_shutdown()
 
     def _on_pressure(self, message: Any) -> None:
-        self._pressures[str(message.header.frame_id)] = float(message.fluid_pressure)
+        name = str(message.header.frame_id)
+        # Senders may invent as many names as they like.
+        if name in self._names:
+            self._pressures[name] = message.fluid_pressure
 
     def _on_joints(self, message: Any) -> None:
-        names = [str(name) for name in message.name]
-        row = np.full(len(self.channels), np.nan, np.float32)
+        self._messages.append(message)
+
+    def _row(self, message: Any) -> tuple[float, Row]:
+        """Time stamp (s) and values of a message of joints, with the pressures that came last."""
+        if len(message.name) > MAX_JOINTS:
+            raise DataError(f"it names {len(message.name):,} joints; at most {MAX_JOINTS} are expected")
+        at = {str(name): n for n, name in reversed(list(enumerate(message.name)))}
+        row = np.full(len(self.channels), np.nan)
         for column, channel in enumerate(self.channels):
             values = getattr(message, FIELDS.get(channel.kind, "effort"))
-            if channel.name in names and names.index(channel.name) < len(values):
-                row[column] = values[names.index(channel.name)]
+            if at.get(channel.name, len(values)) < len(values):
+                row[column] = float(values[at[channel.name]])
             elif channel.name in self._pressures:
-                row[column] = self._pressures[channel.name]
+                row[column] = float(self._pressures[channel.name])
         stamp = message.header.stamp
-        self._rows.append((float(stamp.sec + 1e-9 * stamp.nanosec), row))
+        return float(stamp.sec + 1e-9 * stamp.nanosec), row
 
 
 def _ros2() -> tuple[Any, Any, Any]:

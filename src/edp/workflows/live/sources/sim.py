@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ EPISODE_S = 3600.0
 """Length of an episode; another one of the next seed follows."""
 USUAL_RATE_HZ = 100.0
 USUAL_EXCITATION = "combined"
+COMPILING = "preparing the simulator; its first start on a computer compiles it, which takes about a minute"
 
 
 @SOURCES.register("sim")
@@ -34,6 +35,9 @@ class SimSource(LiveSource):
     Raises:
         EdpError: gymnasium is not installed, or there is no such machine or excitation.
     """
+
+    options: ClassVar[frozenset[str]] = frozenset({"excitation", "fault", "seed", "rate", "speed"})
+    preparing: ClassVar[str] = COMPILING
 
     def __init__(
         self,
@@ -74,7 +78,12 @@ class SimSource(LiveSource):
         """`SourceOptions.value` is the machine."""
         rate_hz = options.rate_hz or needs.rate_hz or USUAL_RATE_HZ
         names = [channel.name for channel in needs.channels]
-        return cls(options.value, rate_hz, options.seed, options.settings, names)
+        return cls(options.value, rate_hz, options.seed or 0, options.settings, names)
+
+    def prepare(self) -> None:
+        """See `LiveSource`: compile the simulator; each episode begins with a reset of its own."""
+        self._env.reset(seed=self._seed)
+        self._env.step(np.zeros(len(LEVERS), np.float32))
 
     def run(self, sink: Sink) -> None:
         """See `LiveSource`."""
@@ -93,7 +102,7 @@ class SimSource(LiveSource):
         ended = False
         while not ended:
             for levers in operator.block(view_of_truth(info["truth"], full)):
-                sink.take(np.concatenate([observation, levers]).astype(np.float32))
+                sink.take(np.concatenate([observation, levers]))
                 observation, _, _, ended, info = env.step(levers)
                 if ended:
                     break

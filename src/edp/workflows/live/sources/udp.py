@@ -5,76 +5,29 @@ from __future__ import annotations
 import math
 import select
 import socket
-import statistics
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 
 from edp.errors import ConfigError, DataError
+from edp.live.addresses import LOOPBACK, resolve_bind
 from edp.settings.bounds import shown
 from edp.signals import VOCABULARY, Channel, Kind, SignalMap, conversion
 from edp.storage.reading import parse_json
+from edp.workflows.live.sources.arrivals import Arrivals
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
 
-LOOPBACK = "127.0.0.1"
 MOST_BYTES = 16_384
 """Of a datagram: 400 channels; a network's own limit is 65,507."""
 MOST_CHANNELS = 256
 BUFFER_BYTES = 1 << 20
 """That the system keeps while the models are busy: some seconds of rows."""
-SILENT_S = 0.5
-"""Without a row, after which the source counts as silent."""
-WINDOW = 100
-"""Steps between rows whose median is the rate."""
-OFF_RATE = 0.05
-"""Share by which the rate may differ from the models' before they predict nothing."""
 POLL_S = 0.1
 STARTUP_S = 30.0
 """To wait for the first row, which says what channels there are, where no model says it."""
 TIME = "t"
-
-
-class RowClock:
-    """Whether rows come at the rate that models were trained at, how many are missing, and when time went back.
-
-    Args:
-        rate_hz: that is expected.
-    """
-
-    def __init__(self, rate_hz: float) -> None:
-        self.rate_hz, self.trusted = rate_hz, True
-        self._last: float | None = None
-        self._steps: deque[float] = deque(maxlen=WINDOW)
-
-    @property
-    def measured_hz(self) -> float | None:
-        """Rate of the last rows, None where there are too few."""
-        if len(self._steps) < WINDOW // 2:
-            return None
-        middle = statistics.median(self._steps)
-        return 1.0 / middle if middle > 0.0 else None
-
-    def tick(self, seconds: float) -> tuple[int, bool]:
-        """Take the time of a row: ticks that are missing before it, and whether time went back."""
-        step = None if self._last is None else seconds - self._last
-        self._last = seconds
-        if step is None:
-            return 0, False
-        if step < 0.0:
-            self._steps.clear()
-            return 0, True
-        missed = max(0, round(step * self.rate_hz) - 1)
-        # A gap is no rate.
-        if step <= SILENT_S:
-            self._steps.append(step)
-        rate = self.measured_hz
-        if rate is not None:
-            self.trusted = abs(rate - self.rate_hz) <= OFF_RATE * self.rate_hz
-        # At another rate every step would count as a gap.
-        return (missed if self.trusted else 0), False
 
 
 @SOURCES.register("udp")
@@ -89,10 +42,11 @@ class UdpSource(LiveSource):
         host: address to listen on.
 
     Raises:
-        ConfigError: the port is no port, or in use.
+        ConfigError: the port is no port, or in use, or `host` is not an address of this computer.
     """
 
     steered: ClassVar[bool] = False
+    options: ClassVar[frozenset[str]] = frozenset({"map", "rate", "machine", "udp-bind"})
     ending = "the source was closed"
 
     def __init__(
@@ -105,11 +59,12 @@ class UdpSource(LiveSource):
     ) -> None:
         self.rate_hz = rate_hz
         self._convert = _conversions(signal_map)
-        self._odd = 0
-        self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+        self._bind = resolve_bind(host, "--udp-bind")
+        family = socket.AF_INET6 if ":" in self._bind.numeric else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         try:
-            self._socket.bind((host, port))
+            self._socket.bind((self._bind.numeric, port))
         except (OSError, OverflowError) as error:
             self._socket.close()
             raise ConfigError(
@@ -127,36 +82,22 @@ class UdpSource(LiveSource):
         mapped = tuple(entry.channel() for entry in signal_map.channels) if signal_map else ()
         names = {channel.name for channel in mapped}
         channels = (*mapped, *(channel for channel in needs.channels if channel.name not in names))
-        host = options.settings.get("bind") or LOOPBACK
+        host = options.settings.get("bind", LOOPBACK)
         source = cls(int(options.value), rate, channels or None, signal_map, host)
         source.machine = options.machine
         return source
 
     def run(self, sink: Sink) -> None:
-        """See `LiveSource`; a row that is none is left out, counted and told."""
-        clock, heard, silent, trusted = RowClock(self.rate_hz), time.monotonic(), False, True
+        """See `LiveSource`; a datagram that is not a row is left out, counted and told."""
+        if not self._bind.is_loopback:
+            sink.note("warning", f"rows are taken from {self._bind.reach}, whoever sends them")
+        arrivals = Arrivals(sink, self.rate_hz)
         while not sink.stopped:
             message = self._received(sink)
             if message is None:
-                sink.show()
-                if not silent and time.monotonic() - heard > SILENT_S:
-                    silent = True
-                    sink.note(
-                        "warning", f"no row for {SILENT_S:g} s: nothing is predicted until rows come again", "silent"
-                    )
-                continue
-            now = time.monotonic()
-            if silent:
-                sink.note("note", f"rows come again, after {now - heard:.1f} s", "again")
-            heard, silent = now, False
-            missed, back = clock.tick(message.get(TIME, now))
-            if back:
-                sink.note("warning", "time went back: what follows is taken for a new session", "back")
-                sink.begin_anew()
-            if clock.trusted != trusted:
-                trusted = clock.trusted
-                self._tell_rate(sink, clock)
-            sink.take(self._row(message), missed, trusted, self._waits())
+                arrivals.wait()
+            else:
+                arrivals.take(self._row(message), message.get(TIME), self._waits())
 
     def close(self) -> None:
         """See `LiveSource`."""
@@ -181,30 +122,14 @@ class UdpSource(LiveSource):
         try:
             return row_of(data)
         except DataError as error:
-            self._odd += 1
-            # The first ones are told, then one in a thousand: a sender that does it all wrong does so at 100 Hz.
-            if self._odd <= 3 or self._odd % 1000 == 0:
-                sink.note("warning", f"datagram {self._odd} that is no row: {error}", "odd")
+            sink.leave_out(str(error))
             return None
-
-    def _tell_rate(self, sink: Sink, clock: RowClock) -> None:
-        rate = clock.measured_hz or math.nan
-        if clock.trusted:
-            sink.note("note", f"rows come at {rate:.4g} Hz again: models begin anew", "rate right")
-            sink.begin_anew()
-        else:
-            sink.note(
-                "warning",
-                f"rows come at {rate:.4g} Hz, the models know {self.rate_hz:g} Hz: nothing is predicted",
-                "rate wrong",
-            )
 
     def _row(self, message: Mapping[str, float]) -> Row:
         row = np.full(len(self.channels), np.nan)
         for column, channel in enumerate(self.channels):
             row[column] = self._convert(channel.name, message)
-        with np.errstate(over="ignore"):
-            return row.astype(np.float32)
+        return row
 
     def _first_channels(self) -> tuple[Channel, ...]:
         """Those of the first row, where nothing else says which there are."""
@@ -215,11 +140,13 @@ class UdpSource(LiveSource):
             except (TimeoutError, DataError):
                 continue
             names = [name for name in message if name != TIME]
+            if not names:
+                continue
             return tuple(VOCABULARY.get(name, Channel(name, Kind.GENERIC)) for name in names[:MOST_CHANNELS])
         self._socket.close()
         raise DataError(
-            f"{self.text}: no row came for {STARTUP_S:g} s, and no model or signal map says which channels there are; "
-            "start the sender first, or give --map"
+            f"{self.text}: no row with a value came for {STARTUP_S:g} s, and no model or signal map says which "
+            "channels there are; start the sender first, or give --map"
         )
 
 

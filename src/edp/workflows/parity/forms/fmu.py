@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from edp.control.fmu.archive import FmuArchive
 from edp.export.fmu import FmuTarget
 from edp.export.golden import Rows
 from edp.workflows.parity.base import FORMS, NAME, Broken, Missing, ParityCase, Ran, timed
@@ -27,8 +27,7 @@ class Slave:
         import fmpy
         from fmpy import fmi2, fmi3
 
-        with zipfile.ZipFile(file) as archive:
-            archive.extractall(folder)
+        FmuArchive(file).unpack_all(folder)
         about = fmpy.read_model_description(str(folder))
         listed = about.modelVariables
         real = "Real" if version == 2 else "Float64"

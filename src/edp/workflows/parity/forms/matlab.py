@@ -16,6 +16,7 @@ from edp.export.description import float_graph
 from edp.export.escape import matlab_string
 from edp.export.golden import Rows
 from edp.export.simulink import SimulinkTarget
+from edp.storage.paths import entries_of
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
 from edp.workflows.parity.forms.c_code import FLAGS
 
@@ -122,7 +123,7 @@ class CCaller:
         results = ", ".join(f"&out[tick][{offset}]" for offset in places[:-1])
         text = DRIVER.substitute(sizes_of, name=NAME, NAME=NAME.upper(), results=results)
         (folder / "driver.c").write_text(text)
-        sources = ["driver.c", f"{NAME}_call.c", *sorted((folder / "core").glob("*.c"))]
+        sources = ["driver.c", f"{NAME}_call.c", *entries_of(folder / "core", "*.c")]
         called([compiler, *FLAGS, "-I", "core", *sources, "-lm", "-o", "driver"], folder)
         output = called([folder / "driver"], folder, np.ascontiguousarray(case.inputs, dtype=np.float32).tobytes())
         (seconds,) = struct.unpack("<d", output[-8:])

@@ -1,0 +1,65 @@
+"""Seals: a hash over the content of a JSON file of EDP, in the file itself, checked each time that the file is read.
+
+A seal shows damage and stray edits. It has no key, so it does not stop somebody who means to forge a file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+HASH = "blake2b"
+"""Key of the hash over the rest of the object."""
+MAX_UNSEALED = 100
+_unsealed: dict[str, None] = {}
+
+
+def content_digest(content: Mapping[str, Any]) -> str:
+    """Return the hash of an object without its hash; what is in it and in which order lists stand is covered."""
+    # One round through JSON: the hash is over what a reader will see, tuples as lists.
+    plain = json.loads(json.dumps({key: value for key, value in content.items() if key != HASH}, allow_nan=False))
+    return digest_of_bytes(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode())
+
+
+def digest_of_bytes(data: bytes) -> str:
+    """Return the hash of the content of a file, as a header or a result states it."""
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an object with the hash of its content."""
+    return {**content, HASH: content_digest(content)}
+
+
+def unsealed(content: Any, where: str, error: type[Exception]) -> Any:
+    """Return an object without its hash, which is checked; anything without a hash is noted and returned.
+
+    Args:
+        content: what a file of EDP holds.
+        where: what to call the file in messages.
+        error: kind of error to raise.
+
+    Raises:
+        Exception: `error`; the content does not match its hash.
+    """
+    if not isinstance(content, dict):
+        return content
+    if HASH not in content:
+        if len(_unsealed) < MAX_UNSEALED:
+            _unsealed[where] = None
+        return content
+    if content[HASH] != content_digest(content):
+        raise error(
+            f"{where} was changed since EDP wrote it: its content does not match its hash ({HASH}); restore it from a "
+            "copy, or give the command that wrote it again"
+        )
+    return {key: value for key, value in content.items() if key != HASH}
+
+
+def files_without_seal() -> list[str]:
+    """Return the files without a hash that this process read, and forget them."""
+    files = list(_unsealed)
+    _unsealed.clear()
+    return files

@@ -1,0 +1,112 @@
+"""A live session with its page: the source in a thread of its own, the server of the page in this one."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+
+from edp.live.server import LiveServer
+from edp.workflows.live.mirror import RerunMirror
+from edp.workflows.live.run_live import LiveOrder, LiveResult, LiveRun
+from edp.workflows.live.sources import LiveSource
+
+STOP_S = 5.0
+"""To wait for the thread of a source, which may be within a tick."""
+
+
+def run_live(
+    order: LiveOrder,
+    on_ready: Callable[[LiveServer], None] | None = None,
+    on_event: Callable[[str, str], None] | None = None,
+    source: LiveSource | None = None,
+    on_mirror: Callable[[str], None] | None = None,
+) -> LiveResult:
+    """Serve a session until Ctrl-C, a request to end, an error, or with `LiveOrder.until_end` the end of the source.
+
+    Args:
+        order: what to show.
+        on_ready: called once the page can be opened.
+        on_event: called with kind and text of each event.
+        source: of the rows, in place of the order's.
+        on_mirror: called with the address of Rerun's page, where that is asked for.
+
+    Raises:
+        EdpError: source, models, port or files cannot be used.
+    """
+    live = LiveRun(order, on_event, source)
+    mirror = _mirrored(live, on_mirror)
+    playing = threading.Thread(target=live.play, name="edp-live-source", daemon=True)
+    try:
+        asyncio.run(_served(live, playing, on_ready))
+    finally:
+        live.pace.stop()
+        if playing.ident is not None:
+            playing.join(STOP_S)
+        if mirror is not None:
+            mirror.close()
+        result = live.close()
+    if live.failure is not None:
+        raise live.failure
+    return result
+
+
+def _mirrored(live: LiveRun, on_mirror: Callable[[str], None] | None) -> RerunMirror | None:
+    if not live.order.rerun:
+        return None
+    try:
+        mirror = RerunMirror(live.session)
+    except BaseException:
+        live.close()
+        raise
+    if on_mirror is not None:
+        on_mirror(mirror.address)
+    return mirror
+
+
+async def _served(live: LiveRun, playing: threading.Thread, on_ready: Callable[[LiveServer], None] | None) -> None:
+    stop, order = asyncio.Event(), live.order
+    server = LiveServer(live.session, live.pace if live.source.steered else None, order.host, order.port)
+
+    def ready(one: LiveServer) -> None:
+        if on_ready is not None:
+            on_ready(one)
+        # Once the port is open: a port in use is refused before anything is played or recorded.
+        playing.start()
+
+    async def watch_end() -> None:
+        while not stop.is_set():
+            await asyncio.sleep(0.1)
+            ended = playing.ident is not None and not playing.is_alive()
+            if ended and (order.until_end or live.failure is not None):
+                stop.set()
+
+    with _interrupts(stop):
+        ending = asyncio.create_task(watch_end())
+        try:
+            await server.run(stop, ready)
+        finally:
+            ending.cancel()
+
+
+@contextlib.contextmanager
+def _interrupts(stop: asyncio.Event) -> Iterator[None]:
+    """Ctrl-C and the system's request end the session, and files are finished; only the main thread hears them."""
+    loop = asyncio.get_running_loop()
+    signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    handlers_before = {number: signal.getsignal(number) for number in signals}
+    for number in signals:
+        try:
+            loop.add_signal_handler(number, stop.set)
+        except NotImplementedError:  # the loops of Windows, which a plain handler has to wake
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
+    try:
+        yield
+    finally:
+        for number in signals:
+            with contextlib.suppress(NotImplementedError):
+                loop.remove_signal_handler(number)
+            # None: a handler that is not Python's cannot be set again.
+            signal.signal(number, handlers_before[number] or signal.SIG_DFL)

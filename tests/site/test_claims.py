@@ -1,0 +1,244 @@
+"""Measured figures and goals of the documentation, recomputed from the results that the benchmarks kept."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shutil
+import sys
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import pytest
+
+from edp_site import results
+
+ROOT = Path(__file__).parents[2]
+BENCHMARKS = ROOT / "benchmarks"
+KEPT = sorted((BENCHMARKS / "results").glob("*.json"))
+UNITS = r"(?:%|mm/s|mm|ms|s|min|h|GB|MB|kB|bar|degC|bytes|times|cycles|tasks)"
+MEASURED = re.compile(rf"(?<![\w.,:-])(?:\d+\.\d+|\d+(?= ?{UNITS}(?![\w-])))")
+"""Numbers of a text that look measured: a decimal number, or a whole number with a unit."""
+REDUCTIONS = {"mean": fmean, "max": max, "min": min, "count": len}
+PROGRAMS = re.compile(r"gcc|clang|valgrind|qemu-system-arm|arm-none-eabi-\w+")
+
+
+@cache
+def kept(name: str) -> Any:
+    return json.loads((BENCHMARKS / "results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def value_of(source: str) -> str:
+    """Return a value of a kept result as text; `docs/figures.toml` has the form of `source`."""
+    place, _, form = source.rpartition(":")
+    place, _, factor = place.partition("*")
+    name, *keys = place.split("/")
+    value = kept(name)
+    path = "/".join(keys)
+    while path:
+        if isinstance(value, list) and path in REDUCTIONS:
+            value, path = REDUCTIONS[path](value), ""
+        elif isinstance(value, list):
+            found = next(one for one in value if path.startswith(f"{one['name']}/"))
+            value, path = found, path.removeprefix(f"{found['name']}/")
+        else:
+            key = next(key for key in sorted(value, key=len, reverse=True) if f"{path}/".startswith(f"{key}/"))
+            value, path = value[key], path.removeprefix(key).removeprefix("/")
+    return format(value * float(factor or 1), form)
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What `docs/figures.toml` says of one page: sentence parts with figures, and numbers that are not measured."""
+
+    figures: tuple[tuple[str, tuple[str, ...]], ...]
+    stated: tuple[str, ...]
+
+
+def claims(page: str) -> Claims:
+    rows = tomllib.loads((ROOT / "docs" / "figures.toml").read_text(encoding="utf-8"))
+    figures = tuple((row["text"], tuple(row["values"])) for row in rows["figure"] if row["page"] == page)
+    return Claims(figures, tuple(text for row in rows["stated"] if row["page"] == page for text in row["texts"]))
+
+
+def plain(page: str) -> str:
+    """Return the text of a page without code, link targets and line breaks."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    text = re.sub(r"```.*?```", " ", text, flags=re.DOTALL)
+    text = re.sub(r"\]\([^)]*\)", "]", re.sub(r"`[^`]*`", " ", text))
+    return " ".join(text.split())
+
+
+def unproven(text: str, page: Claims) -> list[str]:
+    """Return the numbers of a text that look measured and belong to no row."""
+    for pattern, values in page.figures:
+        text = text.replace(pattern.format(*map(value_of, values)), " ")
+    for part in page.stated:
+        text = text.replace(part, " ")
+    return [match[0] for match in MEASURED.finditer(text)]
+
+
+def section(page: str) -> str:
+    """Return the part of a page whose figures are held: the README after its code, and all of any other page."""
+    text = plain(page)
+    return text.split("## Measured")[1].split("## Where things are written")[0] if page == "README.md" else text
+
+
+PAGES = ["README.md", "docs/limits.md"]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_figures_of_a_page_are_those_of_the_kept_results(page):
+    text = plain(page)
+    missing = [part for part in (p.format(*map(value_of, v)) for p, v in claims(page).figures) if part not in text]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_has_no_measured_figure_without_a_source(page):
+    assert unproven(section(page), claims(page)) == []
+
+
+def test_a_figure_that_no_result_has_is_noticed():
+    page = claims("docs/limits.md")
+    assert unproven("It finds 76 % of the faults in 1.25 s, of 3 kinds", page) == ["76", "1.25"]
+
+
+@pytest.mark.parametrize("path", KEPT, ids=lambda path: path.stem)
+def test_a_kept_verdict_follows_from_its_figures(path):
+    costs = benchmark("common").COSTS
+    for one in kept(path.stem)["verdicts"]:
+        sign, bound = one["goal"].split()
+        if not one["rival"]:  # a count that has to be zero
+            assert one["met"] == (one["ours"] == 0), one
+            continue
+        ratio = one["ours"] / one["rival"]
+        assert one["ratio"] == pytest.approx(ratio, rel=1e-6), one
+        assert one["met"] == (ratio <= float(bound) if sign == "<=" else ratio >= float(bound)), one
+        assert not (sign == ">=" and one["unit"] in costs), one
+
+
+@pytest.mark.parametrize("goal", results.read_goals(BENCHMARKS / "goals.toml"), ids=lambda goal: goal.asked[:60])
+def test_a_goal_that_was_asked_has_its_verdicts_or_a_reason(goal):
+    assert sum(map(bool, (goal.result, goal.measured, goal.test))) == 1
+    if goal.result:
+        names = {one["name"] for one in kept(goal.result)["verdicts"]}
+        assert goal.verdicts
+        assert [name for name in goal.verdicts if name not in names] == []
+    if goal.test:
+        assert (ROOT / goal.test).is_file()
+
+
+def test_the_leaderboard_shows_missed_goals_as_missed():
+    goals = results.read_goals(BENCHMARKS / "goals.toml")
+    page = results.results_page(BENCHMARKS / "results", goals)
+    for goal in goals:
+        row = next(line for line in page.splitlines() if line.startswith(f"| {goal.asked} |"))
+        outcomes = (
+            [one["met"] for one in kept(goal.result)["verdicts"] if one["name"] in goal.verdicts] if goal.result else []
+        )
+        assert ("**missed**" in row) == (not all(outcomes))
+
+
+def benchmark(name: str) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        return __import__(name)
+
+
+@pytest.fixture(autouse=True)
+def forget_benchmarks():
+    yield
+    for name in {path.stem for path in BENCHMARKS.glob("*.py")} & set(sys.modules):
+        del sys.modules[name]
+
+
+def test_a_verdict_with_interchanged_figures_is_refused():
+    with pytest.raises(ValueError, match="interchange the figures"):
+        benchmark("common").verdict("a tick against the reference", 24.8, 1.5, ">= 10", "ms", False)
+
+
+def called_programs(path: Path) -> set[str]:
+    """Return the programs of the system that a benchmark names, and those of the parts that it imports."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(tree))
+    texts = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    called = {text for text in texts if PROGRAMS.fullmatch(text)}
+    for node in nodes:
+        part = BENCHMARKS / f"{node.module}.py" if isinstance(node, ast.ImportFrom) else path
+        if part != path and part.is_file() and part.stem != "common" and not is_benchmark(part):
+            called |= called_programs(part)
+    return called
+
+
+def is_benchmark(path: Path) -> bool:
+    return "__main__" in path.read_text(encoding="utf-8")
+
+
+def leaves_parts_out(path: Path) -> bool:
+    """Return whether a benchmark looks for its programs itself and runs without them."""
+    return "shutil.which" in path.read_text(encoding="utf-8")
+
+
+NEEDING = [
+    p for p in sorted(BENCHMARKS.glob("*.py")) if is_benchmark(p) and called_programs(p) and not leaves_parts_out(p)
+]
+
+
+def test_most_benchmarks_of_compiled_code_are_known_by_their_programs():
+    assert len(NEEDING) >= 10
+
+
+@pytest.mark.parametrize("path", NEEDING, ids=lambda path: path.stem)
+def test_a_benchmark_ends_cleanly_without_its_programs(path, monkeypatch, capsys):
+    found = benchmark(path.stem)
+    assert called_programs(path) == set(found.PROGRAMS)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setattr(sys, "argv", [path.name, "--quick"])
+    with pytest.raises(SystemExit) as ended:
+        found.main()
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith(f"skipped: {found.PROGRAMS[0]}")
+
+
+DEFINITIONS = {
+    "adaptation": {"A grey box that follows the machine"},
+    "compress": {"Resource usage of a network"},
+    "control": {"Settings", "Learning"},
+    "environment": {"Settings"},
+    "monitor": {"On the machine"},
+    "simulator": {"Machines", "Excitation"},
+}
+"""Sections whose tables have numbers that define something and were not measured."""
+MEASURED_PAGES = (
+    "adaptation",
+    "compress",
+    "control",
+    "environment",
+    "live",
+    "monitor",
+    "mpc",
+    "simulator",
+    "statistics",
+    "twin",
+)
+
+
+def numeric_rows(part: str) -> list[str]:
+    return [row for row in re.findall(r"^\|.*\|$", part, flags=re.MULTILINE) if re.search(r"\| *-?\d+\.\d", row)]
+
+
+@pytest.mark.parametrize("page", ["results", *MEASURED_PAGES])
+def test_a_section_with_measured_tables_names_its_file_or_says_that_none_was_kept(page):
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    parts = [part for part in re.split(r"^(?=##)", text, flags=re.MULTILINE) if len(numeric_rows(part)) > 1]
+    for part in parts:
+        title = part.splitlines()[0]
+        named = re.findall(r"benchmarks/results/(\w+)\.json", part)
+        assert named or "Not kept**" in part or title.lstrip("# ") in DEFINITIONS.get(page, ()), f"{page}: {title}"
+        assert [name for name in named if not (BENCHMARKS / "results" / f"{name}.json").is_file()] == []
