@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console, ConsoleDimensions
@@ -23,9 +23,6 @@ from rich.text import Text
 from edp.cli.ending import memory_message, out_of_memory, stopped_code
 from edp.cli.settings import setting_of
 from edp.errors import ConfigError, EdpError
-
-if TYPE_CHECKING:
-    from edp.evaluation.guard import ErrorVerdict
 
 UNFOLDED_COLUMNS = 100_000
 """Width of output that is not a terminal."""
@@ -121,28 +118,6 @@ def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None
         sys.stdout.write(json.dumps(facts, indent=1, allow_nan=False) + "\n")
     else:
         show()
-
-
-def show_verdict(verdict: ErrorVerdict | None) -> None:
-    """Print the first line of a command that judges."""
-    if verdict is not None:
-        out.print(verdict.sentence(), style="bold red" if verdict.exit_code else "bold")
-
-
-def verdict_facts(verdict: ErrorVerdict | None) -> dict[str, Any]:
-    """Return a verdict as JSON has it; ``beaten_by`` names the reference where the outcome is *worse*."""
-    beaten = verdict is not None and verdict.exit_code
-    return {
-        "beaten_by": verdict.label if verdict is not None and beaten else None,
-        "verdict": None if verdict is None else str(verdict.outcome),
-        "verdict_sentence": None if verdict is None else verdict.sentence(),
-    }
-
-
-def end_with(verdict: ErrorVerdict | None) -> None:
-    """End a command with the exit code of its verdict, so that scripts need not read JSON."""
-    if verdict is not None and verdict.exit_code:
-        raise typer.Exit(verdict.exit_code)
 
 
 def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

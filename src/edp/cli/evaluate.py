@@ -9,20 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import (
-    JsonFlag,
-    Steps,
-    counted,
-    duration,
-    emit,
-    end_with,
-    out,
-    progress,
-    show_verdict,
-    table,
-    verdict_facts,
-)
+from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
 

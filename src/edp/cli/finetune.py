@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, end_with, out, progress, show_verdict, table, verdict_facts
+from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
 

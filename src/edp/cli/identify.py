@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, end_with, out, progress, show_verdict, table, verdict_facts
+from edp.cli.console import JsonFlag, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.twin import FitDisplay, score_table
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 
 if TYPE_CHECKING:
     from edp.workflows.identify import Identified

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, end_with, out, progress, show_verdict, table, verdict_facts
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path, is_file_at
 
 if TYPE_CHECKING:

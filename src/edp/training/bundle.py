@@ -182,8 +182,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         header = _read_header(path)
         _check_schema(header, path)
         check_hash(header, path / HEADER)
-        unknown = unknown_parts(header["model"])
-        if unknown:
+        if unknown := unknown_parts(header["model"]):
             raise BundleError(f"bundle '{path}': {'; '.join(unknown)}")
         return _assembled(header, path)
 
@@ -204,8 +203,7 @@ def check_hash(header: Mapping[str, Any], file: Path) -> None:
     if header.get(HASH) != content_digest(header):
         raise BundleError(f"'{file}' does not match its hash: it was cut off or changed by hand; restore the bundle")
     built = {key: value for key, value in header.items() if key not in ("provenance", "scores")}
-    missing = missing_parts(header.get(PLUGINS), built)
-    if missing:
+    if missing := missing_parts(header.get(PLUGINS), built):
         raise BundleError(f"'{file}': {'; '.join(missing)}")
 
 

@@ -11,7 +11,7 @@ import pytest
 from edp.errors import ConfigError
 from edp.networks.blocks import BLOCKS
 from edp.registry import _PLUGINS, Registry, load_plugins, missing_parts, origins_in
-from edp.storage.headers import HASH, header_digest
+from edp.storage.seals import HASH, content_digest
 
 BLOCK = """
 from dataclasses import dataclass
@@ -233,7 +233,7 @@ def test_every_registry_is_known_to_plugins():
 def test_a_bundle_of_before_with_an_unknown_part_is_not_called_damaged(edp_bundle):
     header = json.loads((edp_bundle / "bundle.json").read_text())
     header["model"]["blocks"] = [{"kind": "bar_gain"}]
-    (edp_bundle / "bundle.json").write_text(json.dumps(header | {HASH: header_digest(header)}))
+    (edp_bundle / "bundle.json").write_text(json.dumps(header | {HASH: content_digest(header)}))
     import edp
 
     with pytest.raises(edp.EdpError, match="unknown block 'bar_gain'") as refused:

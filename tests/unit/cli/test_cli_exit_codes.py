@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from edp.cli import app, console
+from edp.cli import app, console, verdicts
 from edp.evaluation.guard import BEATEN, ErrorOutcome, ErrorVerdict, network_verdict, outcome_of
 
 ROOT = Path(__file__).parents[3]
@@ -67,14 +67,14 @@ def test_every_command_file_ends_by_the_rule():
     ends = set()
     for file in sorted(COMMANDS.glob("*.py")):
         text = file.read_text(encoding="utf-8")
-        if file.name != "console.py":
+        if file.name != "verdicts.py":
             assert not constants(ast.parse(text)) & {"BEATEN", "6", "verdict.exit_code"}, file.name
-        if "end_with(" in text and file.name != "console.py":
+        if "end_with(" in text and file.name != "verdicts.py":
             ends.add(file.stem)
             assert text.count("end_with(verdict)") == text.count("show_verdict(verdict)"), file.name
             assert text.count("end_with(verdict)") == text.count("verdict_facts(verdict)"), file.name
     assert ends == JUDGING
-    assert callable(console.end_with)
+    assert callable(verdicts.end_with)
 
 
 def test_a_command_whose_help_or_module_compares_with_a_reference_is_one_that_judges():
@@ -82,7 +82,7 @@ def test_a_command_whose_help_or_module_compares_with_a_reference_is_one_that_ju
     users = {
         file.stem
         for file in COMMANDS.glob("*.py")
-        if re.search(r"_verdict\b|beaten_by\(", file.read_text(encoding="utf-8")) and file.name != "console.py"
+        if re.search(r"_verdict\b|beaten_by\(", file.read_text(encoding="utf-8")) and file.name != "verdicts.py"
     } - {"inspect", "quality"}
     assert users == JUDGING
     assert set(get_command(app).commands) >= JUDGING
