@@ -288,6 +288,10 @@ class FitDisplay:
     def on_event(self, event: FreeRunProgress) -> None:
         """How far it is."""
         error = "" if event.validation is None else f", free-run error {event.validation:.3g} deviations"
-        note = f"update {event.update}/{event.updates}, runs of {event.length_s:g} s{error}"
-        self.shown.update(self.bar, completed=event.update / event.updates, note=note)
-        self.steps.say(f"{self.what}: {note}, {duration(event.seconds_left)} left")
+        # A fit that goes on beyond its plan has no time left to state.
+        more = event.update > event.updates
+        count = f"{event.update}, more than the {event.updates} planned" if more else f"{event.update}/{event.updates}"
+        left = "" if more else f", {duration(event.seconds_left)} left"
+        note = f"update {count}, runs of {event.length_s:g} s{error}"
+        self.shown.update(self.bar, completed=min(1.0, event.update / event.updates), note=note)
+        self.steps.say(f"{self.what}: {note}{left}")
