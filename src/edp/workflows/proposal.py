@@ -61,6 +61,7 @@ class LogsProposal:
         inputs: channels that command, where no kind tells it; `edp inspect` sees their coverage only if they are named.
         repairs: what training would refuse unless it is repaired, as ``--repair`` takes it.
         notes: what else a person should know.
+        recordings: number of recordings that the commands read.
     """
 
     source: Path
@@ -73,6 +74,7 @@ class LogsProposal:
     inputs: tuple[str, ...]
     repairs: tuple[str, ...]
     notes: tuple[str, ...]
+    recordings: int
 
     def commands(self, folder: Path) -> list[str]:
         """The commands that come next, in order."""
@@ -97,7 +99,9 @@ class LogsProposal:
             if names
         )
         data, mapped, repair = self._logs(folder)
-        return f"edp twin {data}{mapped} --out {_quoted(folder / 'runs' / 'twin')}{repair}{named}"
+        # Of a single recording the end tests: there is no other one.
+        split = " --set split.kind=time" if self.recordings == 1 else ""
+        return f"edp twin {data}{mapped} --out {_quoted(folder / 'runs' / 'twin')}{repair}{named}{split}"
 
     def no_plant(self) -> str:
         """Why no plant model is proposed, and what to record or to name, in a sentence; empty where one is."""
@@ -175,7 +179,10 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     check_files(files)
     repairs = () if apart else repairs
     inputs = _untold_inputs(proposal)
-    return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
+    return LogsProposal(
+        *(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes)),
+        recordings=len(group.paths) if experiments is None else len(experiments.entries),
+    )
 
 
 def _recordings(
@@ -342,4 +349,7 @@ def _of_pairs(
     notes += _notes(group, others, broken, proposal)
     notes.append(f"two experiments stand side by side: columns of '{train}' train, those of '{test}' test")
     inputs = _untold_inputs(renamed_proposal)
-    return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
+    return LogsProposal(
+        *(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes)),
+        recordings=len(recordings),
+    )

@@ -34,7 +34,8 @@ def losses_line(scores: Mapping[str, Any]) -> str:
     ]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
     return (
-        f"The network loses to a baseline on {len(losses)} of {len(scores['targets'])} outputs: {listed(parts)}{more}."
+        f"At some time ahead a baseline has less error on {len(losses)} of {len(scores['targets'])} outputs: "
+        f"{listed(parts)}{more}."
     )
 
 
