@@ -47,7 +47,7 @@ def test_every_page_is_opened_in_a_browser():
     for path in TESTS.rglob("test_*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("check_page", "check_kind"):
-                opened.add(node.args[-1].value)
+                opened.add(node.args[2 if node.func.id == "check_page" else -1].value)
     assert len(kinds) == len(PAGES)
     assert opened == kinds
 
