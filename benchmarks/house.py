@@ -22,7 +22,7 @@ from common import Verdict, finish, parser, table, verdict
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "edp"
-LONG_FUNCTION, LONG_FILE = 60, 400
+MAX_PARAMETERS, LONG_FILE = 7, 600
 BANNED = frozenset(
     (
         "held",
@@ -54,8 +54,7 @@ class House:
         floors: longest chain of rooms that import one another.
         arrows: pairs of rooms of which one imports the other.
         circles: groups of modules that import one another in a circle, by their names.
-        long_functions: functions whose statements take more than `LONG_FUNCTION` lines; signatures and docstrings
-            do not count: a command of the terminal declares its options in its signature.
+        wide_functions: functions outside the command line with more than `MAX_PARAMETERS` parameters besides ``self``.
         long_files: files of more than `LONG_FILE` lines.
         comments: comments for each 100 lines of code, and the strings that explain a constant below its assignment.
         docstrings: docstrings for each 100 lines of code.
@@ -68,7 +67,7 @@ class House:
     floors: int = 0
     arrows: int = 0
     circles: list[list[str]] = field(default_factory=list)
-    long_functions: list[str] = field(default_factory=list)
+    wide_functions: list[str] = field(default_factory=list)
     long_files: list[str] = field(default_factory=list)
     comments: float = 0.0
     docstrings: float = 0.0
@@ -110,13 +109,20 @@ def measure(package: Path = PACKAGE) -> House:
         for node in nodes[name]:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module):
                 docstrings += ast.get_docstring(node) is not None
-            if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - _first_line(node) + 1 > LONG_FUNCTION:
-                house.long_functions.append(f"{where}:{node.lineno} {node.name}")
+            if isinstance(node, ast.FunctionDef) and parameters_of(node) > MAX_PARAMETERS and "cli" not in where.parts:
+                house.wide_functions.append(f"{where}:{node.lineno} {node.name}")
         classes.update(node.name for node in tree.body if isinstance(node, ast.ClassDef) and node.name[0] != "_")
         house.banned += [f"{where}:{line} {variable}" for variable, line in assigned(nodes[name]) if variable in BANNED]
     house.comments, house.docstrings = 100 * comments / lines, 100 * docstrings / lines
     house.duplicates = {name: count for name, count in sorted(classes.items()) if count > 1}
     return house
+
+
+def parameters_of(function: ast.FunctionDef) -> int:
+    """Return the number of parameters of a function, without the instance or class of a method."""
+    arguments = function.args
+    names = [argument.arg for argument in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
+    return len(names) - (names[:1] in (["self"], ["cls"]))
 
 
 def assigned(nodes: Iterable[ast.AST]) -> Iterator[tuple[str, int]]:
@@ -126,12 +132,6 @@ def assigned(nodes: Iterable[ast.AST]) -> Iterator[tuple[str, int]]:
             yield node.id, node.lineno
         elif isinstance(node, ast.arg):
             yield node.arg, node.lineno
-
-
-def _first_line(function: ast.FunctionDef) -> int:
-    """Of a function's statements, behind its docstring."""
-    body = function.body
-    return body[1].lineno if len(body) > 1 and ast.get_docstring(function) is not None else body[0].lineno
 
 
 def _constant_docstrings(node: ast.AST) -> int:
@@ -240,7 +240,7 @@ def main() -> None:
         ("siblings below the package", len(house.siblings), 23),
         ("arrows between rooms", house.arrows, 141),
         ("circles of modules", len(house.circles), 0),
-        (f"functions of more than {LONG_FUNCTION} lines", len(house.long_functions), 0),
+        (f"functions of more than {MAX_PARAMETERS} parameters", len(house.wide_functions), 0),
         (f"files of more than {LONG_FILE} lines", len(house.long_files), 0),
         ("public class names that stand twice", len(house.duplicates), 0),
         ("variables of a banned name", len(house.banned), 0),
@@ -259,7 +259,7 @@ def main() -> None:
             rows.append((f"make {target}, processor seconds", seconds, f"<= {bound:g}"))
             verdicts.append(verdict(f"make {target}", seconds, bound, "<= 1", "s", given.quick))
     table(("figure", "now", "bound"), rows)
-    for line in (*house.circles, *house.long_functions, *house.long_files, *house.duplicates, *house.banned[:40]):
+    for line in (*house.circles, *house.wide_functions, *house.long_files, *house.duplicates, *house.banned[:40]):
         print("  ", line)
     finish(Path(__file__).stem, verdicts, given.seed, {"floors": house.floors, "modules": house.modules})
 

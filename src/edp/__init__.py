@@ -5,6 +5,7 @@ them. `__init__.pyi` states their types.
 """
 
 from importlib import import_module
+from warnings import warn
 
 __version__ = "0.1.0"
 
@@ -41,6 +42,9 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module 'edp' has no attribute '{name}'")
     module = _PUBLIC[name]
     value = getattr(import_module(module), name) if module else import_module(f"edp.{name}")
+    # After the import: a plug-in takes from EDP what it builds on.
+    for failure in import_module("edp.registry").load_plugins():
+        warn(failure, stacklevel=2)
     globals()[name] = value
     return value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -81,7 +82,7 @@ def test_an_export_that_ends_anywhere_is_absent_and_the_next_one_mends_it(killed
         nonlocal count
         count += 1
         if count == killed:
-            (path.parent / f".{path.name}.abcd_123.tmp").write_bytes(data[:2])  # as a kill leaves it
+            (path.parent / f".{path.name}.0123456789ab.tmp").write_bytes(data[:2])  # as a kill leaves it
             raise KeyboardInterrupt
         plain(path, data)
 
@@ -191,3 +192,24 @@ def test_sizes_beyond_an_index_of_the_code_are_refused():
             with pytest.raises(ExportError, match="chooses from: 65,537"):
                 _check(model)
     assert np.uint16(MOST_COLUMNS - 1) == MOST_COLUMNS - 1
+
+
+def test_a_killed_export_leaves_nothing_behind_the_next_one(tmp_path):
+    # The process is killed while it writes the first file; its name is the one that the writer gives.
+    script = (
+        "import os, signal, sys\n"
+        "from edp.storage import writing\n"
+        "from edp.export.folder import write_export\n"
+        "real = writing.os.fsync\n"
+        "def kill(handle):\n"
+        "    if any('a.h' in name for name in os.listdir(sys.argv[1])):\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    real(handle)\n"
+        "writing.os.fsync = kill\n"
+        "write_export(sys.argv[1], {'a.h': b'1'})\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".tmp"]
+    write_export(tmp_path, {"a.h": b"2"})
+    assert {path.name for path in tmp_path.iterdir()} == {"a.h", "export.sha256"}

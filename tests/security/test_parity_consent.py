@@ -55,5 +55,5 @@ def test_run_folders_and_their_bundles_are_ones_own(parity, tmp_path, name):
     assert from_own_run(tmp_path)
     assert from_own_run(tmp_path / "bundle")
     assert not from_own_run(tmp_path / "other")
-    unfinished = "holds a training that is not finished" if name == "run.json" else "it has no bundle.json"
+    unfinished = "holds a run that is not finished" if name == "run.json" else "it has no bundle.json"
     assert unfinished in parity(tmp_path)[1]

@@ -31,6 +31,7 @@ from edp.logs.store import read_store
 from edp.recording import Recording, spread_recordings, spread_stretches
 from edp.signals import Channel, Kind
 from edp.stats.sketch import QuantileSketch
+from edp.storage import write_json
 from edp.workflows.executors.packing import packed, unpacked
 
 NAMES = ("a", "b", "c", "d", "e", "f")
@@ -71,7 +72,7 @@ def repeated(store, folder, times):
         for turn in range(times)
         for entry in index["recordings"]
     ]
-    (folder / "store.json").write_text(json.dumps(index))
+    write_json(folder / "store.json", index)
     return folder
 
 
@@ -384,7 +385,7 @@ def test_a_disk_that_fills_while_a_store_is_built_loses_nothing(logs, tmp_path, 
 
 def test_a_store_of_another_schema_is_refused(logs, tmp_path):
     path = tmp_path / "store" / "store.json"
-    for schema in (0, 2):
+    for schema in (0, 3):
         path.write_text(json.dumps({**json.loads(path.read_text()), "schema": schema}))
-        with pytest.raises(DataError, match=rf"schema {schema}, this version of EDP reads 1; remove the store"):
+        with pytest.raises(DataError, match=rf"schema {schema}, this version of EDP reads 1 and 2; remove the store"):
             read_store(tmp_path / "store")

@@ -302,7 +302,7 @@ def test_a_store_can_be_inspected(logs, tmp_path):
 def test_the_index_of_a_store_is_plain_json_of_its_schema(logs, tmp_path):
     build(logs, tmp_path / "store")
     table = json.loads((tmp_path / "store" / "store.json").read_text())
-    assert (table["kind"], table["schema"]) == ("edp-store", 1)
+    assert (table["kind"], table["schema"]) == ("edp-store", 2)
     assert [entry["samples"] for entry in table["recordings"]] == [300, 310, 320, 330, 340]
     rows = np.fromfile(tmp_path / "store" / "rows" / f"{table['recordings'][1]['rows']}.f32", "<f4")
     first = table["recordings"][1]["first"]

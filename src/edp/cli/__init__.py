@@ -42,11 +42,12 @@ from edp.cli import (
     train,
     twin,
 )
-from edp.cli.console import run_app
+from edp.cli.console import err, run_app
 from edp.cli.ending import stop_on_request
 from edp.cli.slow import tell_of_missing_layers, tell_of_slow_logs
 from edp.cli.threads import use_one_blas_thread
 from edp.cli.unsealed import tell_of_unsealed_files
+from edp.workflows import load_plugins
 
 app = typer.Typer(
     name="edp",
@@ -105,6 +106,8 @@ def _root(
     ] = False,
 ) -> None:
     """Recordings in, a judged and deployable plant model out."""
+    for failure in load_plugins():
+        err.print(f"warning: {failure}")
 
 
 def main() -> None:

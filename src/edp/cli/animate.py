@@ -51,7 +51,7 @@ def animate(
     run, log = _run_and_log(paths)
     if run is None and horizon is not None:
         raise ConfigError("--horizon is of a run's predictions; give a run before the log: edp animate RUN LOG")
-    target = output or log.with_name(f"{log.stem}.html")
+    target = output or log.parent / f"{log.stem or 'log'}.html"
     film = target.suffix.lower() in FILMS
     if not film and target.suffix.lower() not in PAGES:
         endings = ", ".join((*PAGES, *FILMS))

@@ -24,9 +24,6 @@ from edp.cli.ending import memory_message, out_of_memory, stopped_code
 from edp.cli.settings import setting_of
 from edp.errors import ConfigError, EdpError
 
-# Scripts can tell a network that should not be used without reading JSON.
-BEATEN = 6
-"""Exit code where a baseline has less error than the network, or a floor less than the twin."""
 UNFOLDED_COLUMNS = 100_000
 """Width of output that is not a terminal."""
 KEPT_BREAK = re.compile(r"\n(?=  - )")

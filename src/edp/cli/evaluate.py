@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import BEATEN, JsonFlag, Steps, counted, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
 
@@ -67,22 +68,22 @@ def evaluate(
     if predictor is not None:
         raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
     names = None if baselines is None else baseline_names(baselines)
-    from edp.evaluation.guard import beaten_by
+    from edp.evaluation.guard import network_verdict
     from edp.report.run.choice import promise_line, read_choice
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
     from edp.storage.runs import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json, minutes, workforce, at_most)
-    beaten = beaten_by(scores, minutes_of(run))
+    verdict = network_verdict(scores, minutes_of(run))
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
     choice = read_choice(run) if source is None else None
     beyond, promise = situation_line(scores), "" if choice is None else promise_line(choice)
     importances = run_importance(run, source, as_json, at_most) if channel_importance else None
 
     def show() -> None:
-        for sentence in ("" if beaten is None else beaten.sentence(), lost):
-            if sentence:
-                out.print(sentence, style="bold red")
+        show_verdict(verdict)
+        if lost:
+            out.print(lost)
         show_scores(scores, (promise, beyond, judged), minutes)
         out.print(f"scores in {folder / 'scores.json'}")
         if importances is not None:
@@ -91,11 +92,10 @@ def evaluate(
         out.print(f"next: edp report {folder}")
 
     sentences = {"losses": lost, "tests": judged, "promise": promise, "situation_line": beyond}
-    facts = {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **sentences, **scores}
+    facts = {"folder": str(folder), **verdict_facts(verdict), **sentences, **scores}
     importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
     emit(as_json, facts | importance_json, show)
-    if beaten is not None:
-        raise typer.Exit(BEATEN)
+    end_with(verdict)
 
 
 def refuse_for_a_twin(run: Path, alone: bool, plain: bool) -> None:
@@ -146,7 +146,7 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
     """Judge a twin with a progress display, and print its scores."""
     from edp.cli.twin import ahead_table, coverage_table, score_table, situation_table
     from edp.evaluation.beyond import beyond_sentence
-    from edp.evaluation.guard import twin_beaten_by
+    from edp.evaluation.guard import twin_verdict
     from edp.storage import read_object
     from edp.workflows.twin import evaluate_twin
     from edp.workflows.twin.judge_twin import SCORES
@@ -161,11 +161,10 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
 
         folder = evaluate_twin(run, source, predictor, on_step)
     scores = read_object(folder / SCORES)
-    beaten = twin_beaten_by(scores["models"])
+    verdict = twin_verdict(scores["models"])
 
     def show() -> None:
-        if beaten is not None:
-            out.print(beaten.sentence(), style="bold red")
+        show_verdict(verdict)
         if note := beyond_sentence(scores["models"]["twin"].get("beyond", {})):
             out.print(note, style="bold")
         score_table(scores["models"])
@@ -174,9 +173,8 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
         out.print(f"scores in {folder / SCORES}")
         out.print(f"next: edp report {folder}")
 
-    emit(as_json, {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **scores}, show)
-    if beaten is not None:
-        raise typer.Exit(BEATEN)
+    emit(as_json, {"folder": str(folder), **verdict_facts(verdict), **scores}, show)
+    end_with(verdict)
 
 
 def run_evaluation(

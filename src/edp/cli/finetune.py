@@ -10,6 +10,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
 
@@ -63,6 +64,7 @@ def finetune(
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.report import read_transfer, write_transfer_page
+    from edp.report.transfer.facts import transfer_verdict
     from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec
     from edp.workflows.transfer import finetune as make
 
@@ -93,12 +95,16 @@ def finetune(
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 
+    verdict = transfer_verdict(facts)
+
     def show() -> None:
+        show_verdict(verdict)
         _tables(facts)
         out.print(f"report: {page}")
         out.print(f"next: edp evaluate {folder}, or edp export {folder} --to c --out exported")
 
-    emit(as_json, result | {"run": str(folder), "report": str(page)}, show)
+    emit(as_json, result | {"run": str(folder), "report": str(page)} | verdict_facts(verdict), show)
+    end_with(verdict)
 
 
 def _finetune_fleet(

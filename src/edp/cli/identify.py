@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import BEATEN, JsonFlag, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.twin import FitDisplay, score_table
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 
 if TYPE_CHECKING:
     from edp.workflows.identify import Identified
@@ -39,7 +40,7 @@ def identify(
     Example: `edp identify logs --out mine.toml --machine measured.toml`
     """
     from edp.config.twin import load_twin_experiment
-    from edp.evaluation.guard import machine_beaten_by
+    from edp.evaluation.guard import machine_verdict
     from edp.workflows.identify import identify as run_identify
 
     experiment = None
@@ -52,15 +53,14 @@ def identify(
             source_of(data, signal_map, repair), file, machine, experiment, run, display.on_event, display.on_step
         )
     numbers = [row.plain() for row in result.rows]
-    beaten = machine_beaten_by(result.scores)
+    verdict = machine_verdict(result.scores)
     facts = {
         "machine": str(file), "numbers": numbers, "models": result.scores, "notes": result.notes,
-        "beaten_by": None if beaten is None else beaten.label,
+        **verdict_facts(verdict),
     }  # fmt: skip
 
     def show() -> None:
-        if beaten is not None:
-            out.print(beaten.sentence(), style="bold red")
+        show_verdict(verdict)
         number_table(result)
         score_table(result.scores)
         for note in result.notes:
@@ -69,8 +69,7 @@ def identify(
         out.print(f"next: edp simulate data/mine --machine {file}")
 
     emit(as_json, facts, show)
-    if beaten is not None:
-        raise typer.Exit(BEATEN)
+    end_with(verdict)
 
 
 def number_table(result: Identified) -> None:

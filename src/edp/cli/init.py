@@ -42,10 +42,12 @@ def init(
 
     Example: `edp init logs/ --yes`
     """
+    from edp.storage.folders import check_kind
     from edp.workflows.proposal import propose, write_proposal
 
     if not yes and not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigError("edp init asks before it writes, and there is no terminal to ask on; give --yes")
+    check_kind(folder, what="edp init")
     with progress(as_json) as shown:
         proposal = propose(logs, LogDisplay(shown, Steps(as_json)).on_log)
     if not as_json:

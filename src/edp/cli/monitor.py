@@ -96,6 +96,7 @@ def fit(
         "doubtful": list(fitted.doubtful),
         "one_machine": fitted.one_machine,
         "promise": monitor.limit.sentence(),
+        "found_sizes": list(monitor.provenance.get("found_sizes", [])),
     }
 
     def show() -> None:
@@ -116,6 +117,8 @@ def show_fitted(fitted: FittedMonitor) -> None:
         out.print(f"'{name}' was left out: it lies far from all other healthy sessions; look into it")
     out.print(f"{len(monitor.residual_names)} residuals of {count_of(len(monitor.channels), 'channel')} are watched")
     out.print(monitor.limit.sentence())
+    for line in fitted.finds:
+        out.print(line)
     if fitted.one_machine:
         out.print(
             "its balances of flow know this machine's valves to 1 %: it belongs to this one machine and raises "
@@ -181,7 +184,10 @@ def run(
             out.print(f"logs with their alarms as events in {mdf}")
         if len(rows) > MOST_SHOWN:
             out.print(f"and {len(rows) - MOST_SHOWN:,} more")
-        out.print(f"{len(watched.alarms):,} alarms in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
+        count = f"{len(watched.alarms):,} alarms" if watched.alarms else "no alarm"
+        out.print(f"{count} in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
+        for line in watched.silence:
+            out.print(line)
         if target is not None:
             out.print(f"alarms in {target}; next: edp monitor report {target}")
 

@@ -117,7 +117,7 @@ def run(
         result = run_search(source, plan, study, resources, phase, callbacks)
         # Pictures take long; an unfinished study is drawn when it is asked for.
         page = _write_report(study, None, pictures=result.state == "finished")
-    emit(as_json, _facts(result) | {"report": str(page)}, lambda: _show(result, data, page))
+    emit(as_json, _facts(result) | {"report": str(page)}, lambda: _show(result, page))
 
 
 @app.command("status")
@@ -126,10 +126,12 @@ def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
 
     Example: `edp search status studies/first`
     """
+    from edp.storage.study_file import reading_parts
     from edp.workflows.search.study_log import look_at
 
     progress = look_at(study)
-    emit(as_json, progress, lambda: _show_status(progress))
+    with reading_parts(study):
+        emit(as_json, progress, lambda: _show_status(progress))
 
 
 @app.command("report")
@@ -231,7 +233,7 @@ def _facts(result: SearchResult) -> dict[str, Any]:
     }
 
 
-def _show(result: SearchResult, data: Path, page: Path) -> None:
+def _show(result: SearchResult, page: Path) -> None:
     out.print(f"study: {result.folder}, {result.state}; {count_of(result.trained, 'training')} now")
     out.print(f"report: {page}")
     if result.teacher is None:
@@ -239,10 +241,8 @@ def _show(result: SearchResult, data: Path, page: Path) -> None:
         return
     if result.networks:
         out.print(f"next: {_deploying(result)}")
-    out.print(
-        f"{'or' if result.networks else 'next'}: edp train {data} --config {result.teacher} --out runs/teacher (frozen "
-        "sessions stay frozen)"
-    )
+    data, word = result.source.path, "or" if result.networks else "next"
+    out.print(f"{word}: edp train {data} --config {result.teacher} --out runs/teacher (frozen sessions stay frozen)")
 
 
 def _deploying(result: SearchResult) -> str:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import BEATEN, JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
 from edp.storage.paths import full_path, is_file_at
 
@@ -47,7 +48,7 @@ def twin(
     Example: `edp twin data/m22 --out runs/twin`
     """
     from edp.config.twin import load_twin_experiment, with_budget
-    from edp.evaluation.guard import twin_beaten_by
+    from edp.evaluation.guard import twin_verdict
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
 
@@ -59,17 +60,16 @@ def twin(
         source = source_of(data, signal_map, repair)
         trained = train_twin(source, experiment, folder, display.on_event, display.on_step, workers, start)
     seconds = trained.bundle.provenance["seconds"]
-    beaten = twin_beaten_by(trained.scores)
+    verdict = twin_verdict(trained.scores)
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
-    facts["beaten_by"] = None if beaten is None else beaten.label
+    facts |= verdict_facts(verdict)
     facts["candidates"] = candidates = read_candidates(folder)
 
     if trained.bundle.ground is not None:
         facts["ground"] = trained.bundle.provenance.get("ground")
 
     def show() -> None:
-        if beaten is not None:
-            out.print(beaten.sentence(), style="bold red")
+        show_verdict(verdict)
         if candidates:
             candidate_table(candidates)
             out.print(f"chosen: {choice_sentence(candidates)}")
@@ -80,8 +80,7 @@ def twin(
         out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
 
     emit(as_json, facts, show)
-    if beaten is not None:
-        raise typer.Exit(BEATEN)
+    end_with(verdict)
 
 
 def show_trained(trained: TrainedTwin) -> None:
@@ -293,6 +292,10 @@ class FitDisplay:
     def on_event(self, event: FreeRunProgress) -> None:
         """How far it is."""
         error = "" if event.validation is None else f", free-run error {event.validation:.3g} deviations"
-        note = f"update {event.update}/{event.updates}, runs of {event.length_s:g} s{error}"
-        self.shown.update(self.bar, completed=event.update / event.updates, note=note)
-        self.steps.say(f"{self.what}: {note}, {duration(event.seconds_left)} left")
+        # A fit that goes on beyond its plan has no time left to state.
+        more = event.update > event.updates
+        count = f"{event.update}, more than the {event.updates} planned" if more else f"{event.update}/{event.updates}"
+        left = "" if more else f", {duration(event.seconds_left)} left"
+        note = f"update {count}, runs of {event.length_s:g} s{error}"
+        self.shown.update(self.bar, completed=min(1.0, event.update / event.updates), note=note)
+        self.steps.say(f"{self.what}: {note}{left}")

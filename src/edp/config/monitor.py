@@ -16,7 +16,7 @@ from edp.monitor.residuals.balances import BalancesSpec
 from edp.monitor.residuals.flow_balances import FlowBalancesSpec
 from edp.monitor.residuals.look_ahead import LookAheadSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
-from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
+from edp.settings.bounds import MIN_MINUTES, MOST_NAMES, SEED, above, between, check_bounds, check_count, integer, span
 from edp.settings.tree import SettingsTree, Table
 
 MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS}, what="settings")
@@ -61,7 +61,7 @@ class DictionarySpec:
             draws=integer(2, 100),
             before_s=span(0.0, 3600.0),
             after_s=span(20.0, 3600.0),
-            minutes=above(0.0, 1e5),
+            minutes=span(MIN_MINUTES, 1e5),
         )
         check_count("dictionary", "kinds", self.kinds, MOST_NAMES)
 
@@ -101,7 +101,7 @@ class MonitorExperiment:
             self,
             hours_per_false_alarm=above(0.0, 1e6),
             train_share=between(0.0, 1.0),
-            minutes=above(0.0, 1e5),
+            minutes=span(MIN_MINUTES, 1e5),
             seed=SEED,
         )
         check_count("monitor", "channels", self.channels, MOST_NAMES)

@@ -1,11 +1,24 @@
-"""Whether a simple baseline does better than a network or a twin after all, by the scores of held-out recordings."""
+"""The verdict on a model by its scores on held-out recordings: headline, first line and exit code come from it.
+
+The burden of proof is on the model. Its error is compared with that of the best reference (a baseline, a floor, what it
+was made from):
+
+* *worse*: the reference has less error; the exit code is `BEATEN`;
+* *better*: the model has less error, and the 95 % interval over recordings excludes zero;
+* *not distinguishable*: the model has less error, but the interval holds zero, or the recordings are too few for one.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
+
+import numpy as np
+
+from edp.stats.resampled import paired_t
 
 NETWORK = "network"
 TWIN = "twin"
@@ -23,16 +36,45 @@ LEAST = 1e-3
 """Share of error below which two models count as equal: rounding and threads make as much."""
 
 
+BEATEN = 6
+"""Exit code of the outcome *worse*."""
+FEWEST = 3
+"""Recordings from which an interval is stated."""
+
+
+class ErrorOutcome(StrEnum):
+    """What a comparison shows."""
+
+    BETTER = "better"
+    OPEN = "not distinguishable"
+    WORSE = "worse"
+
+
+def outcome_of(change: float, high: float | None) -> ErrorOutcome:
+    """Return what a relative change of the error against a reference shows.
+
+    Args:
+        change: error over that of the reference, less one.
+        high: upper end of the 95 % interval of the change; None where there are too few recordings for one.
+    """
+    if change > LEAST:
+        return ErrorOutcome.WORSE
+    return ErrorOutcome.BETTER if high is not None and high < 0.0 else ErrorOutcome.OPEN
+
+
 @dataclass(frozen=True)
-class Beaten:
-    """A baseline with less error than the network, or a floor with less than the twin.
+class ErrorVerdict:
+    """A model against its best reference.
 
     Attributes:
-        label: how tables call it.
-        less: by which share its error is less, over all outputs and horizons.
-        outputs: targets on which it has less error, over all horizons.
-        judged: what it beats.
-        advice: what to do instead.
+        label: how tables call the reference.
+        less: share by which the error of the reference is less, over all outputs and horizons; negative where the
+            model has less.
+        outputs: targets on which the reference has less error, over all horizons.
+        judged: what is judged.
+        advice: what to do where it is worse.
+        interval: 95 % interval, over recordings, of the relative change of the model's error; None for too few.
+        recordings: number of recordings that were compared.
     """
 
     label: str
@@ -40,18 +82,51 @@ class Beaten:
     outputs: tuple[str, ...]
     judged: str = "network"
     advice: str = ADVICE
+    interval: tuple[float, float] | None = None
+    recordings: int = 0
+
+    @property
+    def change(self) -> float:
+        """Error of the model over that of the reference, less one."""
+        return 1.0 / (1.0 - self.less) - 1.0 if self.less < 1.0 else math.inf
+
+    @property
+    def outcome(self) -> ErrorOutcome:
+        """What the comparison shows."""
+        return outcome_of(self.change, None if self.interval is None else self.interval[1])
+
+    @property
+    def exit_code(self) -> int:
+        """With which a command ends that judged this."""
+        return BEATEN if self.outcome is ErrorOutcome.WORSE else 0
 
     def sentence(self) -> str:
-        """For the first line of what a person reads."""
-        where = f" (on {', '.join(self.outputs)})" if self.outputs else ""
-        return (
-            f"On the held-out recordings {self.label} has {100 * self.less:.1f} % less error than the "
-            f"{self.judged}{where}: do not use this {self.judged}; {self.advice}."
-        )
+        """Return the first line of what a person reads, in the terminal and on the page."""
+        if self.outcome is ErrorOutcome.WORSE:
+            where = f" (on {', '.join(self.outputs)})" if self.outputs else ""
+            return (
+                f"On the held-out recordings {self.label} has {100 * self.less:.1f} % less error than the "
+                f"{self.judged}{where}: do not use this {self.judged}; {self.advice}."
+            )
+        gain = f"{-100 * self.change:.1f} % less error"
+        who, other = f"On the held-out recordings the {self.judged}", f"{self.label}, the best of the others"
+        if self.interval is None:
+            count = self.recordings
+            why = (
+                f"{count} recording{'s are' if count > 1 else ' is'} too few for an interval"
+                if count
+                else "no interval"
+            )
+            return f"{who} has {gain} than {other} ({why}: chance is not excluded)."
+        low, high = (f"{100 * end:+.1f}" for end in self.interval)
+        reach = f"95 % interval of the change over {self.recordings} recordings: {low} to {high} %"
+        if self.outcome is ErrorOutcome.BETTER:
+            return f"{who} has {gain} than {other} ({reach})."
+        return f"{who} is not distinguishable from {other}: {gain} ({reach})."
 
 
-def beaten_by(scores: Mapping[str, Any], minutes: float | None = None) -> Beaten | None:
-    """The baseline that beats the network by most; None where none does.
+def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> ErrorVerdict | None:
+    """Return the verdict on a network against the baseline with the least error; None without a baseline.
 
     Errors are compared by the geometric mean of the ratio of root-mean-square errors over horizons and targets, so
     that no unit counts for more than another.
@@ -77,10 +152,43 @@ def beaten_by(scores: Mapping[str, Any], minutes: float | None = None) -> Beaten
         if finite:
             mean = sum(finite) / len(finite)
             lost = tuple(target for target, value in by_target.items() if value > LEAST)
-            better.append((mean, Beaten(str(model["label"]), 1.0 - math.exp(-mean), lost, advice=advice)))
+            logs = _by_recording(models[NETWORK], model, scores)
+            interval = _interval(logs, mean)
+            label, less = str(model["label"]), 1.0 - math.exp(-mean)
+            better.append((mean, ErrorVerdict(label, less, lost, NETWORK, advice, interval, len(logs))))
     # Logarithms: halving one target's error and doubling another's cancel out.
-    mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
-    return worst if mean > LEAST else None
+    return max(better, key=lambda entry: entry[0], default=(0.0, None))[1]
+
+
+def beaten_by(scores: Mapping[str, Any], minutes: float | None = None) -> ErrorVerdict | None:
+    """Return the verdict of `network_verdict` where it is *worse*, else None."""
+    return _if_worse(network_verdict(scores, minutes))
+
+
+def _if_worse(verdict: ErrorVerdict | None) -> ErrorVerdict | None:
+    return verdict if verdict is not None and verdict.outcome is ErrorOutcome.WORSE else None
+
+
+def _by_recording(network: Mapping[str, Any], model: Mapping[str, Any], scores: Mapping[str, Any]) -> list[float]:
+    """Logarithms of the ratio of errors, one per recording that both have."""
+    ours, theirs = network.get("recordings", {}), model.get("recordings", {})
+    logs = []
+    for name in ours:
+        pair = ({"overall": ours[name]}, {"overall": theirs.get(name, {})})
+        values = [_logarithm(*pair, target["name"], scores["task"]["horizons"]) for target in scores["targets"]]
+        finite = [value for value in values if math.isfinite(value)]
+        if finite:
+            logs.append(sum(finite) / len(finite))
+    return logs
+
+
+def _interval(logs: list[float], mean: float) -> tuple[float, float] | None:
+    """95 % interval of the relative change over recordings, the pooled change included; None for too few."""
+    if len(logs) < FEWEST or len(set(logs)) < 2:
+        return None
+    ends = paired_t(np.array(logs)).interval()
+    # Long recordings count for more in the pooled error than in the mean over recordings: the wider statement holds.
+    return math.expm1(min(float(ends[0]), mean)), math.expm1(max(float(ends[1]), mean))
 
 
 @dataclass(frozen=True)
@@ -122,8 +230,13 @@ def lost_outputs(scores: Mapping[str, Any]) -> list[LostOutput]:
     return sorted(lost, key=lambda output: -output.less)
 
 
-def twin_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
-    """The floor that beats the twin by most on free runs; None where none does.
+def twin_beaten_by(models: Mapping[str, Any]) -> ErrorVerdict | None:
+    """Return the verdict of `twin_verdict` where it is *worse*, else None."""
+    return _if_worse(twin_verdict(models))
+
+
+def twin_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
+    """Return the verdict on a twin against the floor with the least error on free runs; None without a floor.
 
     Compared is the geometric mean, over actuators, of the ratios of the velocities' errors and of the strokes' at each
     time: a network that only follows for a second, or drifts for a minute, is seen by both.
@@ -131,21 +244,21 @@ def twin_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
     Args:
         models: scores by name, as ``free_run.json`` has them; the twin's is ``twin``.
     """
-    return _beaten_on_free_runs(models, TWIN, TWIN, TWIN_ADVICE)
+    return _verdict_on_free_runs(models, TWIN, TWIN, TWIN_ADVICE)
 
 
-def machine_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
-    """The guess, or the static map, that beats an identified machine by most on free runs; None where none does.
+def machine_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
+    """Return the verdict on an identified machine against the guess and the static map on free runs.
 
     Args:
         models: scores by name, as `edp.workflows.identify.identify` gives them. The grey box is what the machine was
             made of, not what stands in its place.
     """
     rivals = {name: scores for name, scores in models.items() if name != GREY}
-    return _beaten_on_free_runs(rivals, MACHINE, "machine file", MACHINE_ADVICE)
+    return _verdict_on_free_runs(rivals, MACHINE, "machine file", MACHINE_ADVICE)
 
 
-def _beaten_on_free_runs(models: Mapping[str, Any], judged: str, what: str, advice: str) -> Beaten | None:
+def _verdict_on_free_runs(models: Mapping[str, Any], judged: str, what: str, advice: str) -> ErrorVerdict | None:
     own, better = _free_run_errors(models[judged]), []
     for name, scores in models.items():
         theirs = _free_run_errors(scores)
@@ -158,9 +271,8 @@ def _beaten_on_free_runs(models: Mapping[str, Any], judged: str, what: str, advi
         if ratios:
             lost = tuple(name for name, logs in by_actuator.items() if sum(logs) > LEAST * len(logs))
             mean = sum(ratios) / len(ratios)
-            better.append((mean, Beaten(name, 1.0 - math.exp(-mean), lost, what, advice)))
-    mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
-    return worst if mean > LEAST else None
+            better.append((mean, ErrorVerdict(name, 1.0 - math.exp(-mean), lost, what, advice)))
+    return max(better, key=lambda entry: entry[0], default=(0.0, None))[1]
 
 
 def free_run_error(scores: Mapping[str, Any], reference: Mapping[str, Any]) -> float:

@@ -15,13 +15,14 @@ from edp.data.prepared import Prepared
 from edp.data.scaling import feature_columns
 from edp.data.series import Series
 from edp.data.spread_rows import spread_series
+from edp.errors import ConfigError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
 from edp.evaluation.ruler import Numbered, Ruler
 from edp.evaluation.scores_file import nearest_to_shown
 from edp.evaluation.situation import situation_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_groups, streamed
-from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
+from edp.settings.bounds import MOST_TICKS, SEED, check_bounds, integer
 from edp.stats.metrics import weighted_interval_score
 from edp.stats.sketch import MOST_EXACT
 from edp.storage.memory import check_setting
@@ -36,7 +37,7 @@ MOST_VALIDATED = 1 << 20
 PART_TICKS, MOST_PARTS = 1 << 17, 64
 """Ticks of a part of the test recordings that a worker judges the network on, 22 min at 100 Hz, which take far longer
 than to hand them out; and how many parts there are at most, as each brings back megabytes of what it measured."""
-SKIP = integer(0, MOST_ROWS)
+SKIP = integer(0, MOST_TICKS)
 """Ticks that are not scored: a slice that begins with a negative one would score the last ticks alone."""
 
 
@@ -187,6 +188,20 @@ def _groups_of_part(data: Prepared, number: int) -> list[list[int]]:
     middles = np.cumsum(ticks) - ticks / 2
     part_of = np.minimum(middles / ticks.sum() * network_parts(data), network_parts(data) - 1).astype(int)
     return [group for group, part in zip(groups, part_of, strict=True) if part == number]
+
+
+def check_scored(data: Prepared, spec: JudgeSpec) -> None:
+    """Refuse a stated `skip` that leaves no sample to evaluate, before a training begins.
+
+    Raises:
+        ConfigError: no stretch of the test part is longer.
+    """
+    longest = max((part.samples for part in data.test), default=0) - data.task.max_horizon
+    if spec.skip is not None and data.test and spec.skip >= longest:
+        raise ConfigError(
+            f"judge.skip: got {spec.skip:,}, expected fewer than the {longest:,} samples of the longest test stretch "
+            "that can be evaluated; give a smaller one, or longer recordings"
+        )
 
 
 def first_scored(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> int:

@@ -14,7 +14,9 @@ from pathlib import Path, PurePosixPath
 
 from edp.errors import BusyError, StorageError
 from edp.storage import hold, make_folder, storage_error, write_bytes
+from edp.storage.folders import check_kind
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_of
+from edp.storage.writing import TEMPORARY
 
 LIST = "export.sha256"
 UNFINISHED = "export.unfinished"
@@ -22,8 +24,6 @@ UNFINISHED = "export.unfinished"
 LONGEST_LIST = 1_000_000
 """Bytes of a list that are read; those of the largest export here are 5,000."""
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_./-]+)")
-_TEMPORARY = re.compile(r"\.[A-Za-z0-9_.-]+\.[a-z0-9_]{8}\.tmp")
-"""Names of files that `edp.storage` has not finished."""
 Listed = dict[str, set[str]]
 
 
@@ -42,6 +42,7 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
         StorageError: the folder cannot be written, or a file of the export before was changed since and is not among
             the new ones; then nothing was changed.
     """
+    check_kind(folder, "export", what="edp export")
     path = make_folder(folder)
     with _held(path):
         # The hash is of the content in memory, not of what a full disk made of it.
@@ -158,7 +159,7 @@ def _clean(path: Path, every: Mapping[str, object]) -> None:
     for folder in {path, *((path / file).parent for file in every)}:
         if is_folder_at(folder) and not (folder != path and _linked(path, folder)):
             for rest in entries_of(folder):
-                if _TEMPORARY.fullmatch(rest.name) and is_file_at(rest) and not is_link_at(rest):
+                if TEMPORARY.fullmatch(rest.name) and is_file_at(rest) and not is_link_at(rest):
                     _remove(rest)
 
 

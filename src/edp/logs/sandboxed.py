@@ -51,14 +51,17 @@ def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) 
     """
     all_layers = are_layers_required()
     libraries = list(getattr(chosen, "libraries", ()))
-    channel = open_channel(WORKER, [type(chosen).__module__], path, libraries)
+    name = FORMATS.name_of(chosen)
+    # The module that registered the format, which for a plug-in may be another one than that of its class.
+    modules = list(dict.fromkeys([type(chosen).__module__, FORMATS.module_of(name) or type(chosen).__module__]))
+    channel = open_channel(WORKER, modules, path, libraries)
     channel.size = size
     try:
         folder = os.getcwd()
     except FileNotFoundError:
         # The current folder was removed: relative paths have no meaning, absolute ones do.
         folder = os.sep
-    order = {"path": str(path), "folder": folder, "size": size, "format": FORMATS.name_of(chosen)}
+    order = {"path": str(path), "folder": folder, "size": size, "format": name}
     channel.send(order | {"map": plain_map(signal_map), "all_layers": all_layers})
     log = _Log(path, channel)
     note_layers(path, log.answer().get("layers"))

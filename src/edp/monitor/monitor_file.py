@@ -34,6 +34,7 @@ from edp.training.bundle import (
     load_bundle,
     read_arrays,
     save_bundle,
+    with_plugins,
     write_arrays,
 )
 from edp.training.twin_bundle import HEADER as TWIN_HEADER
@@ -88,7 +89,7 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
         remove_dictionary(path)
     else:
         save_dictionary(monitor.diagnosis, path)
-    write_json(path / HEADER, header)
+    write_json(path / HEADER, with_plugins(header))
     _remove_old(path, entry["file"], written)
     return path
 

@@ -36,6 +36,23 @@ USUAL_KINDS = {"head": "mlp"}
 NETWORK = SettingsTree(NETWORK_PARTS, USUAL_KINDS)
 
 
+def unknown_parts(plain: Any) -> list[str]:
+    """Return a sentence for each kind of a plain network spec that its registry does not have."""
+    sentences: list[str] = []
+    if not isinstance(plain, Mapping):
+        return sentences
+    for name, value in plain.items():
+        for table in value if isinstance(value, list) else [value]:
+            kind = table.get("kind") if isinstance(table, Mapping) else None
+            if name in NETWORK_PARTS and isinstance(kind, str):
+                try:
+                    _ = NETWORK_PARTS[name][kind]
+                except ConfigError as error:
+                    sentences.append(str(error))
+            sentences += unknown_parts(table)
+    return sentences
+
+
 def model_to_plain(spec: ModelSpec) -> Table:
     """A network spec as JSON values; options that are None are left out."""
     plain: Table = NETWORK.plain(spec)

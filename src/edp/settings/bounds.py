@@ -26,6 +26,8 @@ MOST_HORIZONS = 1_000
 # Rows or ticks: 115 days at 100 Hz, more than any recording has.
 MOST_ROWS = 1_000_000_000
 MOST_EPOCHS = 1_000_000
+# Of processor time: six milliseconds, in which nothing is trained, and less is a slip of the pen.
+MIN_MINUTES = 1e-4
 MOST_UPDATES = 1_000_000_000
 MOST_THREADS = 4_096
 # Of NumPy's RandomState, which Optuna and scikit-learn draw from: 32 bits.

@@ -13,7 +13,7 @@ import numpy as np
 from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.sandbox.helpers import Helpers, Job, Result
-from edp.settings.bounds import above, check_bounds, integer, span
+from edp.settings.bounds import MIN_MINUTES, above, check_bounds, integer, span
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
@@ -37,7 +37,7 @@ MOST_RECORDINGS, MOST_MINUTES, MOST_MACHINES, MOST_SEED = 100_000, 1e6, 1000, 2*
 """Bounds of one data set; the plan of the most recordings takes some seconds."""
 BOUNDS = {
     "recordings": integer(1, MOST_RECORDINGS),
-    "minutes": above(0.0, MOST_MINUTES),
+    "minutes": span(MIN_MINUTES, MOST_MINUTES),
     "seed": integer(0, MOST_SEED - 1),
     "family": integer(0, MOST_MACHINES),
     "scatter": above(0.0, WIDEST),

@@ -9,6 +9,7 @@ import platform
 import re
 import stat
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -61,6 +62,31 @@ def hold(path: str | Path) -> IO[str]:
         stream.close()
         raise storage_error(lock, error, "write") from error
     return stream
+
+
+@contextlib.contextmanager
+def holding(path: str | Path, what: str) -> Iterator[None]:
+    """Hold a lock file while a command works, and remove the file afterwards.
+
+    Args:
+        path: of the lock file.
+        what: what it protects, for the message.
+
+    Raises:
+        BusyError: another process holds it; nothing was changed.
+        StorageError: the file cannot be written, or is no lock file.
+    """
+    try:
+        stream = hold(path)
+    except BusyError as error:
+        holder = str(error).rpartition("process ")[2]
+        raise BusyError(
+            f"{what} is in use by process {holder}; nothing was changed. Wait for it, or choose another folder"
+        ) from None
+    try:
+        yield
+    finally:
+        release(path, stream)
 
 
 def still_ours(path: str | Path, stream: IO[str]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sys
@@ -23,8 +24,20 @@ if sys.platform == "win32":  # pragma: no cover - see tests/security/test_portab
     def lock(stream: IO[str], wait: bool = False, shared: bool = False) -> None:
         """Lock an open file for this process; closing it, or the end of the process, frees it."""
         lock_region(msvcrt, stream, wait)
+
+    def lock_handle(handle: int) -> None:
+        """Refuse: files that are being written are not held on Windows."""
+        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
 else:
     import fcntl
+
+    def lock_handle(handle: int) -> None:
+        """Lock an open file or folder for this process; closing the handle frees it.
+
+        Raises:
+            OSError: another process holds it, or the file system has no locks.
+        """
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def lock(stream: IO[str], wait: bool = False, shared: bool = False) -> None:
         """Lock an open file for this process; closing it, or the end of the process, frees it.
@@ -39,6 +52,12 @@ else:
         """
         kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
         fcntl.flock(stream, kind | (0 if wait else fcntl.LOCK_NB))
+
+
+def hold_handle(handle: int) -> None:
+    """Show that this process is writing a file; without effect where the system or the file system has no locks."""
+    with contextlib.suppress(OSError):
+        lock_handle(handle)
 
 
 def lock_region(msvcrt_module: object, stream: IO[str], wait: bool) -> None:

@@ -35,10 +35,14 @@ _MARKS: Mapping[str, str] = {
     "auto.json": "auto",
     "foundation.json": "pretraining",
     "adaptation.json": "adaptation",
+    "compression.json": "compression",
+    "alarms.jsonl": "monitor run",
 }
 """What only one kind of run has, in the order in which it decides."""
 _HEADERS = ("bundle/bundle.json", "twin/twin.json", "controller/controller.json")
 """Of what a run made, with its arrays beside it."""
+_WHOLE = ("search", "control", "compression", "monitor run")
+"""Kinds of runs whose mark is written at their end, so that it makes them finished."""
 _NETWORKS = ("network", "auto", "pretraining", "adaptation")
 """Kinds of runs that are finished by a bundle."""
 _RUN = ("run.json", "status.json", "provenance.json", _STUDY, "auto.json")
@@ -123,9 +127,11 @@ def _run(path: Path) -> ListedRun:
     kind = next((kind for mark, kind in _MARKS.items() if is_file_at(path / mark)), "network")
     damaged: list[str] = []
     status, provenance, scores = (_part(path / f"{name}.json", damaged) for name in ("status", "provenance", "scores"))
+    # Before its result is there, a run has only what its status says.
+    kind = str(status.get("kind", kind)) if kind == "network" and status.get("kind") in _MARKS.values() else kind
     state = str(status.get("status", ""))
     if state not in ("finished", "diverged"):
-        state = "running" if held_by(path / ".lock") else "finished" if kind in ("search", "control") else "stopped"
+        state = "running" if held_by(path / ".lock") else "finished" if kind in _WHOLE else "stopped"
     data = provenance.get("data")
     source = str(data.get("source", "")) if isinstance(data, dict) else ""
     when = str(status.get("time") or provenance.get("created") or _touched(path))

@@ -18,14 +18,17 @@ from typing import Any
 
 from edp import __version__
 from edp.errors import BusyError, StorageError
-from edp.storage.locks import check_held, hold
+from edp.storage.folders import check_kind
+from edp.storage.locks import check_held, held_by, hold
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
 from edp.storage.reading import object_with, read_object
 from edp.storage.writing import make_folder, remove_unfinished, write_bytes, write_json
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
 """Libraries whose versions can change a result."""
-IDENTITY = "run.json"
+IDENTITY, STATUS = "run.json", "status.json"
+ENDED = ("finished", "diverged")
+"""States in which a run stays."""
 LEFT = (".lock", "config.toml")
 """What a run that was killed before it was bound to its folder leaves there."""
 PARTS = "parts"
@@ -60,10 +63,11 @@ class RunFolder:
 
     Raises:
         BusyError: another process holds it.
-        StorageError: the folder cannot be made.
+        StorageError: the folder cannot be made, or is one of another kind, such as a store.
     """
 
     def __init__(self, path: str | Path) -> None:
+        check_kind(path, "run", "study", "fleet", what="a run")
         self.path = make_folder(path)
         try:
             self._lock = hold(self.path / ".lock")
@@ -111,11 +115,11 @@ class RunFolder:
     def write_status(self, status: str, **facts: Any) -> None:
         """Say where the run stands: ``running``, ``finished`` or ``diverged``, with facts that fit into JSON."""
         check_held(self.file(".lock"), self._lock)
-        write_json(self.file("status.json"), {"status": status, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
+        write_json(self.file(STATUS), {"status": status, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
 
     def status(self) -> dict[str, Any]:
         """Where the run stands; empty where nothing was written yet."""
-        status_file = self.file("status.json")
+        status_file = self.file(STATUS)
         return read_object(status_file, ("status", "time")) if is_there(status_file) else {}
 
     def remove_parts(self) -> None:
@@ -127,6 +131,25 @@ class RunFolder:
         """Write all epochs so far, a JSON line each."""
         check_held(self.file(".lock"), self._lock)
         write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def unfinished_text(folder: str | Path) -> str:
+    """Return what to say about a run whose result is not there yet; empty where no unfinished run is in the folder.
+
+    Every command that opens a run and misses the result says this.
+
+    Raises:
+        StorageError: the status of the run is damaged.
+    """
+    path = Path(folder)
+    started = is_file_at(path / IDENTITY) or all(is_file_at(path / name) for name in LEFT)
+    status = read_object(path / STATUS, ("status",)) if is_file_at(path / STATUS) else {}
+    if not started or status.get("status") in ENDED:
+        return ""
+    holder = held_by(path / ".lock")
+    state = "it was stopped" if holder is None else f"process {holder} is at work"
+    todo = "give the command that began it again to continue" if holder is None else "wait until it ends"
+    return f"'{path}' holds a run that is not finished ({state}); {todo}"
 
 
 def check_free(path: str | Path, what: str) -> None:
@@ -185,7 +208,10 @@ def read_provenance(folder: str | Path) -> dict[str, Any]:
     """
     file = Path(folder) / "provenance.json"
     if not is_file_at(file):
-        raise StorageError(f"'{folder}' is not a run folder: it has no {file.name}; give the folder of edp train")
+        raise StorageError(
+            unfinished_text(folder)
+            or f"'{folder}' is not a run folder: it has no {file.name}; give the folder of edp train"
+        )
     provenance = read_object(file, ("data", "seconds"))
     data = object_with(provenance["data"], ("source", "reader", "digest"), f"'{file}', data,")
     reader = object_with(data["reader"], ("path",), f"'{file}', data.reader,")

@@ -18,9 +18,14 @@ _unsealed: dict[str, None] = {}
 
 def content_digest(content: Mapping[str, Any]) -> str:
     """Return the hash of an object without its hash; what is in it and in which order lists stand is covered."""
-    # One round through JSON: the hash is over what a reader will see, tuples as lists.
-    plain = json.loads(json.dumps({key: value for key, value in content.items() if key != HASH}, allow_nan=False))
-    return digest_of_bytes(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode())
+    # One round through JSON: the hash is over what a reader will see, names of all kinds as text.
+    return _digest_of_parsed(json.loads(json.dumps(dict(content), allow_nan=False)))
+
+
+def _digest_of_parsed(content: Mapping[str, Any]) -> str:
+    """Return the hash of an object that came from JSON: an index of a million entries is not copied once more."""
+    rest = {key: value for key, value in content.items() if key != HASH}
+    return digest_of_bytes(json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False).encode())
 
 
 def digest_of_bytes(data: bytes) -> str:
@@ -50,7 +55,7 @@ def unsealed(content: Any, where: str, error: type[Exception]) -> Any:
         if len(_unsealed) < MAX_UNSEALED:
             _unsealed[where] = None
         return content
-    if content[HASH] != content_digest(content):
+    if content[HASH] != _digest_of_parsed(content):
         raise error(
             f"{where} was changed since EDP wrote it: its content does not match its hash ({HASH}); restore it from a "
             "copy, or give the command that wrote it again"

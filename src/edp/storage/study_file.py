@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from edp.errors import StorageError
+from edp.errors import StorageError, brief
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.reading import read_json
 
@@ -35,6 +36,22 @@ def read_study(path: str | Path) -> Mapping[str, Any]:
     check_study(study, str(file))
     content: Mapping[str, Any] = study
     return content
+
+
+@contextmanager
+def reading_parts(folder: str | Path) -> Iterator[None]:
+    """Turn a part of a study that is missing or of another kind into one message.
+
+    Raises:
+        StorageError: a part of the study is missing, or of another kind.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise StorageError(
+            f"'{folder}' is damaged: its {FILE} lacks a part or holds another kind of value ({brief(error)}); "
+            "call `edp search` on the study again, which writes it anew"
+        ) from error
 
 
 def check_study(study: Any, where: str = FILE) -> None:

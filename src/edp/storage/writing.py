@@ -5,15 +5,17 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import secrets
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
-from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at
-from edp.storage.portable import BINARY, QUIETLY
+from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_at
+from edp.storage.portable import BINARY, NO_LINK, QUIETLY, hold_handle, lock_handle
 from edp.storage.seals import sealed
 
 
@@ -56,6 +58,42 @@ def check_writable(folder: str | Path) -> Path:
     return path
 
 
+TEMPORARY = re.compile(r"\..{0,80}\.(?:[0-9a-f]{12}|[a-z0-9_]{8})\.tmp", re.DOTALL)
+"""Names of files and folders that are not finished, also of those of earlier versions."""
+
+
+_cleaned: set[str] = set()
+"""Folders in which this process has looked for what killed processes left."""
+LEFT_AFTER_S = 60.0
+"""Age of an unfinished file before another process may remove it: by then its writer holds it, or is gone."""
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove unfinished files and folders whose writers were killed; once for a folder and process.
+
+    A writer holds what it writes; what can be locked has no writer any more. Windows holds nothing here, so that it
+    removes nothing.
+    """
+    name = os.path.abspath(folder)
+    if name in _cleaned or os.name == "nt":
+        return
+    _cleaned.add(name)
+    with contextlib.suppress(StorageError):  # a folder that may be written and not be listed
+        for rest in entries_of(folder, ".*.tmp"):
+            if TEMPORARY.fullmatch(rest.name) is None or is_link_at(rest):
+                continue
+            with contextlib.suppress(OSError):
+                status = status_at(rest, follow=False)
+                if status is None or time.time() - status.st_mtime < LEFT_AFTER_S:
+                    continue
+                handle = os.open(rest, os.O_RDONLY | QUIETLY | NO_LINK)
+                try:
+                    lock_handle(handle)
+                    shutil.rmtree(rest) if is_folder_at(rest) else rest.unlink()
+                finally:
+                    os.close(handle)
+
+
 def _temporary(target: Path) -> tuple[int, str]:
     """A new file beside `target`, with the rights that the user's umask leaves to any new file."""
     while True:
@@ -76,14 +114,19 @@ def replacing(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     make_folder(target.parent)
     temporary: Path | None = None
+    handle = -1
     try:
+        _remove_left(target.parent)
         handle, name = _temporary(target)
-        os.close(handle)
         temporary = Path(name)
+        hold_handle(handle)
         yield temporary
         with temporary.open("rb+") as stream:
             # Before the rename: after a loss of power the new name must not show an empty file.
             os.fsync(stream.fileno())
+        if os.name == "nt":
+            os.close(handle)  # Windows renames no open file
+            handle = -1
         temporary.replace(target)
         temporary = None
     except IsADirectoryError as error:
@@ -93,8 +136,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise storage_error(target, error, "write") from error
     finally:
+        if handle >= 0:
+            os.close(handle)
         if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # the folder may be gone; the error that is under way says more
+                temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -110,8 +156,13 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     target = Path(path).absolute()
     make_folder(target.parent)
     temporary = target.parent / f".{target.name[:80]}.{secrets.token_hex(6)}.tmp"
+    handle = -1
     try:
+        _remove_left(target.parent)
         temporary.mkdir()
+        if os.name != "nt":
+            handle = os.open(temporary, os.O_RDONLY | QUIETLY)
+            hold_handle(handle)
         yield temporary
         if os.name == "nt" and is_folder_at(target):
             target.rmdir()  # Windows renames onto nothing that is there
@@ -119,6 +170,8 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise storage_error(target, error, "write") from error
     finally:
+        if handle >= 0:
+            os.close(handle)
         shutil.rmtree(temporary, ignore_errors=True)
 
 

@@ -26,12 +26,14 @@ from edp.ir.rls import Adaptation
 from edp.ir.w8a16 import Formats
 from edp.ir.w8a16.quantise import weights_of
 from edp.networks.integer import IntegerPredictor
-from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain
+from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain, unknown_parts
 from edp.networks.predictor import Predictor
+from edp.registry import missing_parts, origins_in
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, write_bytes, write_json
 from edp.storage.headers import ARRAYS_BYTES, read_header
-from edp.storage.paths import entries_of, is_entry_at, is_file_at
+from edp.storage.paths import entries_of, is_entry_at
+from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 SCHEMA = 8
@@ -43,7 +45,7 @@ UNHASHED = {2: SCHEMA, 3: INTEGER_SCHEMA, 4: ADAPTED_SCHEMA}
 """Schemas from before the header had a hash, and what they became."""
 REWORDED = {5: SCHEMA, 6: INTEGER_SCHEMA, 7: ADAPTED_SCHEMA}
 """Schemas with the keys `lesson` for ``strategy`` and `rest` for ``dead_zone``, and what they became."""
-HEADER = "bundle.json"
+HEADER, PLUGINS = "bundle.json", "plugins"
 ARRAYS = ("weights", "integers", "adaptation")
 """Beginnings of the names of a bundle's files of arrays."""
 MOST_RATE_HZ, MOST_BITS = 1e6, 64
@@ -145,7 +147,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
-    write_json(path / HEADER, header)
+    write_json(path / HEADER, with_plugins(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken bundle.
     for old in (
         file for what in ("weights", "integers", "adaptation") for file in entries_of(path, f"{what}-*.safetensors")
@@ -180,14 +182,29 @@ def load_bundle(folder: str | Path) -> Bundle:
         header = _read_header(path)
         _check_schema(header, path)
         check_hash(header, path / HEADER)
+        if unknown := unknown_parts(header["model"]):
+            raise BundleError(f"bundle '{path}': {'; '.join(unknown)}")
         return _assembled(header, path)
 
 
+def with_plugins(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a header with the plug-ins whose parts it names."""
+    plugins = origins_in(header)
+    return {**header, PLUGINS: plugins} if plugins else dict(header)
+
+
 def check_hash(header: Mapping[str, Any], file: Path) -> None:
-    """Refuse a header that its hash does not fit."""
+    """Refuse a header that its hash does not fit, and one with parts of plug-ins that are not registered here.
+
+    Raises:
+        BundleError: one of both; the message names the package of a part.
+    """
     # The hash protects against damage and stray edits, not against an attacker: it has no key.
     if header.get(HASH) != content_digest(header):
         raise BundleError(f"'{file}' does not match its hash: it was cut off or changed by hand; restore the bundle")
+    built = {key: value for key, value in header.items() if key not in ("provenance", "scores")}
+    if missing := missing_parts(header.get(PLUGINS), built):
+        raise BundleError(f"'{file}': {'; '.join(missing)}")
 
 
 def upgrade_bundle(folder: str | Path) -> Path:
@@ -209,7 +226,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
         upgraded = _reworded(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
         _assembled(upgraded, path)
-    write_json(path / HEADER, upgraded)
+    write_json(path / HEADER, with_plugins(upgraded))
     return path
 
 
@@ -233,9 +250,8 @@ def _bundle_folder(folder: str | Path) -> Path:
     if is_entry_at(path / "twin" / "twin.json"):
         raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
     if not is_entry_at(path / HEADER):
-        if is_file_at(Path(path) / "run.json"):
-            raise BundleError(f"'{path}' holds a training that is not finished; give the same edp train again to go on")
-        raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
+        missing = f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote"
+        raise BundleError(unfinished_text(path) or missing)
     return path
 
 

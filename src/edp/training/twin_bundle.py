@@ -23,8 +23,9 @@ from edp.storage import make_folder, object_with, write_json
 from edp.storage.headers import read_header
 from edp.storage.memory import check_setting
 from edp.storage.paths import entries_of, is_entry_at
+from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH
-from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, write_arrays
+from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, with_plugins, write_arrays
 
 SCHEMA = 2
 GROUNDED = 3
@@ -105,7 +106,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     }
     if bundle.ground is not None:
         header["ground"] = {"kind": GROUNDS.name_of(bundle.ground), **bundle.ground.plain()}
-    write_json(path / HEADER, header)
+    write_json(path / HEADER, with_plugins(header))
     # Old files go only after the rename; a kill in between leaves spare files, not a broken twin.
     for old in entries_of(path, "weights-*.safetensors"):
         if old.name != entry["file"]:
@@ -151,7 +152,8 @@ def load_twin(folder: str | Path) -> TwinBundle:
     """
     path = _twin_folder(folder)
     if not is_entry_at(path / HEADER):
-        raise BundleError(f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote")
+        missing = f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote"
+        raise BundleError(unfinished_text(path) or missing)
     with as_damage(path):
         header = read_header(path / HEADER, ("schema",))
         schema = header["schema"]

@@ -22,6 +22,7 @@ from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.signals import Kind
 from edp.storage import make_folder, write_bytes
+from edp.storage.folders import check_kind
 from edp.storage.paths import is_file_at, is_link_at, is_there, status_of
 from edp.workflows.proposal_files import (
     DATA,
@@ -60,6 +61,7 @@ class LogsProposal:
         inputs: channels that command, where no kind tells it; `edp inspect` sees their coverage only if they are named.
         repairs: what training would refuse unless it is repaired, as ``--repair`` takes it.
         notes: what else a person should know.
+        recordings: number of recordings that the commands read.
     """
 
     source: Path
@@ -72,6 +74,7 @@ class LogsProposal:
     inputs: tuple[str, ...]
     repairs: tuple[str, ...]
     notes: tuple[str, ...]
+    recordings: int
 
     def commands(self, folder: Path) -> list[str]:
         """The commands that come next, in order."""
@@ -96,7 +99,9 @@ class LogsProposal:
             if names
         )
         data, mapped, repair = self._logs(folder)
-        return f"edp twin {data}{mapped} --out {_quoted(folder / 'runs' / 'twin')}{repair}{named}"
+        # Of a single recording the end tests: there is no other one.
+        split = " --set split.kind=time" if self.recordings == 1 else ""
+        return f"edp twin {data}{mapped} --out {_quoted(folder / 'runs' / 'twin')}{repair}{named}{split}"
 
     def no_plant(self) -> str:
         """Why no plant model is proposed, and what to record or to name, in a sentence; empty where one is."""
@@ -176,7 +181,10 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     check_files(files)
     repairs = () if apart else repairs
     inputs = _untold_inputs(proposal)
-    return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
+    return LogsProposal(
+        *(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes)),
+        recordings=len(group.paths) if experiments is None else len(experiments.entries),
+    )
 
 
 def _recordings(
@@ -247,6 +255,7 @@ def write_proposal(proposal: LogsProposal, folder: str | Path, overwrite: bool =
         StorageError: one is there already and may not be replaced, or cannot be written.
     """
     out = Path(folder)
+    check_kind(out, what="edp init")
     paths = [out / name for name in proposal.files]
     there = [path for path in paths if is_there(path) or is_link_at(path)]
     if there and not overwrite:
@@ -344,4 +353,7 @@ def _of_pairs(
     notes += _notes(group, others, broken, proposal)
     notes.append(f"two experiments stand side by side: columns of '{train}' train, those of '{test}' test")
     inputs = _untold_inputs(renamed_proposal)
-    return LogsProposal(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes))
+    return LogsProposal(
+        *(source, group, others, broken, proposal, files, targets, inputs, repairs, tuple(notes)),
+        recordings=len(recordings),
+    )

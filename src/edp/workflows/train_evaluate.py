@@ -19,7 +19,16 @@ from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
 from edp.evaluation.conditional import collinear
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import Evaluation, JudgedModel, JudgeSpec, ModelBench, first_scored, judge, score_network
+from edp.evaluation.judge import (
+    Evaluation,
+    JudgedModel,
+    JudgeSpec,
+    ModelBench,
+    check_scored,
+    first_scored,
+    judge,
+    score_network,
+)
 from edp.evaluation.scores_file import earlier_scores
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
@@ -123,6 +132,7 @@ def train(
     taught = {} if strategy_factory is None else {"strategy": dict(strategy_factory.facts)}
     frozen = {} if strategy_factory is None else strategy_factory.frozen
     data = data or prepare_data(source, experiment, frozen)
+    check_scored(data, experiment.judge)
     key = run_key(settings | taught, data.digest)
     with RunFolder(out) as run:
         run.claim(key, experiment_toml(experiment))

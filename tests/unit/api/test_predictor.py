@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 import edp
 from edp.errors import BundleError, ConfigError, DataError, StorageError
@@ -126,6 +127,22 @@ def test_the_stream_says_tick_by_tick_what_predict_says(rig_model, rig):
     assert isinstance(stream, edp.Stream)
     ticks = [stream.step(row).prediction for row in rig[0].select(rig_model.inputs)[:50]]
     np.testing.assert_allclose(ticks, rig_model.predict(rig[:1]).values[0][:50], rtol=1e-4, atol=1e-6)
+
+
+def test_the_network_gives_what_predict_gives_whole_and_in_two_parts(rig_model, rig):
+    network, recording = rig_model.network, rig[0]
+    assert isinstance(network, torch.nn.Module)
+    assert not network.training
+    x = torch.from_numpy(recording.select(rig_model.inputs).copy())[None]
+    with torch.no_grad():
+        whole, _ = network.predict(x, network.initial_state(1, like=x))
+        first, state = network.predict(x[:, :150], network.initial_state(1, like=x))
+        second, _ = network.predict(x[:, 150:], state)
+        standardised, _ = network(x, network.initial_state(1, like=x))
+    assert whole.shape == standardised.shape == (1, recording.samples, len(rig_model.horizons), len(rig_model.targets))
+    np.testing.assert_allclose(whole[0].numpy(), rig_model.predict(recording).values[0], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(torch.cat([first, second], dim=1).numpy(), whole.numpy(), rtol=1e-4, atol=1e-6)
+    assert not np.allclose(standardised.numpy(), whole.numpy())
 
 
 @pytest.mark.parametrize("target", list(TARGETS))

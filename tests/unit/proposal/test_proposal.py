@@ -339,10 +339,10 @@ def test_a_plant_model_of_angles_and_commands_alone_is_named_and_takes_their_cha
     assert proposal.targets == ("boom_angle_rad",)
     assert proposal.no_plant() == ""
     plant = shlex.split(proposal.plant_command(tmp_path / "out"))
-    assert plant[-2:] == ["--set", 'channels.commands=["joystick_boom"]']
+    assert plant[-4:] == ["--set", 'channels.commands=["joystick_boom"]', "--set", "split.kind=time"]
     write_proposal(proposal, tmp_path / "out")
     recordings = DataSource.of(tmp_path / "x.csv", tmp_path / "out" / MAP).read()
-    completed, settings = complete_velocities(recordings, load_twin_experiment(None, plant[-1:]).channels)
+    completed, settings = complete_velocities(recordings, load_twin_experiment(None, plant[-3:-2]).channels)
     channels = twin_channels(completed[0], settings)
     assert [channel.name for channel in channels.answers] == ["boom_angle_rad_velocity", "boom_angle_rad"]
 

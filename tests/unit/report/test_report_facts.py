@@ -3,6 +3,7 @@ import json
 import pytest
 
 from edp.errors import DataError, StorageError
+from edp.evaluation.guard import network_verdict
 from edp.report.common.tables import comparison_tables, key_figures
 from edp.report.common.wording import decimals_for, duration, listed, number, percent, unbroken
 from edp.report.run.facts import (
@@ -93,19 +94,22 @@ def test_outputs_without_a_unit_are_never_averaged(run_folder):
     assert " 1 " not in headline(facts)
 
 
-def test_outputs_that_lose_stand_first(run_folder):
+def test_the_headline_is_the_verdict_and_lost_outputs_are_named(run_folder):
     def change(scores):
         name = scores["targets"][1]["name"]
         # At one horizon alone: a network that leads at the others is of no use there.
         best = scores["models"]["persistence"]["overall"]["10"][name]
         best["rmse"] = 0.5 * scores["models"]["network"]["overall"]["10"][name]["rmse"]
 
-    assert "loses" not in headline(read_facts(run_folder))
+    assert "a baseline has less error" not in " ".join(verdict_lines(read_facts(run_folder)))
     edit_scores(run_folder, change)
     facts = read_facts(run_folder)
     name = facts.targets[1].name
-    start = f"The network loses to a baseline on 1 of 3 outputs: {name} at k = 10 (Persistence: 50 % less RMSE)."
-    assert headline(facts).startswith(start)
+    line = f"At some time ahead a baseline has less error on 1 of 3 outputs: {name} at k = 10 "
+    assert f"{line}(Persistence: 50 % less RMSE)." in verdict_lines(facts)
+    verdict = network_verdict(facts.scores)
+    assert headline(facts).startswith(verdict.sentence())
+    assert verdict.exit_code == 0
 
 
 def test_test_logs_are_named_with_what_they_cannot_prove(run_folder):

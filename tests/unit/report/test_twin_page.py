@@ -17,7 +17,7 @@ from edp.report.twin.charts import twin_charts
 from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles, verdict
 from edp.report.twin.page import render
 from edp.signals import Channel, Kind
-from edp.storage import write_json
+from edp.storage import read_json, write_json
 from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -171,11 +171,16 @@ def test_damaged_scores_are_refused_with_what_is_wrong(folder, change, message):
 
 
 def test_damaged_runs_are_refused(folder):
+    (folder / "free_runs.safetensors").write_bytes(b"x")
+    with pytest.raises(StorageError, match="was changed since it was written with the result"):
+        read_free_runs(folder)
+    # As earlier versions wrote them: without the hash of the runs.
+    content = {name: part for name, part in read_json(folder / "free_run.json").items() if name != "files"}
+    write_json(folder / "free_run.json", content)
+    with pytest.raises(StorageError, match="cannot read"):
+        read_free_runs(folder)
     (folder / "free_runs.safetensors").write_bytes(save({"seconds": np.zeros(1, np.float32)}))
     with pytest.raises(StorageError, match="does not fit its scores: 'seconds'"):
-        read_free_runs(folder)
-    (folder / "free_runs.safetensors").write_bytes(b"x")
-    with pytest.raises(StorageError, match="cannot read"):
         read_free_runs(folder)
 
 

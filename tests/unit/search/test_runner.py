@@ -207,8 +207,10 @@ def test_the_same_session_twice_is_refused_before_anything_is_trained(six_sessio
 def test_fewer_sessions_than_folds_and_a_test_session_that_is_not_there(six_sessions, plan, tmp_path):
     many = replace(plan.spec, folds=5, variance_runs=10, most_runs=10)
     named = replace(plan.spec, test=("s9",))
+    # A store cannot be divided into more sessions.
+    six_sessions.store(tmp_path / "store")
     with pytest.raises(DataError, match="4 are left for 5 folds"):
-        run_search(six_sessions, SearchPlan(many, plan.experiment), tmp_path / "a", CREW)
+        run_search(DataSource(tmp_path / "store"), SearchPlan(many, plan.experiment), tmp_path / "a", CREW)
     with pytest.raises(ConfigError, match=r"'s9'.*known: s0, s1"):
         run_search(six_sessions, SearchPlan(named, plan.experiment), tmp_path / "b", CREW)
 

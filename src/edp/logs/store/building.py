@@ -24,7 +24,6 @@ from edp.logs.store.index import (
     INDEX,
     LOCK,
     ROWS,
-    SCHEMA,
     RefusedLog,
     RowsFile,
     StoreEntry,
@@ -36,6 +35,8 @@ from edp.logs.store.index import (
     plain_index,
     read_index,
     rows_path,
+    stamped,
+    without_seal,
     write_plain,
 )
 from edp.recording import MACHINE, Digest
@@ -64,6 +65,8 @@ from edp.storage.paths import (
     status_of,
 )
 
+KEY_SCHEMA = 1
+"""Version of what `StoredLog.key` covers."""
 PART_SAMPLES = 1 << 16
 """Of a log that are in memory at a time."""
 BATCH_LOG_BYTES = 128 * 2**20
@@ -107,7 +110,7 @@ class StoredLog:
         if self.remote is not None:
             facts = [(self.remote.address, self.remote.size, self.remote.written_ns)]
         how = [plain_tree(self.signal_map), asdict(self.repair), self.name, self.rows, self.machine]
-        text = json.dumps([SCHEMA, self.where, facts, how], default=str)
+        text = json.dumps([KEY_SCHEMA, self.where, facts, how], default=str)
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def _files(self) -> list[Path]:
@@ -287,9 +290,7 @@ def store_batch(batch: LogBatch) -> dict[str, Any]:
             index = replace(index, lists=tuple(lists), recordings=(*index.recordings, entry))
             first += entry.samples * len(channels)
     if index.recordings:
-        status = status_of(path)
-        file = RowsFile(key=batch.key, bytes=status.st_size, written_ns=status.st_mtime_ns)
-        index = replace(index, files=(file,))
+        index = replace(index, files=(stamped(batch.folder, RowsFile(key=batch.key)),))
     else:
         path.unlink()
     record = plain_index(index)
@@ -365,6 +366,7 @@ def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
         with suppress(DataError):
             table = parse_json(read_text(path, BATCH_BYTES, where, DataError), where, DataError)
             record = object_with(table, ("files", "recordings"), where, DataError)
+            record = without_seal(record, where)
             batch = index_of(record, where)
             check_places(batch, where)
             if [(file.key, file.bytes) for file in batch.files] == [(path.stem, _size(rows_path(top, path.stem)))]:

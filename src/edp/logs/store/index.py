@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, DataError
 from edp.logs.formats.base import check_names
+from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel
 from edp.storage import object_with, parse_json, read_text, write_bytes
-from edp.storage.paths import is_file_at, is_folder_at
+from edp.storage.paths import is_file_at, is_folder_at, status_of
+from edp.storage.seals import HASH, sealed, unsealed
 
 INDEX, ROWS, LOCK = "store.json", "rows", ".lock"
-KIND, SCHEMA = "edp-store", 1
+KIND, SCHEMA = "edp-store", 2
+UNSEALED_SCHEMA = 1
+"""Of indexes without a hash: every recording is compared with its own hash when such a store is opened."""
 INDEX_BYTES = 512 * 2**20
 """Of an index; an entry of a recording takes some 500 bytes, so that a million fit."""
 BATCH_BYTES = 64 * 2**20
 """Of the record of one batch of logs."""
 NUMBER_BYTES = 4
+BUILD_AGAIN = "remove the store and build it again from its logs"
 KEY = re.compile(r"[0-9a-f]{32}")
+RATE = above(0.0, 1e6)
+MAX_NS = 2**63
+"""Of a time in nanoseconds since 1970: the year 2262."""
 """What names a file of rows: a key leads to no other folder."""
 _TREE = SettingsTree(what="index of the store")
 
@@ -61,11 +70,24 @@ class StoreEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class RowsFile:
-    """A file of samples: its key, its bytes, and when it was last written, in nanoseconds since 1970."""
+    """A file of samples.
+
+    Attributes:
+        key: name of the file.
+        bytes: its size.
+        written_ns: when its content was last written, in nanoseconds since 1970; programs can set it.
+        changed_ns: when the system last changed it in any way (ctime), which no program can set; 0 where it is not
+            known that the file is as it was stored.
+    """
 
     key: str
-    bytes: int
-    written_ns: int
+    bytes: int = 0
+    written_ns: int = 0
+    changed_ns: int = 0
+
+    def is_unchanged(self, status: os.stat_result) -> bool:
+        """Return whether the file was not touched since its samples were compared with their hashes."""
+        return (self.written_ns, self.changed_ns) == (status.st_mtime_ns, status.st_ctime_ns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +134,12 @@ def rows_path(folder: Path, key: str) -> Path:
     return folder / ROWS / f"{key}.f32"
 
 
+def stamped(folder: Path, file: RowsFile) -> RowsFile:
+    """Return a file whose samples were compared with their hashes, with its size and times as they are now."""
+    status = status_of(rows_path(folder, file.key))
+    return replace(file, bytes=status.st_size, written_ns=status.st_mtime_ns, changed_ns=status.st_ctime_ns)
+
+
 def read_index(folder: str | Path) -> StoreIndex:
     """The index of a store, checked: every recording lies within a file of the store.
 
@@ -139,14 +167,30 @@ def checked_index(text: str, where: str) -> StoreIndex:
     table = object_with(parse_json(text, where, DataError), ("kind", "schema"), where, DataError)
     if table["kind"] != KIND:
         raise DataError(f"{where}: kind = {str(table['kind'])[:40]!r}, expected '{KIND}'; it is no store of EDP")
-    if table["schema"] != SCHEMA:
+    if isinstance(table["schema"], bool) or table["schema"] not in (UNSEALED_SCHEMA, SCHEMA):
         raise DataError(
-            f"{where}: schema {str(table['schema'])[:40]}, this version of EDP reads {SCHEMA}; remove the store and "
-            "build it again from its logs"
+            f"{where}: schema {str(table['schema'])[:40]}, this version of EDP reads {UNSEALED_SCHEMA} and {SCHEMA}; "
+            f"{BUILD_AGAIN}"
         )
-    index = index_of(table, where)
+    index = index_of(without_seal(table, where), where)
+    if index.schema == UNSEALED_SCHEMA:
+        # Nothing binds its numbers, so none of its files counts as compared.
+        files = tuple(replace(file, changed_ns=0) for file in index.files)
+        index = replace(index, schema=SCHEMA, files=files)
     check_places(index, where)
     return index
+
+
+def without_seal(table: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return an index or the record of a batch without its hash, which is checked.
+
+    Raises:
+        DataError: it does not match its hash, or lacks one although its schema has it.
+    """
+    if table.get("schema") != UNSEALED_SCHEMA and HASH not in table:
+        raise DataError(f"{where} is damaged: it lacks its hash ({HASH}); copy the store again, or {BUILD_AGAIN}")
+    plain: dict[str, Any] = unsealed(table, where, DataError)
+    return plain
 
 
 def index_of(table: dict[str, Any], where: str) -> StoreIndex:
@@ -158,7 +202,7 @@ def index_of(table: dict[str, Any], where: str) -> StoreIndex:
     try:
         index = _TREE.build(StoreIndex, table, where)
     except ConfigError as error:
-        raise DataError(f"{error}; remove the store and build it again from its logs") from error
+        raise DataError(f"{error}; {BUILD_AGAIN}") from error
     for channels in index.lists:
         check_names(Path(where), [channel.name for channel in channels])
     return index
@@ -171,31 +215,38 @@ def plain_index(index: StoreIndex) -> dict[str, Any]:
 
 
 def write_plain(path: Path, plain: dict[str, Any]) -> None:
-    """Write an index or the record of a batch, whole or not at all."""
-    write_bytes(path, json.dumps(plain, allow_nan=False, separators=(",", ":")).encode())
+    """Write an index or the record of a batch under a hash, whole or not at all."""
+    write_bytes(path, json.dumps(sealed(plain), allow_nan=False, separators=(",", ":")).encode())
 
 
 def check_places(index: StoreIndex, where: str) -> None:
     """Refuse recordings that lie outside their files, and files outside the store."""
     sizes = {file.key: file.bytes // NUMBER_BYTES for file in index.files}
-    for key in sizes:
-        if not KEY.fullmatch(key):
-            raise DataError(f"{where}: a file of rows is called {key[:60]!r}; 32 hexadecimal digits must hold")
+    for file in index.files:
+        if not KEY.fullmatch(file.key):
+            raise DataError(f"{where}: a file of rows is called {file.key[:60]!r}; 32 hexadecimal digits must hold")
+        if file.bytes < 0 or not (0 <= file.written_ns < MAX_NS and 0 <= file.changed_ns < MAX_NS):
+            raise DataError(f"{where}: file {file.key} has a size or time out of bounds; {BUILD_AGAIN}")
     for entry in index.recordings:
         if not 0 <= entry.channels < len(index.lists) or not index.lists[entry.channels]:
             raise DataError(
                 f"{where}: recording {entry.name[:80]!r} has the list of channels {entry.channels}, there are "
-                f"{len(index.lists)}, and none may be empty; remove the store and build it again from its logs"
+                f"{len(index.lists)}, and none may be empty; {BUILD_AGAIN}"
             )
-        if not 0.0 < entry.rate_hz < float("inf"):
+        if not RATE.holds(entry.rate_hz):
             raise DataError(
-                f"{where}: recording {entry.name[:80]!r} has {entry.rate_hz} Hz; a positive number must hold"
+                f"{where}: recording {entry.name[:80]!r} has {entry.rate_hz} Hz; {RATE.rule('a rate')} is required"
+            )
+        if not KEY.fullmatch(entry.digest):
+            raise DataError(
+                f"{where}: recording {entry.name[:80]!r} has the hash {entry.digest[:40]!r}; 32 hexadecimal digits are "
+                f"required; {BUILD_AGAIN}"
             )
         stop = entry.first + entry.samples * len(index.lists[entry.channels])
         if entry.rows not in sizes or entry.first < 0 or entry.samples < 1 or stop > sizes[entry.rows]:
             raise DataError(
                 f"{where}: recording {entry.name[:80]!r} lies at values {entry.first} to {stop} of file "
-                f"{entry.rows[:40]!r}, which the store does not have; remove the store and build it again from its logs"
+                f"{entry.rows[:40]!r}, which the store does not have; {BUILD_AGAIN}"
             )
 
 

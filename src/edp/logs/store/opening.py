@@ -21,11 +21,16 @@ from edp.logs.store.index import (
     plain_index,
     read_index,
     rows_path,
+    stamped,
     write_plain,
 )
 from edp.recording import FloatArray, Recording
 from edp.storage import object_with, parse_json
 from edp.storage.paths import is_file_at, is_link_at
+from edp.storage.seals import digest_of_bytes
+
+_compared: set[str] = set()
+"""Files that this process has compared with their hashes: each is read once for it, not at every opening."""
 
 
 def read_store(folder: str | Path) -> list[Recording]:
@@ -68,7 +73,7 @@ def check_store(folder: str | Path) -> StoreIndex:
     index = read_index(top)
     files = {file.key: _mapped(top, file) for file in index.files}
     _refuse_changed(top, index, files, {file.key for file in index.files})
-    fresh = tuple(replace(file, written_ns=_status(top, file).st_mtime_ns) for file in index.files)
+    fresh = tuple(stamped(top, file) for file in index.files)
     if fresh != index.files:
         index = replace(index, files=fresh)
         write_plain(top / INDEX, plain_index(index))
@@ -108,10 +113,21 @@ def _status(folder: Path, file: RowsFile) -> os.stat_result:
 
 
 def _check_changed(folder: Path, index: StoreIndex, files: dict[str, FloatArray]) -> None:
-    """Where a file was written since, by its time, its recordings are compared with their hashes."""
-    later = {file.key for file in index.files if _status(folder, file).st_mtime_ns != file.written_ns}
+    """Compare the recordings of a file with their hashes where the file was written, copied or moved since."""
+    touched = {file.key: file for file in index.files if not file.is_unchanged(_status(folder, file))}
+    tokens = {key: _token(folder, file, index) for key, file in touched.items()} if touched else {}
+    later = {key for key, token in tokens.items() if token not in _compared}
     if later:
         _refuse_changed(folder, index, files, later)
+        _compared.update(tokens[key] for key in later)
+
+
+def _token(folder: Path, file: RowsFile, index: StoreIndex) -> str:
+    """Return what a comparison is valid for: the file as it is, and what the index says of its recordings."""
+    status = _status(folder, file)
+    state = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    stated = [(entry, index.lists[entry.channels]) for entry in index.recordings if entry.rows == file.key]
+    return digest_of_bytes(repr((str(rows_path(folder, file.key)), state, stated)).encode())
 
 
 def _refuse_changed(folder: Path, index: StoreIndex, files: dict[str, FloatArray], keys: set[str]) -> None:

@@ -86,7 +86,7 @@ def percent(share: float | None, signed: bool = False) -> str:
 
 
 def setting_text(value: object) -> str:
-    """Return a setting as text, exactly as it was given: members of a list with commas between them, "none" if empty."""
+    """Return a setting as text, exactly as it was given; members of a list have commas between them."""
     if isinstance(value, Mapping):
         return "; ".join(f"{key}: {setting_text(inner)}" for key, inner in value.items()) or "none"
     if isinstance(value, list | tuple | set | frozenset):

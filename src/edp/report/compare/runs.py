@@ -17,6 +17,7 @@ from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, re
 from edp.report.twin.facts import TWIN, holds_free_runs, read_free_runs
 from edp.storage import read_object
 from edp.storage.paths import full_path, is_file_at
+from edp.storage.runs import unfinished_text
 
 MOST_RUNS = 12
 """Beside each other: more lines than that nobody tells apart."""
@@ -145,7 +146,7 @@ def _read(path: Path, name: str) -> ComparedRun:
 def _network(path: Path, name: str) -> ComparedRun:
     facts = read_facts(path)
     if facts.scores is None or NETWORK not in facts.models:
-        raise DataError(f"'{path}' was not judged; run edp evaluate {path}")
+        raise DataError(unfinished_text(path) or f"'{path}' was not judged; run edp evaluate {path}")
     # What edp evaluate --data writes is a folder in the run, which has the rest.
     whole = facts
     if facts.provenance is None and is_file_at(full_path(path).parent / "provenance.json"):

@@ -21,6 +21,8 @@ MOST_ALARMS = 40
 MOST_CAUSES = 5
 MOST_SILENT = 6
 MOST_REMARKS = 6
+OUTSIDE = "no alarm, but "
+"""Beginning of a remark on residuals outside of their healthy range."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ class MonitorFacts:
         classes: how many faults the dictionary has; 0 without one.
         provenance: name and text of where it comes from.
         remarks: by what is to be said of recordings, beside their alarms, names of these.
+        unseen: which changes silence does not exclude.
     """
 
     title: str
@@ -74,6 +77,7 @@ class MonitorFacts:
     classes: int = 0
     provenance: Sequence[tuple[str, str]] = ()
     remarks: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    unseen: str = ""
 
     def trace_of(self, alarm: AlarmFacts) -> RecordingTrace | None:
         """The trace of the recording of an alarm."""
@@ -97,7 +101,8 @@ def headline(facts: MonitorFacts) -> str:
     """The answer first: how many alarms in which time, and what they say."""
     hours = hours_text(facts.traces.hours)
     if not facts.alarms:
-        return f"No alarm in {hours}"
+        outside = any(remark.startswith(OUTSIDE) for remark in facts.remarks)
+        return f"No alarm in {hours}{', but residuals lie outside of their healthy range' if outside else ''}"
     count = f"{len(facts.alarms)} alarm{'s' * (len(facts.alarms) > 1)} in {hours}"
     # A fault that stays alarms again and again: it is named once.
     subjects: Counter[str] = Counter()
@@ -134,6 +139,8 @@ def hours_text(hours: float) -> str:
 def verdict(facts: MonitorFacts) -> list[str]:
     """Sentences behind the headline."""
     lines = [f"Limits: {facts.promise}." if facts.promise else ""]
+    if facts.unseen and not facts.alarms:
+        lines.append(f"What silence does not exclude: {facts.unseen}.")
     silent = sorted({name for trace in facts.traces.recordings for name in trace.silent})
     if silent:
         shown = listed(silent[:MOST_SILENT]) + (f" and {len(silent) - MOST_SILENT} more" * (len(silent) > MOST_SILENT))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError, count_of
-from edp.evaluation.guard import MEASURE, MEASURE_NAME, beaten_by
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, ErrorOutcome, network_verdict
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, figure, listed, number, percent
 from edp.report.run.budget import budget_name, budget_rows
@@ -22,6 +22,7 @@ from edp.signals import display_offset
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
+from edp.storage.runs import unfinished_text
 
 NETWORK = "network"
 TRUTH = "truth"
@@ -312,11 +313,12 @@ def headline(facts: Facts) -> str:
     samples = main_horizon(facts)
     rows = comparison_rows(facts)
     if samples is None or not any(row["is_network"] for row in rows):
-        return f"This run has no scores yet; `edp evaluate {facts.folder}` makes them."
-    beaten = beaten_by(facts.scores, minutes_of(facts.folder)) if facts.scores else None
-    if beaten is not None:
-        return beaten.sentence()
-    first = losses_line(facts.scores) if facts.scores else ""
+        missing = f"This run has no scores yet; `edp evaluate {facts.folder}` makes them"
+        return f"{unfinished_text(facts.folder) or missing}."
+    judged = network_verdict(facts.scores, minutes_of(facts.folder)) if facts.scores else None
+    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
+        return judged.sentence()
+    first = "" if judged is None else judged.sentence()
     if not facts.averaged and facts.scores:
         targets = [(target.name, target.description, target.unit) for target in facts.targets]
         return f"{first} {by_output(facts.scores, samples, targets, horizon_text(facts, samples))}".strip()
@@ -345,6 +347,7 @@ def verdict_lines(facts: Facts) -> list[str]:
         won, both = recordings_won(facts, best["model"])
         if both:
             lines.append(f"It is the better of the two on {won} of {count_of(both, 'test recording')}.")
+    lines += [line for line in (losses_line(facts.scores) if facts.scores else "",) if line]
     judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
     beyond = situation_line(facts.scores) if facts.scores else ""
     limit = limit_line(facts, main_horizon(facts))

@@ -35,7 +35,7 @@ def losses_line(scores: Mapping[str, Any]) -> str:
     ]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
     outputs = count_of(len(scores["targets"]), "output")
-    return f"The network loses to a baseline on {len(losses)} of {outputs}: {listed(parts)}{more}."
+    return f"At some time ahead a baseline has less error on {len(losses)} of {outputs}: {listed(parts)}{more}."
 
 
 def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> str:

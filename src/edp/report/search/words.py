@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edp.errors import count_of
+from edp.evaluation.guard import ErrorOutcome, outcome_of
 from edp.report.common.wording import count_text, duration, listed, number, percent, setting_text
 from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, real
 from edp.report.search.smaller import chosen_words
@@ -31,12 +32,15 @@ def _result(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     if ours is None or base is None:
         return "A final training failed, so that nothing can be said of the test sessions."
     sessions = count_of(len(study.test), "test session")
-    if ours < base:
+    gain = facts["test_gain"]
+    outcome = outcome_of(ours / base - 1, None if gain is None else real(gain["high"]))
+    what = f"With {names}" if own else "Tuned anew, with no module,"
+    figures = f"{number(ours, 3)} {study.unit} on {sessions}"
+    if outcome is ErrorOutcome.BETTER:
         change = percent(1 - ours / base)
-        return (
-            f"{f'With {names}' if own else 'Tuned anew, with no module,'} the network reaches {number(ours, 3)} "
-            f"{study.unit} on {sessions}, {change} below the baseline's {number(base, 3)}."
-        )
+        return f"{what} the network reaches {figures}, {change} below the baseline's {number(base, 3)}."
+    if outcome is ErrorOutcome.OPEN:
+        return f"{what} the network is not distinguishable from the baseline: {figures}, against {number(base, 3)}."
     return (
         f"Nothing better than the baseline was found: {number(base, 3)} {study.unit} on {sessions}, against "
         f"{number(ours, 3)} with {names or 'no module'}."

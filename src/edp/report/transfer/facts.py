@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from edp.errors import StorageError, count_of
+from edp.evaluation.guard import ErrorOutcome, ErrorVerdict
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
@@ -179,8 +180,23 @@ def method_sheet(facts: Transfer, horizon: str) -> Sheet:
     return Sheet(f"methods_k{horizon}", f"{facts.ahead(horizon)}, means over targets", columns, tuple(rows), mark)
 
 
+def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
+    """Return the verdict on the fine-tuned network against the best other method at the furthest horizon."""
+    horizon, method = facts.horizons[-1], facts.content["method"]
+    errors = {name: facts.score(name, horizon)["mae"] for name in facts.methods}
+    own, others = errors.pop(method), {name: error for name, error in errors.items() if error > 0}
+    if not others or not own:
+        return None
+    best = min(others, key=lambda name: others[name])
+    advice = f"take {facts.methods[best]['label']}, or give more recordings of this machine"
+    return ErrorVerdict(facts.methods[best]["label"], 1 - others[best] / own, (), "fine-tuned network", advice)
+
+
 def headline(facts: Transfer) -> str:
     """One sentence: what was gained."""
+    judged = transfer_verdict(facts)
+    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
+        return judged.sentence().removesuffix(".")
     horizon = facts.horizons[-1]
     before, after = (facts.score(name, horizon)["mae"] for name in facts.pair)
     gain = facts.gain(horizon)

@@ -14,6 +14,7 @@ from edp.data.unlabelled import unlabelled
 from edp.errors import ConfigError
 from edp.evaluation.judge import JudgeSpec
 from edp.networks import AdaptedStream, Stream
+from edp.networks.predictor import Predictor
 from edp.networks.running import stream_intervals, stream_predictions
 from edp.recording import Recording
 from edp.report import Facts, read_facts
@@ -82,6 +83,18 @@ class TrainedPredictor:
         """SI unit of each input and target, by name."""
         targets = zip(self.targets, self._bundle.target_kinds, strict=True)
         return {c.name: c.unit for c in self._bundle.inputs} | {name: KINDS[kind].si_unit for name, kind in targets}
+
+    @property
+    def network(self) -> Predictor:
+        """The network as a PyTorch module (`torch.nn.Module`), in evaluation mode, with its scaling inside.
+
+        ``network.predict(x, state)`` takes `inputs` in SI units, shape ``(batch, time, input)``, float32, and returns
+        predictions in SI units, shape ``(batch, time, horizon, target)``, with the next state. ``network(x, state)``
+        is the same before the last scaling: standardised predictions, which a loss is taken of. The state is a
+        dictionary of tensors; ``network.initial_state(batch, like=x)`` is that of a reset. It is the module that
+        `predict` runs, so a change of its weights changes this predictor, but not its folder.
+        """
+        return self._bundle.predictor
 
     def evaluate(
         self,

@@ -18,7 +18,7 @@ from edp.config.experiment import (
 from edp.data.splits import ByRecording, SplitSpec
 from edp.errors import ConfigError
 from edp.evaluation.judge import JudgeSpec
-from edp.settings.bounds import MOST_THREADS, SEED, above, check_bounds, integer
+from edp.settings.bounds import MIN_MINUTES, MOST_THREADS, SEED, check_bounds, integer, span
 from edp.settings.tree import Table, merged, override, read_toml
 
 MOST_MINUTES = 10_000.0
@@ -47,7 +47,7 @@ class Portfolio:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        check_bounds("auto", self, minutes=above(0.0, MOST_MINUTES), seed=SEED, threads=integer(0, MOST_THREADS))
+        check_bounds("auto", self, minutes=span(MIN_MINUTES, MOST_MINUTES), seed=SEED, threads=integer(0, MOST_THREADS))
         if self.candidates and ("foundation" in self.candidates) != bool(self.foundation):
             raise ConfigError(
                 f"auto.candidates = {list(self.candidates)} and auto.foundation = '{self.foundation}': the candidate "

@@ -34,7 +34,8 @@ from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, write_bytes, write_json
 from edp.storage.headers import read_header
 from edp.storage.paths import entries_of, is_file_at
-from edp.training.bundle import as_damage, check_hash, read_arrays, write_arrays
+from edp.storage.runs import unfinished_text
+from edp.training.bundle import as_damage, check_hash, read_arrays, with_plugins, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
 KEPT, HEADER, MACHINE, TWIN = "controller", "controller.json", "machine.toml", "twin"
@@ -110,7 +111,7 @@ def keep_controller(
         "twin": twin is not None,
         "arrays": write_arrays(folder, "arrays", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()})),
     }
-    write_json(folder / HEADER, header)
+    write_json(folder / HEADER, with_plugins(header))
     for old in entries_of(folder, "arrays-*.safetensors"):
         if old.name != header["arrays"]["file"]:  # type: ignore[index]
             old.unlink(missing_ok=True)
@@ -129,7 +130,8 @@ def load_kept(run: str | Path) -> KeptController:
     folder = path / KEPT
     if not is_file_at(folder / HEADER):
         raise StorageError(
-            f"'{path}' has no {KEPT}/{HEADER}: it is no finished run of edp control, or one of an earlier version; run "
+            unfinished_text(path)
+            or f"'{path}' has no {KEPT}/{HEADER}: it is not a run of edp control, or one of an earlier version; run "
             "edp control again, in a new folder"
         )
     with as_damage(folder):

@@ -72,7 +72,7 @@ def control_loops(
     key = repr(chosen) if guard is None else f"{chosen!r} {guard!r}"
     with RunFolder(out) as run:
         run.claim(run_key(CONTROL_SETTINGS.plain(experiment), key), control_toml(experiment))
-        run.write_status("running")
+        run.write_status("running", kind="control")
         results = bench.results(on_loop=on_loop, guard=guard)
         folder = make_folder(run.file(LOOPS))
         for result in results:

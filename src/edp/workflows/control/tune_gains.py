@@ -96,7 +96,7 @@ def tune_gains(
     judge.check()
     with RunFolder(out) as run:
         run.claim(key, control_toml(experiment))
-        run.write_status("running")
+        run.write_status("running", kind="tuning")
         study = Study(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )

@@ -13,14 +13,15 @@ from typing import Any
 from edp import __version__
 from edp.config.experiment import Change
 from edp.data.prepared import Prepared
-from edp.errors import ConfigError, EdpError, closest
+from edp.errors import ConfigError, EdpError, StorageError, closest
 from edp.evaluation.judge import score_predictions
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import KINDS
 from edp.storage import check_writable, make_folder, object_with, read_object, write_bytes, write_json
 from edp.storage.ledger import TrainingIdentity, WithState
-from edp.storage.paths import full_path
+from edp.storage.paths import full_path, is_file_at
+from edp.storage.runs import unfinished_text
 from edp.training.bundle import load_bundle, save_bundle, weights_digest
 from edp.training.delta import DELTA_BYTES, SUFFIX, delta_from_bytes, delta_of, read_delta, with_delta
 from edp.workflows.executors import Workforce
@@ -171,6 +172,8 @@ def read_fleet(folder: str | Path) -> dict[str, Any]:
         ConfigError: of another schema.
     """
     file = Path(folder, FLEET)
+    if not is_file_at(file) and (unfinished := unfinished_text(folder)):
+        raise StorageError(unfinished)
     content = object_with(read_object(file), ("schema", "base", "source", "machines"), f"'{file}'")
     if content["schema"] != SCHEMA:
         raise ConfigError(f"'{file}' has schema {content['schema']}; this version of EDP reads {SCHEMA}: update it")

@@ -28,6 +28,7 @@ from edp.storage import (
     write_bytes,
     write_json,
 )
+from edp.storage.folders import check_kind
 from edp.storage.paths import entries_of, is_file_at, is_folder_at
 from edp.storage.runs import read_provenance
 from edp.training import Bundle, load_bundle, save_bundle
@@ -91,6 +92,7 @@ def add_to_registry(registry: str | Path, source: str | Path, name: str) -> Regi
     if not NAME.fullmatch(name):
         raise ConfigError(f"'{name}' is no name of an entry; give up to 64 letters, digits, dots, dashes, underscores")
     folder = Path(source)
+    check_kind(registry, "registry", what="edp registry add")
     top = check_writable(registry)
     lock = hold(top / LOCK)
     try:

@@ -6,7 +6,7 @@ import itertools
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from edp.config.monitor import MonitorExperiment, monitor_toml
 from edp.errors import BundleError, ConfigError, DataError, LostError, closest
 from edp.logs.source import DataSource
+from edp.monitor.detectable import found_sizes, healthy_range, measure_found_sizes, promise_lines
 from edp.monitor.fitting import FittedChain, doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
@@ -28,7 +29,9 @@ from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.recording import Recording
 from edp.sandbox.helpers import Helpers
 from edp.signals import Channel
-from edp.storage import check_writable, write_bytes
+from edp.storage import check_writable, remove_unfinished, write_bytes
+from edp.storage.folders import check_kind
+from edp.storage.locks import holding
 from edp.storage.paths import is_there
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
@@ -65,6 +68,11 @@ class FittedMonitor:
     sessions: tuple[SessionBlocks, ...] = ()
     one_machine: bool = False
 
+    @property
+    def finds(self) -> list[str]:
+        """Sentences on what the monitor finds with these logs."""
+        return promise_lines(found_sizes(self.monitor.provenance))
+
 
 def fit_monitor(
     runs: Sequence[str | Path],
@@ -88,20 +96,23 @@ def fit_monitor(
     Raises:
         EdpError: runs or logs that cannot be used, or too few hours for the promise, or a process died.
     """
+    check_kind(out, "monitor", what="edp monitor fit")
     check_writable(out)
-    bundles = [_network_of(run) for run in runs]
-    recordings = source.read()
-    with Helpers(workers or os.cpu_count() or 1, _died) as helpers:
+    with holding(Path(out) / ".lock", f"monitor folder '{out}'"):
+        remove_unfinished(Path(out))
+        bundles = [_network_of(run) for run in runs]
+        recordings = source.read()
+        with Helpers(workers or os.cpu_count() or 1, _died) as helpers:
 
-        def side_by_side(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
-            return helpers.ordered(partial(_in_one_thread, function), jobs)
+            def side_by_side(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
+                return helpers.ordered(partial(_in_one_thread, function), jobs)
 
-        fitted = fit_to_recordings(
-            recordings, experiment, bundles, note, side_by_side=map if helpers.workers == 1 else side_by_side
-        )
-    folder = save_monitor(fitted.monitor, out)
-    write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
-    return replace(fitted, folder=folder)
+            fitted = fit_to_recordings(
+                recordings, experiment, bundles, note, side_by_side=map if helpers.workers == 1 else side_by_side
+            )
+        folder = save_monitor(fitted.monitor, out)
+        write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
+        return replace(fitted, folder=folder)
 
 
 def _in_one_thread(function: Callable[[Any], Any], job: Any) -> Any:
@@ -184,12 +195,14 @@ def fit_to_recordings(
             seconds = time.process_time() - began
             return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
     monitor = _assembled(material, sources, fitted, sessions, rest)
+    # Validation sessions set no limit.
+    sizes = measure_found_sizes(monitor, validation, 60.0 * float(monitor.provenance["hours"]), note)
+    measured = {"found_sizes": [asdict(size) for size in sizes], "healthy_range": healthy_range(fitted)}
     healthy = [session for session in rest if session.name not in fitted.doubtful]
-    provenance = dict(monitor.provenance) | {"seconds": time.process_time() - began}
+    provenance = dict(monitor.provenance) | measured | {"seconds": time.process_time() - began}
     monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, note, side_by_side)
-    one_machine = not experiment.chain.tolerance and any(isinstance(source, FlowBalances) for source in sources)
-    seconds = time.process_time() - began
-    return FittedMonitor(monitor, fitted.doubtful, seconds, None, fitted.sessions, one_machine)
+    alone = not experiment.chain.tolerance and any(isinstance(source, FlowBalances) for source in sources)
+    return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began, None, fitted.sessions, alone)
 
 
 def _assembled(
@@ -200,7 +213,7 @@ def _assembled(
     rest: Sequence[Recording],
 ) -> Monitor:
     """The monitor without a dictionary; `rest` are the sessions that trained no residual."""
-    rate_hz, doubtful = material.rate_hz, fitted.doubtful
+    doubtful = fitted.doubtful
     provenance: dict[str, Any] = {
         "sessions": len(sessions),
         "hours": sum(session.duration_s for session in sessions) / 3600.0,
@@ -210,14 +223,10 @@ def _assembled(
         "seed": material.seed,
     }
     return Monitor(
-        material.channels,
-        rate_hz,
-        sources,
-        fitted.chain,
-        fitted.limit,
+        *(material.channels, material.rate_hz, sources, fitted.chain, fitted.limit),
         session_means(material.channels, sessions),
         provenance=provenance,
-        scatter=scatter_of(fitted.chain, fitted.sessions, fitted.chain.summaries.block / rate_hz),
+        scatter=scatter_of(fitted.chain, fitted.sessions, fitted.chain.summaries.block / material.rate_hz),
     )
 
 

@@ -73,8 +73,9 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
         _text(content["promise"], where),
         confusions,
         classes,
-        provenance_rows({key: value for key, value in content.items() if isinstance(value, str)}),
+        provenance_rows({key: value for key, value in content.items() if isinstance(value, str) and key != "unseen"}),
         _remarks(content, where),
+        _text(content.get("unseen", ""), where),
     )
 
 
@@ -85,7 +86,7 @@ def _remarks(content: Mapping[str, Any], where: str) -> dict[str, list[str]]:
         StorageError: it is damaged.
     """
     remarks: dict[str, list[str]] = {}
-    for key in ("unlike", "unlearned"):
+    for key in ("outside", "unlike", "unlearned"):
         entries = content.get(key, {})
         if not isinstance(entries, dict) or len(entries) > MOST_REMARKED:
             raise StorageError(f"{where}: {key} must be an object of at most {MOST_REMARKED}; run the monitor again")

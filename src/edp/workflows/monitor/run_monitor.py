@@ -16,6 +16,7 @@ import numpy as np
 from edp import __version__
 from edp.logs.source import DataSource
 from edp.monitor.alarms import MonitorAlarm, episodes
+from edp.monitor.detectable import found_sizes, outside_line, unseen_line
 from edp.monitor.monitor import Monitor, Watched
 from edp.monitor.monitor_file import load_monitor
 from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
@@ -48,6 +49,7 @@ class MonitorRun:
         traces: statistics and levels of residual groups, block by block.
         unlearned: by recording, sentences on residuals that are silent where healthy logs were never.
         unlike: by recording, why it looks like one of another machine of the same kind.
+        outside: by recording without an alarm, which residual lies outside of its healthy range all the same.
     """
 
     monitor: Monitor
@@ -58,6 +60,14 @@ class MonitorRun:
     traces: RunTraces
     unlearned: dict[str, tuple[str, ...]]
     unlike: dict[str, str]
+    outside: dict[str, str]
+
+    @property
+    def silence(self) -> list[str]:
+        """Sentences on what the absence of alarms does not exclude."""
+        lines = [f"'{name}': no alarm, but {reason}" for name, reason in self.outside.items()]
+        unseen = unseen_line(found_sizes(self.monitor.provenance))
+        return [*lines, *([unseen] if unseen and not self.alarms else [])]
 
     @property
     def changes(self) -> list[list[MonitorAlarm]]:
@@ -72,6 +82,8 @@ class MonitorRun:
             "silent": {name: list(channels) for name, channels in self.silent.items()},
             "unlearned": {name: list(reasons) for name, reasons in self.unlearned.items()},
             "unlike": dict(self.unlike),
+            "outside": dict(self.outside),
+            "silence": self.silence,
             "promise": self.monitor.limit.sentence(),
             "alarms": [alarm.to_json() for alarm in self.alarms],
         }
@@ -99,6 +111,7 @@ def run_monitor(
     silent: dict[str, tuple[str, ...]] = {}
     unlearned: dict[str, tuple[str, ...]] = {}
     unlike: dict[str, str] = {}
+    outside: dict[str, str] = {}
     traces: list[RecordingTrace] = []
     if out is not None:
         check_writable(out)
@@ -118,6 +131,9 @@ def run_monitor(
         reason = monitor.unlike(watched)
         if reason:
             unlike[recording.name] = reason
+        beyond = "" if watched.alarms else outside_line(monitor, watched.rows.astype(np.float64))
+        if beyond:
+            outside[recording.name] = beyond
         alarms += watched.alarms
         traces.append(trace_of(monitor, recording, watched, groups, start))
         hours += recording.duration_s / 3600.0
@@ -125,7 +141,7 @@ def run_monitor(
     names = tuple(recording.name for recording in recordings)
     run = MonitorRun(
         monitor, tuple(alarms), hours, names, silent,
-        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)), unlearned, unlike,
+        RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)), unlearned, unlike, outside,
     )  # fmt: skip
     if out is not None:
         _write(run, Path(out), str(folder))
@@ -179,6 +195,8 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
         "silent": {name: list(channels) for name, channels in run.silent.items()},
         "unlearned": {name: list(reasons) for name, reasons in run.unlearned.items()},
         "unlike": dict(run.unlike),
+        "outside": {name: f"no alarm, but {reason}" for name, reason in run.outside.items()},
+        "unseen": unseen_line(found_sizes(run.monitor.provenance)),
         "classes": 0 if dictionary is None else len(dictionary.classes),
         "confusions": [] if dictionary is None else [asdict(pair) for pair in dictionary.confusions],
     }

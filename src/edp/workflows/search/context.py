@@ -189,6 +189,20 @@ class SearchContext:
         return scores
 
 
+def is_enough(sessions: int, spec: SearchSpec) -> bool:
+    """Return whether so many sessions fill test sets and folds; True where test sessions are named."""
+    if spec.test or spec.second:
+        return True
+    test = max(1, round(spec.test_share * sessions))
+    second = max(1, round(spec.second_share * sessions)) if spec.compression.on else 0
+    return _fills_folds(sessions - test - second, spec)
+
+
+def _fills_folds(development: int, spec: SearchSpec) -> bool:
+    # Rounded up: the largest fold must leave two sessions to train.
+    return development >= max(spec.folds, 3) and development - -(-development // spec.folds) >= 2
+
+
 def set_apart(
     sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
@@ -223,15 +237,14 @@ def set_apart(
         named = tuple(name for name in sessions if name in spec.second)
         second = named or _drawn(rest, families, [spec.seed, 0x7E58], count)
     development = tuple(name for name in sessions if name not in (*test, *second))
-    # Rounded up: the largest fold must leave two sessions to train.
-    fold = -(-len(development) // spec.folds)
-    if len(development) < max(spec.folds, 3) or len(development) - fold < 2:
+    if not _fills_folds(len(development), spec):
         less = "a smaller test_share" + (", --set search.compression.on=false" if second else "")
         raise DataError(
             f"{len(sessions)} sessions came: {len(test)} are set apart as test"
             + (f", {len(second)} for phase 6" if second else "")
             + f", and {len(development)} are left for {spec.folds} folds, "
-            f"which must leave two to train; give more recordings, {less}, or another number of folds"
+            f"which must leave two to train, and they are too short (or in a store) to be divided: give more or longer "
+            f"recordings, {less}, or another number of folds"
         )
     return development, test, second
 

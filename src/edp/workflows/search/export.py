@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
-from edp.storage.study_file import read_study
+from edp.storage.study_file import read_study, reading_parts
 from edp.workflows.search.plan import space_of
 from edp.workflows.search.space import Choice, Range, Space
 from edp.workflows.search.study import FinishedStudy, FinishedTrial, write_journal
@@ -31,7 +31,8 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     """
     content = read_study(folder)
     file = Path(folder, JOURNAL) if path is None else Path(path)
-    studies = ended_studies(content)
+    with reading_parts(folder):
+        studies = ended_studies(content)
     if not studies:
         raise StorageError(
             f"'{folder}' has asked no questions yet: phase 1 (calibration) has not ended; go on with edp search, then "

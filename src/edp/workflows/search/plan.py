@@ -78,7 +78,7 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     if not isinstance(search, Mapping):
         raise ConfigError(f"settings {where}: search = {search!r}; expected a table")
     experiment = build(Experiment, merged(preset_table(base), table), where)
-    spec = _spec(dict(search), where)
+    spec = _spec(_with_task(dict(search), table, experiment), where)
     _check_parts(spec, settings_of(experiment), f"settings {where}: search")
     # Scores exist for the horizons of the task only.
     if spec.horizon not in experiment.task.horizons:
@@ -88,6 +88,19 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
             "one of these, or --set task.horizons=[...]"
         )
     return SearchPlan(spec, experiment, preset)
+
+
+def _with_task(search: Table, table: Table, experiment: Experiment) -> Table:
+    """Take the feature set and the horizon of a task that the user gave, where ``[search]`` names none."""
+    completed, task = {**search}, table.get("task")
+    if "features" not in search and isinstance(task, Mapping) and "features" in task:
+        features = task["features"]
+        own = features if isinstance(features, str) else experiment.task.features
+        completed["features"] = [own if isinstance(own, str) else plain_tree(own)]
+    horizons = experiment.task.horizons
+    if "horizon" not in search and SearchSpec.horizon not in horizons:
+        completed["horizon"] = max(horizons)
+    return completed
 
 
 def _with_files(table: Table, folder: Path) -> Table:

@@ -24,12 +24,13 @@ from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record
 from edp.storage.portable import cores
 from edp.workflows.executors import Executor, LocalPool, RayPool
-from edp.workflows.search.context import Decision, SearchContext, set_apart
+from edp.workflows.search.context import Decision, SearchContext, is_enough, set_apart
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.networks import JudgedNetwork, frozen_split, network_name, write_networks
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import SearchPlan, plain_spec
 from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.sessions import SESSIONS_FILE, divide_logs
 from edp.workflows.search.study_log import StudyLog
 from edp.workflows.search.trainings import TrainingRequest, settings_of
 
@@ -111,6 +112,7 @@ class SearchResult:
         state: ``finished``, or ``stopped`` where not all phases were to run.
         digest: hash over the results of all trainings.
         trained: trainings of this sitting.
+        source: where the sessions are; a data-set file in the study where the logs had to be divided.
         teacher: settings of the winner as an experiment file; None before phase 4.
         networks: runs that phase 6 left: the teacher, and the network that was chosen; none before.
     """
@@ -120,6 +122,7 @@ class SearchResult:
     state: str
     digest: str
     trained: int
+    source: DataSource
     teacher: Path | None = field(default=None)
     networks: Mapping[str, Path] = field(default_factory=dict)
 
@@ -152,15 +155,26 @@ def run_search(
     resources, callbacks = resources or Resources(), callbacks or SearchCallbacks()
     if until is not None:
         _ = PHASES[until]
-    data = _Data.read(source, plan)  # before anything is made on disk
+    # Before anything is made on disk: what is refused leaves no folder.
+    recordings = source.read()
+    parts = None if is_enough(len(recordings), plan.spec) else divide_logs(source, recordings, _gap(plan))
+    data = _Data.of(recordings if parts is None else parts.recordings, plan)
     development, test, second = set_apart(data.names, data.families, plan.spec)
     target = make_folder(folder)
+    if parts is not None:
+        source = DataSource(target / SESSIONS_FILE)
+        callbacks.on_note(
+            f"too few logs for sessions ({len(recordings)}): divided into {len(data.names)} sessions of "
+            f"{parts.seconds:.3g} s or more ({source.path}); what is found holds for these logs, not for other days"
+        )
     with ExitStack() as open_things:
         ledger = open_things.enter_context(Ledger(target / "ledger"))
         if ledger.damaged:
             callbacks.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
         # A folder is bound to data and settings: another search in it would mix records.
         ledger.bind({"data": data.digest, **plan.to_plain()})
+        if parts is not None:
+            write_bytes(source.path, parts.data_set().encode())
         settings = settings_of(plan.experiment)
         context = SearchContext(
             plan.spec, settings, source.to_plain(), development, test, data.channels, data.unit, second=second
@@ -192,7 +206,7 @@ def run_search(
         split = frozen_split(target, context, data.digests)
         networks = write_networks(target, source, context, split, observer.judged_networks)
         teacher = _write_teacher(target, context, split)
-        return SearchResult(target, context, state, ledger.digest(), study_log.trained, teacher, networks)
+        return SearchResult(target, context, state, ledger.digest(), study_log.trained, source, teacher, networks)
 
 
 @dataclass(frozen=True)
@@ -208,8 +222,7 @@ class _Data:
     digests: dict[str, str]
 
     @staticmethod
-    def read(source: DataSource, plan: SearchPlan) -> _Data:
-        recordings = source.read()
+    def of(recordings: Sequence[Recording], plan: SearchPlan) -> _Data:
         _refuse_twice(recordings)
         unit = _check_channels(recordings, plan)
         names = tuple(recording.name for recording in recordings)
@@ -224,6 +237,11 @@ class _Data:
         hours = sum(recording.duration_s for recording in recordings) / 3600
         digests = {recording.name: recording.digest for recording in recordings}
         return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit, digests)
+
+
+def _gap(plan: SearchPlan) -> int:
+    """Return the samples that a prediction reads and looks ahead: window plus largest horizon."""
+    return plan.experiment.model.window + max(plan.experiment.task.horizons)
 
 
 class _Observer:

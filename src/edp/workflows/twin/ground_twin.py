@@ -65,7 +65,7 @@ def ground_twin(
     with RunFolder(out) as run:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             return load_twin(run.path), True
-        run.write_status("running")
+        run.write_status("running", kind="twin")
         tell(f"fitting the ground '{experiment.ground}' to forces along the logs")
         twin = check_grounded(base.bundle.twin)
         fitted = fit_ground(experiment.ground, twin, data.train, data.validation, linkage)

@@ -108,7 +108,7 @@ def train_twin(
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
-        run.write_status("running")
+        run.write_status("running", kind="twin")
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell, helpers)
         result = _chosen(fit, KeyedRun(run, key), base)
         fitted = result.fitted

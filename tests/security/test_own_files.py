@@ -1,0 +1,132 @@
+"""JSON files of EDP's own: one reader and one writer, and any change in a file is refused with one message."""
+
+from __future__ import annotations
+
+import ast
+import json
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from edp.errors import StorageError
+from edp.storage import read_json, write_bytes, write_json
+from edp.storage.headers import FILES, check_files, digests_of
+from edp.storage.seals import HASH, files_without_seal
+
+SOURCE = Path(__file__).parents[2] / "src" / "edp"
+PARSERS = {
+    "json.load",
+    "json.loads",
+    "tomllib.load",
+    "tomllib.loads",
+    "load_file",
+    "pickle.load",
+    "pickle.loads",
+    "np.load",
+}
+READERS = {
+    "storage/reading.py": "the reader",
+    "storage/seals.py": "a round through JSON before hashing",
+    "storage/ledger/store.py": "a round through JSON before a comparison",
+    "sim/data_set.py": "a round through JSON before a comparison",
+    "testing/networks.py": "a round through JSON before a comparison",
+    "sandbox/broker.py": "messages between processes",
+    "sandbox/protocol.py": "messages between processes",
+    "sandbox/sandbox.py": "messages between processes",
+    "sandbox/sandbox_worker.py": "messages between processes",
+    "live/protocol.py": "messages of viewers",
+    "workflows/executors/packing.py": "results of workers",
+    "workflows/search/trainings.py": "settings within a job",
+    "workflows/fleet/judging.py": "settings within a job",
+    "workflows/fleet/machines.py": "facts of an index that was read",
+    "workflows/parity/forms/onnx_runtime.py": "answers of a program that was started",
+    "workflows/parity/forms/ros2.py": "answers of a program that was started",
+    "workflows/parity/forms/casadi.py": "answers of a program that was started",
+    "report/common/interactive.py": "text of a figure of this process",
+    "report/run/facts.py": "arrays whose hash scores.json states",
+    "report/twin/facts.py": "arrays whose hash free_run.json states",
+    "report/transfer/facts.py": "arrays whose hash transfer.json states",
+    "logs/formats/edp_metadata.py": "facts in a log",
+    "export/c/program.py": "a file of the package",
+    "export/casadi/runtime.py": "runs without EDP",
+    "export/ros2/package/core.py": "runs without EDP",
+}
+"""Who parses by itself, and why."""
+
+
+def test_files_are_parsed_by_the_declared_reader():
+    found = set()
+    for file in SOURCE.rglob("*.py"):
+        calls = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Call)]
+        if any(ast.unparse(call.func) in PARSERS for call in calls):
+            found.add(file.relative_to(SOURCE).as_posix())
+    assert sorted(found - READERS.keys()) == [], "read it by edp.storage.read_json, or say here why not"
+    assert sorted(READERS.keys() - found) == [], "an exception that nothing needs"
+
+
+CONTENT = {"schema": 1, "name": "m22", "rates": [100.0, 50.0], "on": True, "none": None, "deep": {"a": [1, {"b": "c"}]}}
+
+
+def changes(value, path=()):
+    """Yield every change of one number, text, truth value, list or key of a tree, as the changed tree."""
+    if isinstance(value, dict):
+        for key in value:
+            yield {name: other for name, other in value.items() if name != key}
+            yield from ({**value, key: changed} for changed in changes(value[key], (*path, key)))
+    elif isinstance(value, list):
+        yield value[:-1]
+        yield value[::-1]
+        for place, entry in enumerate(value):
+            yield from ([*value[:place], changed, *value[place + 1 :]] for changed in changes(entry, (*path, place)))
+    else:
+        yield "" if isinstance(value, str) and value else 17
+
+
+def test_every_change_of_a_value_is_refused_with_one_message(tmp_path):
+    file = tmp_path / "facts.json"
+    write_json(file, CONTENT)
+    assert read_json(file) == CONTENT
+    whole = json.loads(file.read_text())
+    tried = 0
+    for changed in changes(CONTENT):
+        if changed == CONTENT:
+            continue
+        file.write_text(json.dumps(changed | {HASH: whole[HASH]}))
+        with pytest.raises(StorageError, match=r"facts\.json' was changed since EDP wrote it.* restore it"):
+            read_json(file)
+        tried += 1
+    assert tried > 15
+    for digest in ("", None, 0, [], "0" * 32):
+        file.write_text(json.dumps(CONTENT | {HASH: digest}))
+        with pytest.raises(StorageError, match="was changed since"):
+            read_json(file)
+
+
+def test_every_flipped_bit_is_refused_or_changes_nothing(tmp_path):
+    file = tmp_path / "facts.json"
+    write_json(file, CONTENT)
+    whole = file.read_bytes()
+    for place in range(len(whole)):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        files_without_seal()
+        with suppress(StorageError):  # white space may change; without the name of the hash, a file is told as unsealed
+            assert read_json(file) == CONTENT or files_without_seal()
+
+
+def test_a_file_without_a_hash_is_read_and_told(tmp_path):
+    files_without_seal()
+    (tmp_path / "old.json").write_text(json.dumps(CONTENT))
+    assert read_json(tmp_path / "old.json") == CONTENT
+    assert len(files_without_seal()) == 1
+    assert files_without_seal() == []
+
+
+def test_arrays_beside_a_result_are_bound_to_it(tmp_path):
+    write_bytes(tmp_path / "arrays.bin", b"12345678")
+    content = {FILES: digests_of(tmp_path, "arrays.bin")}
+    check_files(content, tmp_path, "again")
+    write_bytes(tmp_path / "arrays.bin", b"12345679")
+    with pytest.raises(StorageError, match="changed since it was written with the result beside it; again"):
+        check_files(content, tmp_path, "again")
+    check_files({}, tmp_path, "again")  # of an earlier version
