@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from browser import check_page
+from browser import check_page, page_faults
 from safetensors.numpy import load_file, save_file
 from typer.testing import CliRunner
 
@@ -238,3 +238,11 @@ def test_costs_of_all_runs_are_listed(pair):
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, pair, tmp_path):
     check_page(browser, write_compare_page(compare_runs(pair), tmp_path / "compare.html"), "comparison")
+
+
+@pytest.mark.processes
+def test_numbers_of_an_axis_are_never_cut_short(browser, make_run, tmp_path):
+    first, second = make_run("first"), make_run("second")
+    browser.open(write_compare_page(compare_runs([first, second]), tmp_path / "compare.html"))
+    browser.run("window.dispatchEvent(new Event('beforeprint'))")
+    assert [fault for fault in page_faults(browser) if "number cut short" in fault] == []
