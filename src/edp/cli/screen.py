@@ -14,6 +14,7 @@ from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listin
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.errors import count_of
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -170,7 +171,11 @@ def show_selection(selection: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
     screening = selection.screening
     rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in screening.proposal.choices if c.keep]
-    listing(f"keep: {len(rows)} of {len(screening.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
+    listing(
+        f"keep: {len(rows)} of {count_of(len(screening.channels), 'channel')}",
+        ["channel", "score", "why"],
+        rows[:SHOWN],
+    )
     if len(rows) > SHOWN:
         out.print(f"  ... and {len(rows) - SHOWN} more in {selection.files['page']}")
     out.print()

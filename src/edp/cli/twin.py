@@ -11,6 +11,7 @@ from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_te
 from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, within
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
+from edp.errors import count_of
 from edp.settings.bounds import MIN_MINUTES, above, span
 from edp.storage.paths import full_path, is_file_at
 
@@ -193,7 +194,10 @@ def score_table(models: dict[str, Any]) -> None:
         rows.append([name, *(_number(one["stroke_error"][k]["mean"]) for one in models.values())])
     rows.append(["pressure, deviations", *(_number(one["pressure_nrmse"]["mean"]) for one in models.values())])
     rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in models.values())])
-    out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over actuators and runs:")
+    out.print(
+        f"{count_of(first['runs'], 'free run')} of {first['seconds']:g} s on commands alone, mean over actuators "
+        "and runs:"
+    )
     # A column a model: with a column a time it would be too wide for a terminal of 80.
     table("MAE of velocities, stroke error by time, NRMSE of pressures", ["", *models], rows)
 
@@ -202,7 +206,7 @@ def actuator_tables(models: dict[str, Any]) -> None:
     """Print a table an actuator: errors of its velocity and of its stroke by time, a row a model."""
     first = next(iter(models.values()))
     strokes = first["stroke_error"]
-    out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over runs:")
+    out.print(f"{count_of(first['runs'], 'free run')} of {first['seconds']:g} s on commands alone, mean over runs:")
     places = zip(first["velocity_mae"]["by_channel"], strokes[0]["by_channel"], strict=True)
     for velocity, stroke in places:
         unit, length = first["velocity_mae"]["units"][velocity], strokes[0].get("units", {}).get(stroke, "")

@@ -159,4 +159,4 @@ def test_what_cannot_be_read_is_refused(folder, spoil, reason):
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, folder):
-    check_page(browser, write_transfer_page(folder(content())), "transfer")
+    check_page(browser, write_transfer_page(folder(content())), "transfer", CYLINDERS)

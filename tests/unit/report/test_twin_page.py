@@ -188,4 +188,4 @@ def test_damaged_runs_are_refused(folder):
 def test_the_page_in_a_browser(browser, tmp_path):
     page = tmp_path / "twin.html"
     page.write_text(render(facts_of()))
-    check_page(browser, page, "free runs")
+    check_page(browser, page, "free runs", ("boom", "dig"))

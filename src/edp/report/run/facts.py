@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError, StorageError
+from edp.errors import DataError, StorageError, count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import read_scores
-from edp.report.common.wording import decimals_for, listed, number, percent
+from edp.report.common.wording import decimals_for, figure, listed, number, percent
 from edp.report.run.budget import budget_name, budget_rows
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
@@ -261,8 +261,8 @@ def _check_predictions(facts: Facts) -> None:
 def horizon_text(facts: Facts, samples: int) -> str:
     """A horizon in milliseconds, or in samples where the rate is unknown."""
     if facts.rate_hz is None:
-        return f"{samples} sample{'s' if samples != 1 else ''}"
-    return f"{1000 * samples / facts.rate_hz:g} ms"
+        return count_of(samples, "sample")
+    return f"{figure(1000 * samples / facts.rate_hz)} ms"
 
 
 def main_horizon(facts: Facts) -> int | None:
@@ -348,7 +348,7 @@ def verdict_lines(facts: Facts) -> list[str]:
         )
         won, both = recordings_won(facts, best["model"])
         if both:
-            lines.append(f"It is the better of the two on {won} of {both} test recordings.")
+            lines.append(f"It is the better of the two on {won} of {count_of(both, 'test recording')}.")
     lines += [line for line in (losses_line(facts.scores) if facts.scores else "",) if line]
     judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
     beyond = situation_line(facts.scores) if facts.scores else ""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from edp.errors import StorageError
+from edp.errors import StorageError, count_of
 from edp.evaluation.guard import ErrorVerdict
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
@@ -236,9 +236,10 @@ def caveats(facts: Transfer) -> list[str]:
     minutes = facts.content["data"]["minutes"]
     return [
         f"Trained on {minutes['train']:.1f} min, epochs chosen on {minutes['validation']:.1f} min, judged on "
-        f"{minutes['test']:.1f} min: the end of each of {facts.content['data']['recordings']} logs, a gap of W + k "
+        f"{minutes['test']:.1f} min: the end of each of {count_of(facts.content['data']['recordings'], 'log')}, a "
+        "gap of W + k "
         "apart.",
-        "The test part holds the conditions of the logs, not others: another soil, load or temperature is not in it.",
+        "The test part holds the conditions of the logs, not others: another load or temperature is not in it.",
         "One training each: differences of a percent between methods may be chance.",
         *facts.content["notes"],
     ]
