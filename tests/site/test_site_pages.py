@@ -268,6 +268,17 @@ def test_a_built_page_is_held_to_its_links_and_to_loading_nothing(tmp_path):
     assert len([problem for problem in problems_of(tmp_path) if problem.startswith("plain.html")]) == 3
 
 
+def test_a_figure_at_the_end_of_a_cell_is_a_picture_of_the_page(tmp_path):
+    source = "import edp, numpy\ndata = edp.Recordings.from_arrays(numpy.zeros((50, 1)), rate_hz=100)\ndata.plot()"
+    cell = {"cell_type": "code", "source": source, "outputs": [], "metadata": {}, "execution_count": None}
+    (tmp_path / "a.ipynb").write_text(json.dumps({"nbformat": 4, "cells": [cell]}))
+    ran = notebooks.run_notebook(tmp_path / "a.ipynb", tmp_path)
+    (tmp_path / "a.ipynb").write_text(json.dumps(ran))
+    page = notebooks.notebook_page(tmp_path / "a.ipynb", tmp_path / "pictures")
+    assert "![What the cell above draws](pictures/a_1.png)" in page
+    assert (tmp_path / "pictures" / "a_1.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_a_notebook_runs_and_is_shown(tmp_path):
     cells = ["import matplotlib.pyplot as plt\nplt.plot([1, 2])\nprint('said')\n3 + 4", "1 / 0"]
     code = [{"cell_type": "code", "metadata": {}, "source": text, "outputs": []} for text in cells]

@@ -93,9 +93,16 @@ def _run_cell(source: str, space: dict[str, Any]) -> list[dict[str, Any]]:
     if text := printed.getvalue():
         outputs.append({"output_type": "stream", "name": "stdout", "text": _lines(text)})
     if value is not None:
-        data = {"text/plain": _lines(repr(value))}
+        data = {"text/plain": _lines(repr(value))} | _picture_of(value)
         outputs.append({"output_type": "execute_result", "execution_count": None, "metadata": {}, "data": data})
     return outputs + _pictures()
+
+
+def _picture_of(value: Any) -> dict[str, str]:
+    """Return the picture that a value shows of itself in a notebook, by its type; empty if it has none."""
+    bundle = getattr(value, "_repr_mimebundle_", None)
+    shown = bundle() if callable(bundle) else {}
+    return {"image/png": shown["image/png"] + "\n"} if "image/png" in shown else {}
 
 
 def _pictures() -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 
 MODELS = ("twin", "persistence")
@@ -45,7 +45,7 @@ def forecast(
 
         def note(name: str, number: int, of: int) -> None:
             shown.update(bar, total=of, completed=number - 1, note=name)
-            steps.say(f"forecast: log {number} of {of}, {name}")
+            steps.say(f"forecast: log {count_text(number, of)}, {name}")
 
         result = forecast_logs(run, source_of(data, signal_map, repair), ahead, folder, answer, gain, note)
     facts = {

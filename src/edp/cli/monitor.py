@@ -96,6 +96,7 @@ def fit(
         "one_machine": fitted.one_machine,
         "promise": monitor.limit.sentence(),
         "found_sizes": list(monitor.provenance.get("found_sizes", [])),
+        "found_effort": monitor.provenance.get("found_effort"),
     }
 
     def show() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import Steps, out, table
+from edp.cli.console import Steps, count_text, out, table
 from edp.cli.options import MOST_HOURS, within
 from edp.settings.bounds import above
 
@@ -47,8 +47,10 @@ class LogDisplay:
 
     def on_log(self, path: Path, number: int, count: int) -> None:
         """Show one log."""
-        self.shown.update(self.bar, completed=(number - 1) / count, note=f"{path.name}, {number} of {count}")
-        self.steps.say(f"read: {path.name}, {number} of {count}")
+        self.shown.update(
+            self.bar, completed=(number - 1) / max(1, count), note=f"{path.name}, {count_text(number, count)}"
+        )
+        self.steps.say(f"read: {path.name}, {count_text(number, count)}")
 
 
 def show_report(report: QualityReport) -> None:

@@ -197,9 +197,10 @@ class SearchDisplay:
         counts, left = study_log.counts(), study_log.seconds_left()
         # No more than are asked for: workers may be idle at the end of a batch.
         running = min(study_log.workers, counts["asked"] - counts["done"])
-        note = f"{self.title}: {counts['done']} trainings, {running} running, {counts['total'] - counts['done']} left"
+        remaining = max(0, counts["total"] - counts["done"])
+        note = f"{self.title}: {counts['done']} trainings, {running} running, {remaining} left"
         self.shown.update(self.bar, completed=counts["done"] / max(1, counts["total"]), note=note)
-        self.steps.say(f"search: {note}" + ("" if left is None else f", at most {duration(left)}"))
+        self.steps.say(f"search: {note}" + ("" if not left else f", at most {duration(max(1.0, left))}"))
 
     def on_decision(self, decision: Decision) -> None:
         """Print what was decided, and why."""

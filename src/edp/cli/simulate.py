@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, out, progress, table
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 
 if TYPE_CHECKING:
@@ -144,7 +144,8 @@ def run(
             left = elapsed / max(1, counts["new"]) * (order.recordings - done)
             note = f"{counts['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
             shown.update(bar, advance=1, note=note)
-            steps.say(f"simulate: {done:g} of {order.recordings} recordings, {note}, {duration(left)} left")
+            count = count_text(round(done), order.recordings)
+            steps.say(f"simulate: {count} recordings, {note}{left_text(left)}")
 
         if workforce is not None:
             from edp.workflows.fleet.simulating import simulate_with
@@ -164,7 +165,7 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: in
         def on_done(done: int, total: int) -> None:
             left = (time.monotonic() - began) / done * (total - done)
             shown.update(bar, completed=done, total=total)
-            steps.say(f"limit: {done} of {total} recordings branched, {duration(left)} left")
+            steps.say(f"limit: {count_text(done, total)} recordings branched{left_text(left)}")
 
         return find_data_set_limit(folder, order, spec, workers, on_done)
 

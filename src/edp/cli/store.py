@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, err, listing, out, progress, table
 from edp.cli.inspect import FAULTY
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
@@ -59,7 +59,7 @@ def build(
         def note(reached: StoreProgress) -> None:
             refused = f", {reached.refused} refused" if reached.refused else ""
             shown.update(bar, total=reached.of, completed=reached.logs, note=f"{reached.logs} logs{refused}")
-            steps.say(f"store: {reached.logs} of {reached.of} logs{refused}")
+            steps.say(f"store: {count_text(reached.logs, reached.of)} logs{refused}")
 
         if cluster:
             from edp.workflows.fleet.storing import store_with

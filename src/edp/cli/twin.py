@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_text, out, progress, table
 from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, within
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
@@ -303,9 +303,7 @@ class FitDisplay:
         """How far it is."""
         error = "" if event.validation is None else f", free-run error {event.validation:.3g} deviations"
         # A fit that goes on beyond its plan has no time left to state.
-        more = event.update > event.updates
-        count = f"{event.update}, more than the {event.updates} planned" if more else f"{event.update}/{event.updates}"
-        left = "" if more else f", {duration(event.seconds_left)} left"
-        note = f"update {count}, runs of {event.length_s:g} s{error}"
-        self.shown.update(self.bar, completed=min(1.0, event.update / event.updates), note=note)
+        left = "" if event.update >= event.updates else left_text(event.seconds_left)
+        note = f"update {count_text(event.update, event.updates, '/')}, runs of {event.length_s:g} s{error}"
+        self.shown.update(self.bar, completed=event.update / max(1, event.updates), note=note)
         self.steps.say(f"{self.what}: {note}{left}")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, EdpError, closest
 from edp.logs.formats.base import RawLog, RawSignal
-from edp.logs.units import kind_of_unit, unit_for
+from edp.logs.units import check_unit, kind_of_unit, unit_for
 from edp.signals import VOCABULARY, Channel, ChannelMap, SignalMap, Unit
 
 _LOOKED_ROWS = 1000
@@ -110,13 +110,14 @@ def _nothing_known(raw: RawLog) -> DataError:
 def _one(raw: RawLog, entry: ChannelMap) -> ChannelSource:
     channel = entry.channel()
     where = f"'{raw.path}', column '{entry.column}'"
+    stated = check_unit(entry.unit, f"{where}: signal map, channel '{entry.name}'")
     present = entry.column in raw
     if not present and entry.column in raw.scalars:
-        unit = unit_for(entry.unit, channel.kind, where)
+        unit = unit_for(stated, channel.kind, where)
         value = raw.scalars[entry.column] * entry.scale * unit.factor + unit.offset
         # A single number of a MAT file fills a channel: gains are constant by nature.
         return ChannelSource(channel, None, unit, constant=value)
     if not present and entry.constant is not None:
         return ChannelSource(channel, None, Unit((channel.kind,), 1.0), constant=entry.constant)
     signal = raw.signal(entry.column)
-    return ChannelSource(channel, signal, unit_for(entry.unit or signal.unit, channel.kind, where), entry.scale)
+    return ChannelSource(channel, signal, unit_for(stated or signal.unit, channel.kind, where), entry.scale)

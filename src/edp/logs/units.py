@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
+
 from edp.errors import ConfigError, DataError
-from edp.signals import UNITS, Kind, Unit, conversion
+from edp.settings.bounds import shown
+from edp.signals import TIME_UNITS, UNITS, Kind, Unit, conversion
 
 ALIASES = {
     "m/s²": "m/s^2",
@@ -71,6 +74,38 @@ def normalise_unit(text: str | None) -> str | None:
     if not unit:
         return None
     return ALIASES.get(unit, unit)
+
+
+def check_unit(stated: str | None, where: str) -> str | None:
+    """Return the usual name of a unit that a user wrote; None for an empty text.
+
+    Units that a file states are not checked: a logger may write anything, and such a column has no kind.
+
+    Args:
+        stated: the unit as written in a signal map or a call.
+        where: the channel and its source, for the message.
+
+    Raises:
+        DataError: the unit is unknown; names the closest units.
+    """
+    unit = normalise_unit(stated)
+    if unit is None or unit in UNITS or unit in TIME_UNITS or unit in OTHER_UNITS:
+        return unit
+    near = _closest_units(unit)
+    hint = f"did you mean {' or '.join(repr(name) for name in near)}?" if near else f"known: {', '.join(UNITS)}"
+    raise DataError(
+        f"{where}: unknown unit {shown(unit)}; {hint} (docs/channels.md lists all); correct it, or leave it out to "
+        "take the numbers unconverted"
+    )
+
+
+def _closest_units(unit: str, count: int = 3) -> list[str]:
+    """Return the usual names of the known units whose spelling is closest, without regard to capitals."""
+    spellings: dict[str, str] = {}
+    for spelling, usual in {**ALIASES, **{name: name for name in UNITS}}.items():
+        spellings.setdefault(spelling.lower(), usual)
+    near = difflib.get_close_matches(unit.lower()[:40], list(spellings), n=3 * count, cutoff=0.5)
+    return list(dict.fromkeys(spellings[spelling] for spelling in near))[:count]
 
 
 def kind_of_unit(stated: str | None) -> Kind:

@@ -37,12 +37,12 @@ def test_units_are_converted_and_tell_the_kind(rig):
         ("CylVels_1", "mm/s", "velocity", 0.003),
         ("BmUp", "bar", "pilot_pressure", 3e5),
         ("BmUp", "V", "voltage", 3.0),
-        ("BmUp", "furlong", "generic", 3.0),
+        ("BmUp", "kW", "generic", 3.0),
         ("oil", "°C", "temperature", 276.15),
         ("x", "%", "ratio", 0.03),
     ],
 )
-def test_any_name_and_any_unit_are_taken(name, unit, kind, value):
+def test_any_name_and_any_known_unit_are_taken(name, unit, kind, value):
     (recording,) = from_arrays(np.full((4, 1), 3.0), names=[name], units=None if unit is None else [unit])
     assert str(recording.channels[0].kind) == kind
     np.testing.assert_allclose(recording.values, value, rtol=1e-6)
@@ -198,9 +198,9 @@ def test_what_edp_wrote_is_read_back(rig, tmp_path):
 
 def test_notebook_display_escapes_names():
     hostile = "<script>alert(1)</script>\u202e"
-    data = from_arrays(np.zeros((5, 1)), names=[hostile], recording_names=["<img src=x>"], units=["<b>m"])
+    data = from_arrays(np.zeros((5, 1)), names=[hostile], recording_names=["<img src=x>"], units=["m"])
     shown = data._repr_html_()
-    for mark in ("<script", "<img", "<b>m", "\u202e"):
+    for mark in ("<script", "<img", "\u202e"):
         assert mark not in shown
     assert "&lt;script&gt;" in shown
     text = data.plot().to_json()

@@ -85,7 +85,7 @@ def test_what_goes_both_ways_is_not_told_apart(make_run):
     run = make_run("first", recordings=6)
     comparison = compare_runs([run, changed(run, "second", [1.3, 0.7, 1.2, 0.8, 1.1, 0.9])])
     assert not comparison.differences(comparison.measures[0])["second"].told_apart
-    assert "second cannot be told apart" in comparison.headline()
+    assert "second is not distinguishable" in comparison.headline()
 
 
 def test_p_values_are_adjusted_for_the_number_of_runs(make_run):

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["BLUE", "DROPPED", "INK", "NOT_XML", "file_name", "write_drawings", "write_pictures"]
+__all__ = ["BLUE", "DROPPED", "INK", "NOT_XML", "draw_png", "file_name", "write_drawings", "write_pictures"]
 
 DPI = 150
 FORMATS = ("svg", "png")
@@ -98,7 +98,19 @@ def write_drawings(folder: str | Path, drawings: Mapping[str, Callable[[Figure],
     return [path for name, draw in drawings.items() for path in _write(target, name, draw)]
 
 
+def draw_png(chart: Chart, dpi: int = DPI) -> bytes:
+    """Return a chart without choices as a PNG image."""
+    return _draw_formats(partial(draw, chart=chart), dpi)["png"]
+
+
 def _write(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path]:
+    for suffix, content in _draw_formats(draw, DPI).items():
+        write_bytes(folder / f"{name}.{suffix}", content)
+    return [folder / f"{name}.{suffix}" for suffix in FORMATS]
+
+
+def _draw_formats(draw: Callable[[Figure], None], dpi: int) -> dict[str, bytes]:
+    """Return the content of the picture in each format."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -107,7 +119,7 @@ def _write(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path
 
     bytes_of, vector = io.BytesIO(), io.StringIO()
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(dpi=DPI, layout="constrained")
+        figure = Figure(dpi=dpi, layout="constrained")
         bitmap = FigureCanvasAgg(figure)
         draw(figure)
         for text in figure.findobj(Text):
@@ -119,9 +131,7 @@ def _write(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path
         # No program name and no date: equal content gives equal bytes.
         bitmap.print_png(bytes_of, metadata={"Software": None})
         FigureCanvasSVG(figure).print_svg(vector, metadata={"Date": None})
-    write_bytes(folder / f"{name}.svg", NOT_XML.sub("\ufffd", vector.getvalue()).encode())
-    write_bytes(folder / f"{name}.png", bytes_of.getvalue())
-    return [folder / f"{name}.{suffix}" for suffix in FORMATS]
+    return {"svg": NOT_XML.sub("\ufffd", vector.getvalue()).encode(), "png": bytes_of.getvalue()}
 
 
 def file_name(target: str) -> str:

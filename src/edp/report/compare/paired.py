@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.evaluation.guard import ErrorOutcome
 from edp.report.common.wording import listed, number, percent
 from edp.report.compare.runs import FREE, MEAN, ComparedRun, Measure, read_runs, recording_that_differs
 from edp.report.run.facts import NETWORK, TRUTH
@@ -120,7 +121,7 @@ class Comparison:
                 sign = percent(difference.change, signed=True)
                 ends = (difference.low, difference.high)
                 reach = "" if None in ends else f", 95 % interval {' to '.join(percent(e, signed=True) for e in ends)}"
-                parts.append(f"{name} cannot be told apart ({sign}{reach})")
+                parts.append(f"{name} is {ErrorOutcome.OPEN} ({sign}{reach})")
         rest = len(self.runs) - 1 - len(parts)
         more = f"; {rest} more below" if rest > 0 else ""
         error = f"{number(self.error(first, measure))} {measure.unit}".rstrip()

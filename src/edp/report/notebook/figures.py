@@ -126,6 +126,6 @@ def _in_report_unit(values: Array, channel: Channel) -> Array:
 
 def _figure(chart: Chart, title: str = "") -> go.Figure:
     # Plotly takes half a second to import, which `edp.read` alone should not cost.
-    from edp.report.common.interactive import plot
+    from edp.report.notebook.display import show_chart
 
-    return plot(chart, title).figure
+    return show_chart(chart, title)

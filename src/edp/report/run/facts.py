@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError
-from edp.evaluation.guard import MEASURE, MEASURE_NAME, ErrorOutcome, network_verdict
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
 from edp.report.run.budget import budget_name, budget_rows
@@ -316,12 +316,14 @@ def headline(facts: Facts) -> str:
         missing = f"This run has no scores yet; `edp evaluate {facts.folder}` makes them"
         return f"{unfinished_text(facts.folder) or missing}."
     judged = network_verdict(facts.scores, minutes_of(facts.folder)) if facts.scores else None
-    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
-        return judged.sentence()
-    first = "" if judged is None else judged.sentence()
+    figures = _figures(facts, rows, samples)
+    return figures if judged is None else judged.headline(figures)
+
+
+def _figures(facts: Facts, rows: Sequence[Mapping[str, Any]], samples: int) -> str:
     if not facts.averaged and facts.scores:
         targets = [(target.name, target.description, target.unit) for target in facts.targets]
-        return f"{first} {by_output(facts.scores, samples, targets, horizon_text(facts, samples))}".strip()
+        return by_output(facts.scores, samples, targets, horizon_text(facts, samples))
     unit = facts.unit
     values = {row["model"]: score(facts.models[row["model"]], samples) for row in rows}
     places = min(max(decimals_for(values.values(), significant=2), 1), 4 if unit else 8)
@@ -329,7 +331,7 @@ def headline(facts: Facts) -> str:
     shown = parts if len(parts) <= 4 else [*parts[:3], f"{len(parts) - 3} more above that"]
     ours = f"{number(values[NETWORK], places)} {unit}".rstrip()
     start = f"At {horizon_text(facts, samples)} ahead the network is off by {ours}"
-    return f"{first} {'; '.join([f'{start} ({MEASURE_NAME})', *shown])}.".strip()
+    return f"{'; '.join([f'{start} ({MEASURE_NAME})', *shown])}."
 
 
 def verdict_lines(facts: Facts) -> list[str]:

@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from edp.errors import StorageError
-from edp.evaluation.guard import ErrorOutcome, ErrorVerdict
+from edp.evaluation.guard import ErrorVerdict
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
@@ -195,8 +195,11 @@ def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
 def headline(facts: Transfer) -> str:
     """One sentence: what was gained."""
     judged = transfer_verdict(facts)
-    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
-        return judged.sentence().removesuffix(".")
+    figures = _figures(facts)
+    return figures if judged is None else judged.headline(figures)
+
+
+def _figures(facts: Transfer) -> str:
     horizon = facts.horizons[-1]
     before, after = (facts.score(name, horizon)["mae"] for name in facts.pair)
     gain = facts.gain(horizon)

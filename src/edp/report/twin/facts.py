@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from edp.errors import StorageError
-from edp.evaluation.guard import ErrorOutcome, twin_verdict
+from edp.evaluation.guard import twin_verdict
 from edp.evaluation.scores_file import (
     COUNT,
     NAME,
@@ -217,10 +217,13 @@ def _check_arrays(facts: FreeRunFacts, path: Path) -> None:
 
 def headline(facts: FreeRunFacts) -> str:
     """The error of the strokes at the end of the runs in one sentence; of the answers where they are plain numbers."""
-    twin = facts.twin
     judged = twin_verdict(facts.models)
-    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
-        return judged.sentence().removesuffix(".")
+    figures = _figures(facts)
+    return figures if judged is None else judged.headline(figures)
+
+
+def _figures(facts: FreeRunFacts) -> str:
+    twin = facts.twin
     plain = _plain_answers(facts)
     if plain:
         off = number(twin["velocity_mae"]["mean"])

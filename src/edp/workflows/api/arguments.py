@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
 from edp.logs.read import RATE_TOLERANCE
+from edp.logs.units import check_unit
 from edp.recording import Recording
 from edp.signals import KINDS, Kind
 
@@ -103,7 +104,7 @@ def units_of(units: Sequence[str | None] | Mapping[str, str] | None, names: Sequ
     """Units that a user gave, by channel.
 
     Raises:
-        DataError: another number of them, an unknown channel, or no texts.
+        DataError: another number of them, an unknown channel, an unknown unit, or no texts.
     """
     if units is None:
         return {}
@@ -121,4 +122,6 @@ def units_of(units: Sequence[str | None] | Mapping[str, str] | None, names: Sequ
         raise DataError(
             f"units: that of '{wrong[0]}' is no text; give its name, such as {KINDS[Kind.PRESSURE].si_unit}"
         )
+    for name, unit in pairs:
+        check_unit(unit, f"units, channel '{name}'")
     return dict(pairs)

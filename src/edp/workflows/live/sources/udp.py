@@ -13,8 +13,9 @@ import numpy as np
 
 from edp.errors import ConfigError, DataError
 from edp.live.addresses import LOOPBACK, resolve_bind
+from edp.logs.units import check_unit, unit_for
 from edp.settings.bounds import shown
-from edp.signals import VOCABULARY, Channel, Kind, SignalMap, conversion
+from edp.signals import VOCABULARY, Channel, Kind, SignalMap
 from edp.storage.reading import parse_json
 from edp.workflows.live.sources.arrivals import Arrivals
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
@@ -182,9 +183,9 @@ def _conversions(signal_map: SignalMap | None) -> Callable[[str, Mapping[str, fl
     """From a channel's name and a row to its value in SI units."""
     entries: dict[str, Any] = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
     units = {
-        name: conversion(entry.unit, entry.channel().kind, f"signal map, channel '{name}'")
+        name: unit_for(check_unit(entry.unit, where), entry.channel().kind, where)
         for name, entry in entries.items()
-        if entry.unit is not None
+        if entry.unit is not None and (where := f"signal map, channel '{name}'")
     }
 
     def convert(name: str, message: Mapping[str, float]) -> float:
