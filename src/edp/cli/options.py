@@ -72,9 +72,9 @@ def check_belonging(context: typer.Context) -> None:
     """
     command = " ".join(context.command_path.split()[1:])
     words = {parameter.name: _word(parameter) for parameter in context.command.params}
-    given = {name for name in words if _is_given(context, name)}
+    stated = {name for name in words if _is_given(context, name)}
     for name, owners in _rules(OWNERS, command, words):
-        if name in given and not given.intersection(owners):
+        if name in stated and not stated.intersection(owners):
             needed = " or ".join(words[owner] for owner in owners)
             raise ConfigError(
                 f"{words[name]}: it has no effect without {needed}, to which it belongs; give {needed}, or leave "
@@ -82,7 +82,7 @@ def check_belonging(context: typer.Context) -> None:
             )
     for name, others in _rules(EXCLUDED, command, words):
         for other in others:
-            if name in given and other in given:
+            if name in stated and other in stated:
                 raise ConfigError(f"{words[other]}: it has no effect beside {words[name]}; leave one of them out")
 
 
