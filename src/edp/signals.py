@@ -140,6 +140,43 @@ UNITS: Mapping[str, Unit] = {
 }
 
 
+UNIT_ENDINGS: Mapping[str, str] = {
+    ending: unit
+    for unit, endings in {
+        **{
+            unit: unit for unit in ("bar", "kPa", "MPa", "psi", "mm", "cm", "rpm", "kN", "deg", "rad", "mV", "mA", "kg")
+        },
+        "%": "percent prozent pct",
+        "m/s": "mps",
+        "mm/s": "mmps",
+        "L/min": "lpm lmin",
+        "V": "volt volts",
+        "A": "ampere",
+        "deg/s": "dps degps",
+        "rad/s": "radps",
+        "K": "kelvin",
+        "degC": "degC celsius",
+    }.items()
+    for ending in endings.lower().split()
+}
+"""Last words of names, in lower case, that are units."""
+UNIT_TAILS: Mapping[str, str] = {
+    "degC": "degC",
+    "degF": "degF",
+    **{unit: unit for unit in ("kPa", "MPa", "kN", "mA", "mV")},
+    "m_s": "m/s",
+    "mm_s": "mm/s",
+    "cm_s": "cm/s",
+    **dict.fromkeys(("m_s2", "mps2"), "m/s^2"),
+    **dict.fromkeys(("mm_s2", "mmps2"), "mm/s^2"),
+    "rad_s": "rad/s",
+    "deg_s": "deg/s",
+    **dict.fromkeys(("l_min", "L_min"), "L/min"),
+}
+"""Ends of names behind an underscore that are units as they are written, capitals and divisions included. Single
+letters are not among them: ``p_A`` is a chamber, ``x_m`` may be a measured one."""
+
+
 def display_offset(unit: str) -> float:
     """Return what is added to a value (SI value * factor) of a unit that pages show: -273.15 for degrees Celsius."""
     of_logs = UNITS.get(unit)

@@ -14,11 +14,12 @@ from edp import __version__
 from edp.errors import ExportError
 from edp.export.golden import GOLDEN_TICKS, golden_recording, stream
 from edp.export.hashes import model_hash, scale_hash
+from edp.export.si_names import si_channels, si_names
 from edp.ir import Graph
 from edp.ir.hydraulics import HydraulicTick
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import Predictor
-from edp.signals import KINDS
+from edp.signals import KINDS, Kind
 from edp.training.bundle import Bundle
 
 SCHEMA = 1
@@ -48,6 +49,7 @@ class Description:
         """Plain values that JSON can hold."""
         bundle, task = self.bundle, self.bundle.task
         kinds, texts = bundle.target_kinds, bundle.descriptions
+        target_names = si_names(task.targets, kinds)
         return {
             "schema": SCHEMA,
             "edp": __version__,
@@ -60,17 +62,23 @@ class Description:
             "window": self.graph.window,
             "mode": str(task.mode),
             "inputs": [
-                {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description}
-                for c in bundle.inputs
+                entry_of(c.name, own.name, c.kind, c.description)
+                for c, own in zip(bundle.inputs, si_channels(bundle.inputs), strict=True)
             ],
             "targets": [
-                {"name": name, "unit": KINDS[kind].si_unit, "kind": str(kind), "description": text}
-                for name, kind, text in zip(task.targets, kinds, texts, strict=True)
+                entry_of(logged, name, kind, text)
+                for logged, name, kind, text in zip(task.targets, target_names, kinds, texts, strict=True)
             ],
             "horizons": [{"ticks": k, "seconds": k / task.rate_hz} for k in task.horizons],
             "coverages": list(bundle.predictor.output.coverages),
             "results": {meaning: list(shape) for meaning, shape in self.shapes.items()},
         }
+
+
+def entry_of(logged: str, name: str, kind: Kind, description: str) -> dict[str, str]:
+    """Return one channel as plain values; ``original`` is its name in the log where that names another unit."""
+    entry = {"name": name, "unit": KINDS[kind].si_unit, "kind": str(kind), "description": description}
+    return entry if name == logged else entry | {"original": logged}
 
 
 def shape_of_result(graph: Graph, value: str, targets: int) -> tuple[int, int]:

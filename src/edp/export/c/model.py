@@ -16,12 +16,14 @@ from edp.export.c.plan import MemoryPlan, plan
 from edp.export.c.text import filled, indented, number
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.hashes import little_endian, model_hash, scale_hash
+from edp.export.si_names import si_channels, si_names
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
 from edp.ir import Graph, Layer, memory
 from edp.ir.base import Number
 from edp.ir.hydraulics import HydraulicTick
 from edp.networks.input_range import HOLD_TICKS, LIMIT, input_limits
 from edp.networks.integer import IntegerPredictor
+from edp.signals import KINDS
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
@@ -168,14 +170,18 @@ class Model:
     def _what(self) -> Code:
         task = self.bundle.task
         when = ", ".join(f"{k} ticks ({1000 * k / task.rate_hz:g} ms)" for k in task.horizons)
-        targets = ", ".join(map(c_comment, task.targets))
-        lines = [f" *   prediction[h][t]  {targets}, SI units, for each of {when} ahead"]
+        units = [KINDS[kind].si_unit for kind in self.bundle.target_kinds]
+        targets = ", ".join(c_comment(f"{name} [{unit}]") for name, unit in zip(self._targets(), units, strict=True))
+        lines = [f" *   prediction[h][t]  {targets}, for each of {when} ahead"]
         covered = ", ".join(f"{100 * c:g} %" for c in self.bundle.predictor.output.coverages)
         if covered:
             lines.append(f" *   lower, upper[i][h][t]  bounds of intervals meant to hold {covered} of the true values")
         if self.graph.fed_back:
             lines += [line.format(ticks=self.graph.window) for line in PLANT]
         return Code("\n".join(lines))
+
+    def _targets(self) -> list[str]:
+        return si_names(self.bundle.task.targets, self.bundle.target_kinds)
 
     def _cost(self) -> Code:
         text = EQUATIONS_COST if self.hydraulic else COST
@@ -191,12 +197,14 @@ class Model:
         inputs = [
             (f"{upper}_IN_{name} = {i},", f"{channel.unit}; {channel.description}")
             for i, (name, channel) in enumerate(
-                zip(c_names((c.name for c in self.bundle.inputs), most), self.bundle.inputs, strict=True)
+                zip(c_names((c.name for c in si_channels(self.bundle.inputs)), most), self.bundle.inputs, strict=True)
             )
         ]
         targets = [
-            (f"{upper}_OUT_{name} = {i},", text)
-            for i, (name, text) in enumerate(zip(c_names(task.targets, most), self.bundle.descriptions, strict=True))
+            (f"{upper}_OUT_{name} = {i},", "; ".join(part for part in (KINDS[kind].si_unit, text) if part))
+            for i, (name, kind, text) in enumerate(
+                zip(c_names(self._targets(), most), self.bundle.target_kinds, self.bundle.descriptions, strict=True)
+            )
         ]
         ahead = [
             (f"{upper}_AHEAD_{k} = {i},", f"{k} ticks, {1000 * k / task.rate_hz:g} ms")

@@ -18,6 +18,7 @@ from edp.export.controller.numbers import ConstantTables, constants_of_controlle
 from edp.export.controller.parts import AXES, ControllerParts, GoldenLoop, PlanParts
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.folder import write_export
+from edp.export.si_names import si_channels
 from edp.export.sizes import check_sizes
 from edp.networks.input_range import HOLD_TICKS
 
@@ -224,7 +225,9 @@ class ControllerFiles:
 
     def _input_enum(self) -> Code:
         upper = self.name.upper()
-        names = c_names((channel.name for channel in self.parts.inputs), C_SIGNIFICANT - len(f"{upper}_CONTROL_IN_"))
+        names = c_names(
+            (channel.name for channel in si_channels(self.parts.inputs)), C_SIGNIFICANT - len(f"{upper}_CONTROL_IN_")
+        )
         return Code(
             "\n".join(
                 f"    {upper}_CONTROL_IN_{own} = {i}, /* {c_comment('; '.join((channel.unit, channel.description)))} */"

@@ -7,6 +7,7 @@ from typing import Literal
 
 from edp.export.c.model import Model
 from edp.export.escape import LONGEST_NAME, LONGEST_TEXT, shown_names, visible
+from edp.export.si_names import si_channels, si_names
 from edp.networks.input_range import usual_range
 from edp.signals import KINDS, Kind
 
@@ -55,7 +56,7 @@ def variables(model: Model) -> list[Variable]:
     _, spread = usual_range(model.bundle.predictor)
     entries = [
         Variable(entry.name, "input", entry.description, kind=entry.kind, nominal=_nominal(width))
-        for entry, width in zip(model.bundle.inputs, spread, strict=True)
+        for entry, width in zip(si_channels(model.bundle.inputs), spread, strict=True)
     ]
     return unique(entries + _predictions(model) + list(OWN))
 
@@ -73,7 +74,7 @@ def _predictions(model: Model) -> list[Variable]:
     for ending, text in ends_of:
         for row, ticks in zip(widths, task.horizons, strict=True):
             when = f"{ticks} ticks ({1000 * ticks / task.rate_hz:g} ms) after the inputs of the last step"
-            for at, name in enumerate(task.targets):
+            for at, name in enumerate(si_names(task.targets, bundle.target_kinds)):
                 what = f"[{visible(name, LONGEST_NAME)}] {when}{text}"
                 about = " ".join(part for part in (visible(bundle.descriptions[at]), what) if part)
                 kind = bundle.target_kinds[at]

@@ -26,6 +26,7 @@ from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.folder import write_export
 from edp.export.follower.parts import FollowerParts
 from edp.export.hashes import model_hash, scale_hash
+from edp.export.si_names import si_channels
 from edp.export.sizes import check_sizes
 from edp.ir.hydraulics import HydraulicTick
 from edp.networks.twin.tuned import LEAST, TunedTwin
@@ -208,7 +209,7 @@ def _own(path: str) -> str:
 
 
 def _enum(prefix: str, channels: Iterable[Channel]) -> Code:
-    every = list(channels)
+    every = si_channels(channels)
     return _listed(prefix, [c.name for c in every], ["; ".join((c.unit, c.description)) for c in every])
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from edp import __version__
+from edp.export.description import entry_of
 from edp.export.monitor.parts import MonitorParts
+from edp.export.si_names import si_channels
 
 SCHEMA = 1
 SUMMARIES = ("mean", "spread", "gain", "lag", "peak")
@@ -26,7 +28,8 @@ def description(parts: MonitorParts, name: str) -> dict[str, Any]:
         "block_s": chain.block / parts.rate_hz,
         "settle_blocks": chain.settle,
         "inputs": [
-            {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in parts.inputs
+            entry_of(c.name, own.name, c.kind, c.description)
+            for c, own in zip(parts.inputs, si_channels(parts.inputs), strict=True)
         ],
         "residuals": list(parts.residuals),
         "summaries": [*SUMMARIES, *(f"drive{number + 1}" for number in range(len(chain.drivers)))],

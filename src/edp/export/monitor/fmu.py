@@ -14,6 +14,7 @@ from edp.export.folder import write_export
 from edp.export.monitor.describe import description
 from edp.export.monitor.parts import MonitorParts
 from edp.export.monitor.write import monitor_files
+from edp.export.si_names import si_channels
 
 STATUS = "0 judged; 1 warming up: blocks after a reset that are not judged; 2 an input is missing, residuals are silent"
 OUTPUTS = (
@@ -34,7 +35,7 @@ def monitor_variables(parts: MonitorParts) -> list[Variable]:
     spread = 1.0 / parts.chain.spread
     inputs = [
         Variable(c.name, "input", c.description, kind=c.kind, nominal=float(f"{abs(width):.3g}") or 1.0)
-        for c, width in zip(parts.inputs, spread, strict=True)
+        for c, width in zip(si_channels(parts.inputs), spread, strict=True)
     ]
     outputs = [Variable(name, "output", text) for name, text in OUTPUTS]
     statistics = [

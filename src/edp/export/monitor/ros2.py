@@ -82,7 +82,7 @@ def _about(parts: MonitorParts, name: str) -> dict[str, Any]:
     about = description(parts, name)
     names = message_names(entry["name"] for entry in about["inputs"])
     about["inputs"] = [
-        entry | {"name": own} | ({} if own == entry["name"] else {"original": entry["name"]})
+        entry | {"name": own} | ({} if own == entry["name"] else {"original": entry.get("original", entry["name"])})
         for own, entry in zip(names, about["inputs"], strict=True)
     ]
     about["residuals"] = message_names(parts.residuals)

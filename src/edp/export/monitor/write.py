@@ -22,6 +22,7 @@ from edp.export.monitor.golden import JUDGED_BLOCKS, MISSING, SEED, SHIFT, golde
 from edp.export.monitor.numbers import MonitorTables, double_number, golden_header
 from edp.export.monitor.parts import PIECE, ROW, MonitorParts, WatchPart, pieces
 from edp.export.monitor.sources import SourceCode, reads_tables, source_code
+from edp.export.si_names import si_channels
 from edp.export.sizes import check_sizes
 from edp.networks.input_range import HOLD_TICKS
 
@@ -237,7 +238,7 @@ class MonitorFiles:
     def _enums(self) -> dict[str, Code]:
         upper, parts = self.name.upper(), self.parts
         most = C_SIGNIFICANT - len(f"{upper}_RES_")
-        inputs = zip(c_names((c.name for c in parts.inputs), most), parts.inputs, strict=True)
+        inputs = zip(c_names((c.name for c in si_channels(parts.inputs)), most), parts.inputs, strict=True)
         residuals = zip(c_names(parts.residuals, most), parts.residuals, strict=True)
         watches = enumerate(parts.chain.watches)
         return {

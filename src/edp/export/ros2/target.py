@@ -78,7 +78,7 @@ def _content(described: Description) -> dict[str, Any]:
         channel_names = [entry["name"] for entry in about[side]]
         names = message_names(channel_names)
         about[side] = [
-            entry | {"name": name} | ({} if name == old else {"original": old})
+            entry | {"name": name} | ({} if name == old else {"original": entry.get("original", old)})
             for entry, name, old in zip(about[side], names, channel_names, strict=True)
         ]
     return about

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from edp.logs.units import normalise_unit
-from edp.signals import UNITS, Kind
+from edp.signals import UNIT_ENDINGS, UNIT_TAILS, UNITS, Kind
 
 _LONGEST = 200
 """Characters of a name that are looked at."""
@@ -36,40 +36,6 @@ KIND_WORDS: Mapping[str, Kind] = {
 """Words that name a kind; the first of a name counts, in this order. ``current`` is not among them: it may mean now."""
 _LONG = 4
 """Letters from which a word also counts within a compound, as in ``Kolbendruck``."""
-_UNIT_ENDINGS: Mapping[str, str] = {
-    ending: unit
-    for unit, endings in {
-        **{
-            unit: unit for unit in ("bar", "kPa", "MPa", "psi", "mm", "cm", "rpm", "kN", "deg", "rad", "mV", "mA", "kg")
-        },
-        "%": "percent prozent pct",
-        "m/s": "mps",
-        "mm/s": "mmps",
-        "L/min": "lpm lmin",
-        "V": "volt volts",
-        "A": "ampere",
-        "deg/s": "dps degps",
-        "rad/s": "radps",
-        "K": "kelvin",
-        "degC": "degC celsius",
-    }.items()
-    for ending in endings.lower().split()
-}
-_UNIT_TAILS: Mapping[str, str] = {
-    "degC": "degC",
-    "degF": "degF",
-    **{unit: unit for unit in ("kPa", "MPa", "kN", "mA", "mV")},
-    "m_s": "m/s",
-    "mm_s": "mm/s",
-    "cm_s": "cm/s",
-    **dict.fromkeys(("m_s2", "mps2"), "m/s^2"),
-    **dict.fromkeys(("mm_s2", "mmps2"), "mm/s^2"),
-    "rad_s": "rad/s",
-    "deg_s": "deg/s",
-    **dict.fromkeys(("l_min", "L_min"), "L/min"),
-}
-"""Ends of names behind an underscore that are units as they are written, capitals and divisions included. Single
-letters are not among them: ``p_A`` is a chamber, ``x_m`` may be a measured one."""
 ROLE_WORDS: Mapping[str, str] = {
     word: role
     for role, words in {
@@ -175,11 +141,11 @@ def tag_family(name: str) -> str:
 
 def unit_by_ending(name: str) -> str | None:
     """The unit that ends a name of several words: ``valve_percent``, ``pA_bar``."""
-    for tail, unit in _UNIT_TAILS.items():
+    for tail, unit in UNIT_TAILS.items():
         if name.endswith("_" + tail) and len(name) > len(tail) + 1:
             return unit
     words = [word for word in words_of(name) if not word.isdigit()]
-    return _UNIT_ENDINGS.get(words[-1]) if len(words) > 1 else None
+    return UNIT_ENDINGS.get(words[-1]) if len(words) > 1 else None
 
 
 def known_unit(stated: str | None) -> str | None:
