@@ -181,10 +181,10 @@ def measure_found_sizes(
     rows: list[FoundSize] = []
     for number, (change, channel) in enumerate(planned, start=1):
         note(f"changes that are found: {change} of {channel.name}, {number} of {len(planned)}")
-        found = _of_channel(monitor, quiet, channel, change, effort)
-        if found is None:
+        row = _of_channel(monitor, quiet, channel, change, effort)
+        if row is None:
             break
-        rows.append(replace(found, minutes=minutes))
+        rows.append(replace(row, minutes=minutes))
     return FoundSizes(tuple(rows), len(planned), effort.seconds, effort.allowed_s)
 
 

@@ -199,8 +199,8 @@ def fit_to_recordings(
     monitor = _assembled(material, sources, fitted, sessions, rest)
     # Validation sessions set no limit.
     minutes, fit_s = 60.0 * float(monitor.provenance["hours"]), time.process_time() - began
-    found = measure_found_sizes(monitor, validation, minutes, fit_s, note)
-    measured = {"found_sizes": [asdict(size) for size in found.sizes], "found_effort": found.effort()}
+    trials = measure_found_sizes(monitor, validation, minutes, fit_s, note)
+    measured = {"found_sizes": [asdict(size) for size in trials.sizes], "found_effort": trials.effort()}
     measured["healthy_range"] = healthy_range(fitted)
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     provenance = dict(monitor.provenance) | measured | {"seconds": time.process_time() - began}
