@@ -109,7 +109,7 @@ class FoundSize:
 
     def sentence(self) -> str:
         """Return the finding in words."""
-        share = f"{self.share:.0%} of {self.trials} trials"
+        share = f"{self.share:.0%} of {self.trials} trial{'s' if self.trials > 1 else ''}"
         what = f"a {self.change} of {self.channel} by {self.amount()}"
         if self.within_s is None:
             return f"{what}, the largest tried, is found in {share} only"
@@ -322,7 +322,9 @@ def unseen_line(sizes: Sequence[FoundSize]) -> str:
         return ""
     parts = []
     for rows in _by_change(sizes):
-        named = ", ".join(f"of {size.channel} below {size.amount()}" for size in rows[:_SHOWN])
+        named = ", ".join(
+            f"of {size.channel} {'up to' if size.size is None else 'below'} {size.amount()}" for size in rows[:_SHOWN]
+        )
         parts.append(f"a {rows[0].change} {named}{', and others' if len(rows) > _SHOWN else ''}")
     return (
         f"with {sizes[0].minutes:.3g} healthy minutes {'; '.join(parts)} would not have been found in "
