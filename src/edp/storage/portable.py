@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import stat
 import sys
 from typing import IO
 
@@ -32,12 +33,14 @@ else:
     import fcntl
 
     def lock_handle(handle: int) -> None:
-        """Lock an open file or folder for this process; closing the handle frees it.
+        """Lock an open folder, or a file that is open for writing, for this process; closing the handle frees it.
 
         Raises:
             OSError: another process holds it, or the file system has no locks.
         """
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # A file by a record lock: HDF5 takes the other kind itself and would find its own file locked.
+        lock_kind = fcntl.flock if stat.S_ISDIR(os.fstat(handle).st_mode) else fcntl.lockf
+        lock_kind(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def lock(stream: IO[str], wait: bool = False, shared: bool = False) -> None:
         """Lock an open file for this process; closing it, or the end of the process, frees it.

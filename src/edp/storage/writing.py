@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -110,7 +111,8 @@ def _remove_left(folder: Path) -> None:
                 status = status_at(rest, follow=False)
                 if status is None or time.time() - status.st_mtime < LEFT_AFTER_S:
                     continue
-                handle = os.open(rest, os.O_RDONLY | QUIETLY | NO_LINK)
+                mode = os.O_RDONLY if stat.S_ISDIR(status.st_mode) else os.O_RDWR
+                handle = os.open(rest, mode | QUIETLY | NO_LINK)
                 try:
                     lock_handle(handle)
                     shutil.rmtree(rest) if is_folder_at(rest) else rest.unlink()
