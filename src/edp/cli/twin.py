@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path, is_file_at
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def twin(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.kind=recurrent.")] = [],  # noqa: B006
