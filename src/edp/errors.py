@@ -74,6 +74,25 @@ def brief(error: BaseException | str, most: int = SHOWN_CAUSE) -> str:
     return message if len(message) <= most else f"{message[:most]}..."
 
 
+def count_of(count: float | str | None, noun: str) -> str:
+    """Return a count with its noun, such as "1 recording" and "2 recordings"; a dash if the count is not known.
+
+    Args:
+        count: a number, or its text.
+        noun: in the singular; only its last word gets a plural.
+    """
+    text = (
+        "–" if count is None else count if isinstance(count, str) else f"{count:,g}" if count % 1 else f"{count:,.0f}"
+    )
+    if text == "1":
+        return f"1 {noun}"
+    if noun.endswith("xis"):
+        return f"{text} {noun[:-2]}es"
+    if noun.endswith("y") and noun[-2:-1] not in "aeiou":
+        return f"{text} {noun[:-1]}ies"
+    return f"{text} {noun}{'es' if noun.endswith(('s', 'x', 'ch', 'sh')) else 's'}"
+
+
 def closest(name: str, options: Iterable[str]) -> str:
     """A suffix for messages: ``; did you mean 'x'?`` or ``; known: a, b, c``."""
     known_options = sorted(options)

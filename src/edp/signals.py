@@ -327,6 +327,8 @@ VOCABULARY: Mapping[str, Channel] = {
 
 _SLOWEST, _FASTEST = 1e-9, 1e9
 """Bounds of a rate in Hz and of a step in s: clocks of logs count nanoseconds."""
+LARGEST = 1e30
+"""Largest scale or constant of a channel, of either sign; values are kept in float32."""
 _LONGEST = 1024
 """Characters of a name, a column or a description in a signal map."""
 
@@ -356,10 +358,11 @@ class ChannelMap:
                     f"signal map, channel {self.name[:80]!r}: its {key} has {len(text)} characters; at most {_LONGEST} "
                     "are taken, and no control characters: change it"
                 )
-        if self.constant is not None and not math.isfinite(self.constant):
-            raise ConfigError(f"signal map, channel '{self.name}': constant = {self.constant:g}; give a finite number")
-        if not math.isfinite(self.scale):
-            raise ConfigError(f"signal map, channel '{self.name}': scale = {self.scale:g}; give a finite number")
+        for key in ("constant", "scale"):
+            number = getattr(self, key)
+            if number is not None and not (math.isfinite(number) and abs(number) <= LARGEST):
+                where = f"signal map, channel '{self.name}'"
+                raise ConfigError(f"{where}: {key} = {number:g}; give a finite number of at most {LARGEST:g}")
 
     def channel(self) -> Channel:
         """The channel this entry yields; a name outside the vocabulary needs a kind (default generic)."""

@@ -1,7 +1,7 @@
 """Run command lines in this process's children and print how each ended, a JSON line each.
 
-Called with a folder of `commands.world`, the folder of a full disk or "", the first seed, how many, and seconds for
-each. A child that is still at work when its seconds are over has ended without a traceback.
+Called with a folder of `command_lines.world`, the folder of a full disk or "", the first seed, how many, and seconds
+for each. A child that is still at work when its seconds are over has ended without a traceback.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from types import FrameType
 from typing import Any
 
 import typer
-from commands import commands, drawn
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "plugins"))
+from command_lines import commands, drawn
 
 from edp.cli import app
 from edp.cli.console import refuse_empty

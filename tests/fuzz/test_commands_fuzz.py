@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from commands import close, commands, world
+from command_lines import close, commands, world
 from file_rights import hold_root_to_rights
 
 HERE = Path(__file__).parent

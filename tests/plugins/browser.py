@@ -10,12 +10,13 @@ import importlib.util
 import itertools
 import json
 import os
+import re
 import select
 import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -180,13 +181,14 @@ AXE = "EDP_AXE"
 """Variable that names ``axe.min.js`` of axe-core; without it that of the package axe-core-python."""
 
 
-def check_page(browser: Browser, page: Path, kind: str) -> None:
+def check_page(browser: Browser, page: Path, kind: str, own: Iterable[str] = ()) -> None:
     """What every page of EDP keeps: small, whole, quiet, on a phone and at a desk, for eyes, keys and screen readers.
 
     Args:
         browser: an open browser.
         page: an HTML file.
         kind: what its title ends in, which says by which template it was made.
+        own: names of an excavator's parts that the data on the page bring with them; the page has no others.
     """
     assert page.stat().st_size < PAGE_BYTES
     faults = []
@@ -199,8 +201,14 @@ def check_page(browser: Browser, page: Path, kind: str) -> None:
             faults += [f"{size[0]} px{', dark' if dark else ''}: {fault}" for fault in found]
         assert browser.complaints() == []
         assert browser.requests() == []
-    assert not faults, "\n".join(faults)
     check_kind(browser, kind)
+    words = visible_text(browser)
+    faults += [
+        f"more digits than are known, format it by edp.report.common.wording: {one}" for one in long_numbers(words)
+    ]
+    if kind not in ABOUT_EXCAVATORS:
+        faults += [f"a word of an excavator on a page for any machine: {one}" for one in excavator_words(words, own)]
+    assert not faults, "\n".join(faults)
     browser.open(page)
     links = browser.run("document.querySelectorAll('nav a').length")
     browser.press("Tab")
@@ -212,6 +220,46 @@ def check_page(browser: Browser, page: Path, kind: str) -> None:
 def check_kind(browser: Browser, kind: str) -> None:
     """Check by which template the open page was made; `tests/security/test_pages.py` holds that every one is opened."""
     assert browser.run("document.title").endswith(f": {kind}")
+
+
+ABOUT_EXCAVATORS = ("side view", "closed loops")
+"""Pages that are made for nothing but an excavator's front: they need its geometry."""
+EXCAVATOR = re.compile(
+    r"\b(soils?|digs?|digging|levers?|buckets?|booms?|sticks?|cylinders?|excavators?|excavation|joystick)\b", re.I
+)
+NUMBER = re.compile(r"(?<![\w.,:/−-])[+−-]?(\d[\d,]*)\.(\d+)(?![\w.:/])")
+NOT_SHOWN_ROUNDED = "script, style, template, .settings, [data-exact], pre, code, textarea, input, option"
+"""What keeps numbers as they were given: settings, commands and hashes."""
+
+
+def visible_text(browser: Browser) -> list[str]:
+    """Return the text of every element and drawing of the open page, closed sections included, settings left out."""
+    return browser.run(
+        f"""(() => {{
+        const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), texts = [];
+        while (walker.nextNode()) {{
+            const node = walker.currentNode;
+            if (!node.parentElement.closest({json.dumps(NOT_SHOWN_ROUNDED)})) texts.push(node.data);
+        }}
+        return texts.map(text => text.trim()).filter(Boolean);
+        }})()"""
+    )
+
+
+def long_numbers(texts: Iterable[str]) -> list[str]:
+    """Return the texts that hold a number with decimals and more than four significant digits."""
+    found = []
+    for text in texts:
+        digits = ["".join(match.groups()).replace(",", "").lstrip("0") for match in NUMBER.finditer(text)]
+        if any(len(one) > 4 for one in digits):
+            found.append(text[:120])
+    return found
+
+
+def excavator_words(texts: Iterable[str], own: Iterable[str] = ()) -> list[str]:
+    """Return the texts that speak of parts or work of an excavator, the data's own names left out."""
+    names = re.compile("|".join(map(re.escape, own)) or r"(?!)")
+    return [text[:120] for text in texts if EXCAVATOR.search(names.sub("", text))]
 
 
 def page_faults(browser: Browser, rule: str = "") -> list[str]:

@@ -107,6 +107,9 @@
       if (across > 3 && down > 5) say(`words "${one.text.textContent}" and "${other.text.textContent}" overlap`, drawing);
     }));
   });
+  document.querySelectorAll("svg text").forEach((text) => {
+    if (/^[\u2212\d.,]+\u2026[\d.,]*$/.test(text.textContent.trim())) say("number cut short", text);
+  });
   document.querySelectorAll("td, th").forEach((cell) => {
     if (shown(cell) && cell.textContent.trim().length > 3 && cell.getBoundingClientRect().width < 24) say("narrow cell", cell);
   });

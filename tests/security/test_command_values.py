@@ -106,6 +106,27 @@ CASES = [
     if word.option and word.kind & {int, float}
 ]
 
+SLIPS = ("-1", "0", "1e-320", "1e308", "nan", "inf", "1000000000000000000")
+SENSIBLE = {
+    ("*", "--workers"): {"0"},  # one for each core
+    ("demo", "--seed"): {"0"},
+    ("simulate", "--seed"): {"0", "1000000000000000000"},
+    ("simulate", "--family"): {"0"},  # one machine
+    ("screen", "--horizon"): {"0"},
+    ("animate", "--start"): {"0", "1e-320"},
+    ("evaluate", "--minutes"): {"0", "1e-320"},  # the cheapest baseline alone
+    ("rollout", "--from"): {"0", "1e-320"},
+    ("forecast", "--gain"): {"0", "1e-320"},
+    ("live", "--port"): {"0"},
+    ("live", "--udp"): {"0"},
+    ("live", "--seed"): {"0"},
+    ("live", "--speed"): {"inf"},  # as fast as it goes
+}
+"""Values of `SLIPS` that an option takes."""
+ALL_NUMBERS = [
+    (name, word.name) for name, words in COMMANDS.items() for word in words if word.option and word.kind & {int, float}
+]
+
 
 @pytest.fixture
 def edp(tmp_path, monkeypatch, capsys):
@@ -146,6 +167,26 @@ def test_extreme_numbers_end_in_one_message(name, option, edp):
         assert "error: " in err, f"{value}: {err}"
         assert "Traceback" not in err
         assert len(err) < 8000
+
+
+@pytest.mark.parametrize(("name", "option"), ALL_NUMBERS)
+def test_every_number_has_bounds_that_are_checked_before_anything_is_read(name, option, edp):
+    """Every numeric option of every command, also of later ones: refused by name while nothing is there to read."""
+    source = ["--sim", "M22"] if name == "live" and option != "--udp" else []
+    allowed = SENSIBLE.get((name, option), set()) | SENSIBLE.get(("*", option), set())
+    for value in SLIPS:
+        if value in allowed:
+            continue
+        code, err, left = edp(*words_of(name), *source, option, value)
+        said = err.partition("error: ")[2]
+        assert code in (1, 2), f"{value} was taken: {err}"
+        assert option in said or option.removeprefix("--").replace("-", "_") in said, f"{value}: {said}"
+        assert "Traceback" not in err
+        assert left == [], f"{value}: {left}"
+
+
+def test_values_that_an_option_takes_belong_to_options():
+    assert {case for case in SENSIBLE if case[0] != "*"} <= set(ALL_NUMBERS)
 
 
 @pytest.mark.parametrize(("name", "option"), list(ALWAYS_WRONG))

@@ -46,8 +46,9 @@ def test_every_page_is_opened_in_a_browser():
     opened = set()
     for path in TESTS.rglob("test_*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("check_page", "check_kind"):
-                opened.add(node.args[-1].value)
+            called = getattr(node.func, "id", "") if isinstance(node, ast.Call) else ""
+            if called in ("check_page", "check_kind") and getattr(node.args[0], "id", "") == "browser":
+                opened.add(node.args[2 if called == "check_page" else 1].value)
     assert len(kinds) == len(PAGES)
     assert opened == kinds
 

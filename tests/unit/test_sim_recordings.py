@@ -172,7 +172,7 @@ def test_a_held_out_fifth_has_every_family():
     ("change", "message"),
     [
         ({"recordings": 0}, "recordings = 0; integers, 1 <= recordings <= 100,000 must hold"),
-        ({"minutes": -1.0}, "minutes = -1.0; 0 < minutes <= 1,000,000 must hold"),
+        ({"minutes": -1.0}, "minutes = -1.0; 0.0001 <= minutes <= 1,000,000 must hold"),
         ({"mix": {"isolatd": 1.0}}, "did you mean 'isolated'"),
         ({"mix": {"isolated": -1.0}}, "must not be negative"),
         ({"mix": {"isolated": 0.0}}, "add up to nothing"),

@@ -80,7 +80,7 @@ def test_every_key_arrives_and_options_go_first(tmp_path):
     [
         ("minutes = ", "not valid TOML"),
         ("minuts = 5", "unknown key 'minuts'; did you mean 'minutes'"),
-        ("minutes = -1", "minutes = -1.0; 0 < minutes <= 1,000,000 must hold"),
+        ("minutes = -1", "minutes = -1.0; 0.0001 <= minutes <= 1,000,000 must hold"),
         ("minutes = nan", "minutes = nan: a finite number must hold"),
         ("recordings = 2.5", "recordings = 2.5: an integer must hold"),
         ("seed = true", "seed = True: true and false are no numbers"),

@@ -10,6 +10,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 
 
 def adapt(
@@ -30,13 +31,16 @@ def adapt(
     Example: `edp adapt runs/first --out runs/first_adapted --set adapt.rank=12`
     """
     from edp.config.commands import command_settings
+    from edp.evaluation.guard import adaptation_verdict
     from edp.workflows.adaptation import AdaptationSpec
     from edp.workflows.adaptation import adapt as make
 
     spec, _ = command_settings("adapt", AdaptationSpec, config, changes)
     correction, facts = make(run, folder, spec)
+    verdict = adaptation_verdict(facts)
 
     def show() -> None:
+        show_verdict(verdict)
         out.print(f"{correction.features} features, {correction.macs:,} multiply-accumulates a tick; {folder}")
         out.print("its test recordings, each from nothing:")
         replay_tables(facts)
@@ -44,9 +48,11 @@ def adapt(
 
     emit(
         as_json,
-        {"folder": str(folder), "features": correction.features, "macs": correction.macs, "replay": facts},
+        {"folder": str(folder), "features": correction.features, "macs": correction.macs, "replay": facts}
+        | verdict_facts(verdict),
         show,
     )
+    end_with(verdict)
 
 
 def replay(
@@ -70,13 +76,21 @@ def replay(
 
     Example: `edp replay runs/first_adapted logs/monday --twin runs/grey`
     """
+    from edp.evaluation.guard import adaptation_verdict
     from edp.workflows.adaptation import replay_run
 
     with progress(as_json) as shown:
         on_recording = counted(shown, Steps(as_json), "replay", "done")
         facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, on_recording, twin)
 
-    emit(as_json, facts, lambda: replay_tables(facts))
+    verdict = adaptation_verdict(facts)
+
+    def show() -> None:
+        show_verdict(verdict)
+        replay_tables(facts)
+
+    emit(as_json, facts | verdict_facts(verdict), show)
+    end_with(verdict)
 
 
 def replay_tables(facts: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import sys
@@ -12,15 +13,16 @@ import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 from rich.console import Console, ConsoleDimensions
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TaskProgressColumn
 from rich.table import Table
 from rich.text import Text
 
 from edp.cli.ending import memory_message, out_of_memory, stopped_code
+from edp.cli.options import check_belonging
 from edp.cli.settings import setting_of
 from edp.errors import ConfigError, EdpError
 
@@ -204,6 +206,55 @@ class Words(ProgressColumn):
         return _shown(self.of_task(task))
 
 
+class BoundedProgress(Progress):
+    """Progress display whose tasks never exceed their total, whatever is reported."""
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        """Update a task; what is done is cut at the total."""
+        task = self._tasks[task_id]
+        total = changes["total"] if changes.get("total") is not None else task.total
+        advance = changes.pop("advance", None)
+        if advance is not None:
+            changes["completed"] = task.completed + advance
+        if total is not None and changes.get("completed") is not None:
+            changes["completed"] = min(max(changes["completed"], 0.0), total)
+        super().update(task_id, **changes)
+
+
+class TimeLeft(ProgressColumn):
+    """Time left of a task at work, at least one second; the time taken once all is done."""
+
+    max_refresh = 0.5
+
+    def render(self, task: Task) -> Text:
+        """Return the time now."""
+        if task.finished:
+            return Text("" if task.finished_time is None else duration(task.finished_time))
+        return Text("" if task.time_remaining is None else left_text(task.time_remaining).removeprefix(", "))
+
+
+def left_text(seconds: float) -> str:
+    """Return ``, 5 s left`` for a line of progress; empty where the estimate is used up or not finite.
+
+    Args:
+        seconds: estimated time that the remaining work takes.
+    """
+    if not 0.0 < seconds < math.inf:
+        return ""
+    return f", {duration(max(1.0, seconds))} left"
+
+
+def count_text(done: int, planned: int, sign: str = " of ") -> str:
+    """Return how many of a plan are done; a count that exceeds its plan says so.
+
+    Args:
+        done: number done, or of the one at work.
+        planned: number planned.
+        sign: between both.
+    """
+    return f"{done}, more than the {planned} planned" if done > planned else f"{done}{sign}{planned}"
+
+
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Progress]:
     """A progress display on standard error with a bar, a note (rate and figures) and the time left."""
@@ -212,10 +263,10 @@ def progress(quiet: bool = False) -> Iterator[Progress]:
         BarColumn(bar_width=24),
         TaskProgressColumn(),
         Words(lambda task: task.fields["note"]),
-        TimeRemainingColumn(elapsed_when_finished=True),
+        TimeLeft(),
     )
     # Four updates a second: more only flickers, and slow terminals lag behind.
-    with Progress(*columns, console=err, disable=quiet or not err.is_terminal, refresh_per_second=4) as shown:
+    with BoundedProgress(*columns, console=err, disable=quiet or not err.is_terminal, refresh_per_second=4) as shown:
         yield shown
 
 
@@ -279,9 +330,10 @@ def counted(shown: Progress, steps: Steps, command: str, verb: str) -> Callable[
     bar = shown.add_task(command, total=1.0, note="reading recordings")
 
     def on_next(name: str, done: int, count: int) -> None:
-        left = f", {duration((time.monotonic() - began) / done * (count - done))} left" if done else ""
-        shown.update(bar, completed=done / count, note=f"{done}/{count}, {name}")
-        steps.say(f"{command}: {done}/{count} {verb}, now {name}{left}")
+        left = left_text((time.monotonic() - began) / done * (count - done)) if done else ""
+        text = count_text(done, count, "/")
+        shown.update(bar, completed=done / max(1, count), note=f"{text}, {name}")
+        steps.say(f"{command}: {text} {verb}, now {name}{left}")
 
     return on_next
 
@@ -330,8 +382,23 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
 @cache
 def _command(app: typer.Typer) -> Callable[..., Any]:
     """The commands with their options, read from the functions' signatures once a process."""
-    command: Callable[..., Any] = typer.main.get_command(app)
-    return command
+    command: Any = typer.main.get_command(app)
+    _check_options_of(command)
+    return cast(Callable[..., Any], command)
+
+
+def _check_options_of(command: Any) -> None:
+    """Let every command below a group refuse options without effect before it begins."""
+    for inner in getattr(command, "commands", {}).values():
+        _check_options_of(inner)
+    if not hasattr(command, "commands"):
+        run = command.invoke
+
+        def invoke(context: typer.Context) -> Any:
+            check_belonging(context)
+            return run(context)
+
+        command.invoke = invoke
 
 
 def refuse_empty(words: Sequence[str]) -> None:

@@ -10,13 +10,16 @@ import typer
 
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
+from edp.cli.options import MOST_LOOPS
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
 
 TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
 MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
 ControllerOption = Annotated[str, typer.Option("--controller", help="What moves the levers, such as pi or inversion.")]
 SeedsOption = Annotated[
-    int | None, typer.Option("--seeds", min=1, help="Number of loops, each along a reference of its own; default: 6.")
+    int | None,
+    typer.Option("--seeds", min=1, max=MOST_LOOPS, help="Number of loops, each of a reference of its own; default: 6."),
 ]
 PlantOption = Annotated[
     Path | None, typer.Option("--plant", help="Run folder of a twin, or an FMU (.fmu), that is the plant instead.")
@@ -94,8 +97,8 @@ def tune(
     plant: PlantOption = None,
     twin: TwinOption = None,
     predictor: PredictorOption = None,
-    trials: Annotated[int, typer.Option(min=1, help="Settings of the gains to try.")] = 40,
-    loops: Annotated[int, typer.Option(min=1, help="References that each of them is run along.")] = 4,
+    trials: Annotated[int, typer.Option(min=1, max=MOST_LOOPS, help="Settings of the gains to try.")] = 40,
+    loops: Annotated[int, typer.Option(min=1, max=MOST_LOOPS, help="References that each of them is run along.")] = 4,
     config: ConfigOption = None,
     changes: ChangesOption = [],  # noqa: B006
     yes: YesOption = False,
@@ -108,6 +111,7 @@ def tune(
     Example: `edp tune runs/tuned --task grade --controller pi --on runs/twin`
     """
     from edp.config.control import load_control_experiment
+    from edp.evaluation.guard import tuning_verdict
     from edp.workflows.control import ControlSources, TuningSpec, tune_gains
     from edp.workflows.control.tune_gains import TUNED
 
@@ -118,8 +122,10 @@ def tune(
         tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (on, plant))
         tuning = tune_gains(experiment, folder, tuned_on, judged_on, TuningSpec(trials=trials, loops=loops), on_trial)
     judged = tuning.content["judged_mm"]
+    verdict = tuning_verdict(judged)
 
     def show() -> None:
+        show_verdict(verdict)
         gains = ", ".join(f"{name} {value:.3g}" for name, value in tuning.content["gains"].items())
         out.print(
             f"position error of the tip on the plant: {judged['after']:.1f} mm (rms), {judged['before']:.1f} mm before"
@@ -127,7 +133,10 @@ def tune(
         out.print(f"gains: {gains}")
         out.print(f"next: edp control RUN --config {folder / TUNED}")
 
-    emit(as_json, {"run": str(folder), "settings": str(folder / TUNED), **tuning.content}, show)
+    emit(
+        as_json, {"run": str(folder), "settings": str(folder / TUNED), **tuning.content} | verdict_facts(verdict), show
+    )
+    end_with(verdict)
 
 
 def _options(task: str, machine: str, controller: str, seeds: int | None) -> dict[str, Any]:

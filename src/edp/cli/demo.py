@@ -12,6 +12,8 @@ from edp.cli import evaluate as evaluate_command
 from edp.cli import simulate as simulate_command
 from edp.cli import train as train_command
 from edp.cli.console import JsonFlag, duration, emit, out
+from edp.cli.options import within
+from edp.settings.bounds import SEED
 from edp.storage.paths import full_path
 
 # 180 min in 60 recordings: with 75 min the network's lead over ridge ARX was smaller (docs/findings.md).
@@ -21,7 +23,7 @@ RECORDINGS = 60
 
 def demo(
     folder: Annotated[Path, typer.Option("--out", help="Folder for data, run and report.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(help="Seed of data and training.")] = 0,
+    seed: Annotated[int, typer.Option(callback=within(SEED), help="Seed of data and training.")] = 0,
     as_json: JsonFlag = False,
 ) -> None:
     """Simulate a 22 t excavator, train the hybrid for k = 10, judge it, and write a report page.

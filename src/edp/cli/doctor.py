@@ -19,7 +19,7 @@ import typer
 
 from edp import __version__
 from edp.cli.console import JsonFlag, emit, listing, out
-from edp.errors import EdpError
+from edp.errors import EdpError, count_of
 from edp.storage.paths import is_folder_at
 
 BROKEN = 3
@@ -92,7 +92,7 @@ def doctor(
         listing("", ["what", "state", "value", "needed for"], rows)
         missing = sum(check.state == "missing" for check in checks)
         out.print()
-        out.print(f"{len(broken)} broken, {missing} optional part(s) missing")
+        out.print(f"{len(broken)} broken, {count_of(missing, 'optional part')} missing")
 
     emit(as_json, {"checks": [asdict(check) for check in checks], "broken": len(broken)}, show)
     if broken:

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
+from edp.cli.options import MOST_HOURS, MOST_MINUTES, within
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
+from edp.settings.bounds import above, span
 
 if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
@@ -34,11 +36,18 @@ def evaluate(
     ] = False,
     minutes: Annotated[
         float | None,
-        typer.Option(min=0.0, help="After these begin no further baseline; cheap ones come first."),
+        typer.Option(
+            callback=within(span(0.0, MOST_MINUTES)),
+            help="After these begin no further baseline; cheap ones come first.",
+        ),
     ] = None,
     at_most: Annotated[
         float | None,
-        typer.Option("--at-most", help="Judge on evenly spread stretches of at most so many hours, about."),
+        typer.Option(
+            "--at-most",
+            callback=within(above(0.0, MOST_HOURS)),
+            help="Judge on evenly spread stretches of at most so many hours, about.",
+        ),
     ] = None,
     predictor: Annotated[
         Path | None, typer.Option(help="Of a twin: run folder of a look-ahead predictor to compare with.")

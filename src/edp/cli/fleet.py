@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.storage.paths import full_path
 
@@ -93,4 +93,4 @@ class MachineDisplay:
     def on_machine(self, name: str, done: int, count: int) -> None:
         """Show one machine."""
         self.shown.update(self.bar, total=count, completed=done, note=name)
-        self.steps.say(f"{self.what}: {name}, {done} of {count}")
+        self.steps.say(f"{self.what}: {name}, {count_text(done, count)}")

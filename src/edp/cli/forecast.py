@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
+from edp.errors import count_of
 
 MODELS = ("twin", "persistence")
 """In the scores, in the order of the table's columns."""
@@ -45,7 +46,7 @@ def forecast(
 
         def note(name: str, number: int, of: int) -> None:
             shown.update(bar, total=of, completed=number - 1, note=name)
-            steps.say(f"forecast: log {number} of {of}, {name}")
+            steps.say(f"forecast: log {count_text(number, of)}, {name}")
 
         result = forecast_logs(run, source_of(data, signal_map, repair), ahead, folder, answer, gain, note)
     facts = {
@@ -70,7 +71,7 @@ def forecast(
             title = f"{row['seconds']:g} s ahead, commands held: mean absolute error at {row['moments']:,} moments"
             table(title, ["", "unit", "twin", "present value held"], errors)
         out.print(f"gain of the observer: {result.gain:g}")
-        out.print(f"{len(result.files)} logs in {folder}, each with {', '.join(result.channels)}")
+        out.print(f"{count_of(len(result.files), 'log')} in {folder}, each with {', '.join(result.channels)}")
         out.print(f"next: edp train {folder} --set task.features=all --out runs/ahead")
 
     emit(as_json, facts, show)

@@ -11,7 +11,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress
 from edp.cli.quality import LogDisplay
-from edp.errors import ConfigError
+from edp.errors import ConfigError, count_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -79,7 +79,7 @@ def show_proposal(proposal: LogsProposal) -> None:
     look, clock = proposal.proposal.look, proposal.proposal.clock
     rate = "unknown rate" if clock.rate_hz is None else f"{clock.rate_hz:.5g} Hz"
     count = len(proposal.group.paths)
-    out.print(f"{count} log(s) with these columns; {look.path.name}: {look.rows:,} rows, {rate}")
+    out.print(f"{count_of(count, 'log')} with these columns; {look.path.name}: {look.rows:,} rows, {rate}")
     # What never moves last: logs of ROS hold more of it than fits.
     columns = sorted(proposal.proposal.columns, key=lambda guess: guess.role == "constant")
     rows = _rows(columns[:_SHOWN_ROWS])
@@ -93,7 +93,10 @@ def show_proposal(proposal: LogsProposal) -> None:
     out.print(f"to predict: {', '.join(proposal.targets)}")
     unsure = sum(guess.sureness == "unsure" for guess in columns if guess.channel)
     if unsure:
-        out.print(f"unsure of {unsure} channel(s): taken as numbers without a unit (generic) until the map says more")
+        out.print(
+            f"unsure of {count_of(unsure, 'channel')}: taken as numbers without a unit (generic) until the map says "
+            "more"
+        )
 
 
 def _rows(columns: Sequence[ColumnGuess]) -> list[tuple[str, ...]]:

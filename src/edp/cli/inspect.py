@@ -13,7 +13,7 @@ from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, show_lines, show_report, verdict_text
 from edp.cli.train import LogsArgument, MapOption, shell_words
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
-from edp.errors import DataError, EdpError
+from edp.errors import DataError, EdpError, count_of
 from edp.storage.paths import full_path, is_file_at
 
 if TYPE_CHECKING:
@@ -188,7 +188,9 @@ def show_coverage(coverage: Coverage, whole: bool = True) -> None:
         far = coverage.distance
         rows.append(("test to train, median", f"{far.test[0]:.3g}", f"train to train {far.train[0]:.3g}"))
         rows.append(("test farther than 95 % of train", _share(far.beyond), "5 % where both are alike"))
-    table(f"coverage: {coverage.recordings} recording(s), {coverage.hours:.2f} h", ["", "value", "note"], rows)
+    table(
+        f"coverage: {count_of(coverage.recordings, 'recording')}, {coverage.hours:.2f} h", ["", "value", "note"], rows
+    )
     out.print()
     judged = [
         (w.name, f"{w.value:.3g} {w.unit}", f"{'>=' if w.at_least else '<='} {w.bound:g} {w.unit}", _verdict(w.met))

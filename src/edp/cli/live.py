@@ -12,6 +12,7 @@ from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, err, out
 from edp.cli.train import MapOption
 from edp.errors import ConfigError
+from edp.settings.bounds import MOST_SEED
 from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
@@ -47,7 +48,9 @@ def live(
     until_end: Annotated[bool, typer.Option("--until-end", help="End with the source, for scripts.")] = False,
     machine: Annotated[str | None, typer.Option(help="Machine or machine file (.toml) of the side view.")] = None,
     rate: Annotated[float | None, typer.Option(help="Rate (Hz) where no model says it.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the simulator or the loop; default: 0.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=MOST_SEED, help="Of the simulator or the loop; default: 0.")
+    ] = None,
     excitation: Annotated[str | None, typer.Option(help="Operator of --sim; default: combined.")] = None,
     fault: Annotated[list[str], typer.Option("--fault", help="Fault of --sim, as edp simulate takes it.")] = [],  # noqa: B006
     controller: Annotated[str | None, typer.Option(help="Controller of --loop, such as pi.")] = None,

@@ -12,6 +12,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.workforce import WorkersOption
+from edp.errors import count_of
 from edp.storage.paths import full_path
 
 if TYPE_CHECKING:
@@ -96,6 +97,7 @@ def fit(
         "one_machine": fitted.one_machine,
         "promise": monitor.limit.sentence(),
         "found_sizes": list(monitor.provenance.get("found_sizes", [])),
+        "found_effort": monitor.provenance.get("found_effort"),
     }
 
     def show() -> None:
@@ -114,7 +116,7 @@ def show_fitted(fitted: FittedMonitor) -> None:
     monitor = fitted.monitor
     for name in fitted.doubtful:
         out.print(f"'{name}' was left out: it lies far from all other healthy sessions; look into it")
-    out.print(f"{len(monitor.residual_names)} residuals of {len(monitor.channels)} channels are watched")
+    out.print(f"{len(monitor.residual_names)} residuals of {count_of(len(monitor.channels), 'channel')} are watched")
     out.print(monitor.limit.sentence())
     for line in fitted.finds:
         out.print(line)

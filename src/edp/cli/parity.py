@@ -9,6 +9,7 @@ import typer
 
 from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
+from edp.cli.options import MOST_TICKS
 from edp.cli.train import MapOption, RepairOption, source_of
 
 if TYPE_CHECKING:
@@ -23,7 +24,9 @@ def parity(
     ticks: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Length of the reference recording; default 400 ticks, of a twin its prefix and 60 s."
+            min=1,
+            max=MOST_TICKS,
+            help="Length of the reference recording; default 400 ticks, of a twin its prefix and 60 s.",
         ),
     ] = None,
     forms: Annotated[

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import Steps, out, table
+from edp.cli.console import Steps, count_text, out, table
+from edp.cli.options import MOST_HOURS, within
+from edp.errors import count_of
+from edp.settings.bounds import above
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -19,7 +22,9 @@ if TYPE_CHECKING:
 AtMostOption = Annotated[
     float | None,
     typer.Option(
-        "--at-most", help="Of a store, look at evenly spread stretches of at most so many hours, about; default: all."
+        "--at-most",
+        callback=within(above(0.0, MOST_HOURS)),
+        help="Of a store, look at evenly spread stretches of at most so many hours, about; default: all.",
     ),
 ]
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
@@ -43,8 +48,10 @@ class LogDisplay:
 
     def on_log(self, path: Path, number: int, count: int) -> None:
         """Show one log."""
-        self.shown.update(self.bar, completed=(number - 1) / count, note=f"{path.name}, {number} of {count}")
-        self.steps.say(f"read: {path.name}, {number} of {count}")
+        self.shown.update(
+            self.bar, completed=(number - 1) / max(1, count), note=f"{path.name}, {count_text(number, count)}"
+        )
+        self.steps.say(f"read: {path.name}, {count_text(number, count)}")
 
 
 def show_report(report: QualityReport) -> None:
@@ -54,7 +61,7 @@ def show_report(report: QualityReport) -> None:
         f": {report.duration_s:.1f} s, {report.rate_hz:g} Hz, {report.samples:,} samples, verdict: {report.verdict}"
     )
     for clock in report.clocks:
-        gaps = f"{clock.gaps} gap(s), longest {clock.longest_gap_s:g} s" if clock.gaps else "no gaps"
+        gaps = f"{count_of(clock.gaps, 'gap')}, longest {clock.longest_gap_s:g} s" if clock.gaps else "no gaps"
         out.print(f"  time of '{clock.name}': {clock.rate_hz:g} Hz, jitter {clock.jitter:.2g} of a step, {gaps}")
     if report.channels:
         rows = [(c.name, c.unit, *map(_short, (c.min, c.max, c.mean, c.std)), c.missing) for c in report.channels]
@@ -92,13 +99,13 @@ def show_lines(quality: DataQuality) -> None:
     for severity in ("error", "warning", "note"):
         chosen = [each for (of, *_), each in kinds.items() if of == severity]
         if severity == "note" and chosen:
-            out.print(f"  {len(chosen)} kind(s) of notes; --details shows them")
+            out.print(f"  {count_of(len(chosen), 'kind')} of notes; --details shows all")
             break
         for each in sorted(chosen, key=len, reverse=True)[:_MOST_KINDS]:
             show_finding(each[0][1])
             if len(quality.reports) > 1:
                 names = ", ".join(name for name, _ in each[:_MOST_NAMED]) + (", ..." if len(each) > _MOST_NAMED else "")
-                out.print(f"    in {len(each)} of {len(quality.reports)} logs: {names}")
+                out.print(f"    in {len(each)} of {count_of(len(quality.reports), 'log')}: {names}")
         if len(chosen) > _MOST_KINDS:
             out.print(f"  and {len(chosen) - _MOST_KINDS} more kinds of {severity}s; --details shows them")
     out.print()
@@ -123,9 +130,12 @@ def show_between(quality: DataQuality) -> None:
 def verdict_text(quality: DataQuality) -> str:
     """The last line: how many recordings, errors and repeats, and what to do."""
     count, errors = len(quality.reports), quality.errors
-    parts = [f"{count} recording(s)", f"{errors} error(s) that training would refuse" if errors else "no errors"]
+    parts = [
+        f"{count_of(count, 'recording')}",
+        f"{count_of(errors, 'error')} that training would refuse" if errors else "no errors",
+    ]
     if quality.repeats:
-        parts.append(f"{len(quality.repeats)} repeat(s) of a session")
+        parts.append(f"{count_of(len(quality.repeats), 'repeat')} of a session")
     return f"{', '.join(parts)}; {VERDICT_TEXTS[quality.verdict]}"
 
 

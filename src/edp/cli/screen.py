@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, listing, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listing, out, progress, table
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
 from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.errors import count_of
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -144,24 +145,24 @@ class ScreeningDisplay:
 
     def on_trial(self, name: str, done: int, total: int, event: TrainingProgress | None) -> None:
         """Show a training."""
-        part, note = 0.0, f"{name}, training {done + 1} of {total}"
+        part, note = 0.0, f"{name}, training {count_text(done + 1, total)}"
         if event is not None:
             part = event.share
-            note += f", epoch {event.epoch}/{event.epochs}"
+            note += f", epoch {count_text(event.epoch, event.epochs, '/')}"
         elif not self.trained:
             # Trainings that are in the folder already take no time, and say nothing about the others.
             self.began.pop("trials", None)
         self.trained = self.trained or event is not None
-        self._show("trials", (done + part) / total, note)
+        self._show("trials", (done + part) / max(1, total), note)
 
     def _show(self, what: str, share: float, note: str) -> None:
         now = time.monotonic()
         if what not in self.bars:
             self.bars[what] = self.shown.add_task(what, total=1.0, note="")
-        self.shares[what] = share = max(share, self.shares.get(what, 0.0))  # a refit begins its epochs again
+        self.shares[what] = share = max(min(share, 1.0), self.shares.get(what, 0.0))  # a refit begins its epochs again
         first_share, began = self.began.setdefault(what, (share, now))
         gained, elapsed = share - first_share, now - began
-        tail = f", {duration(elapsed / gained * (1.0 - share))} left" if gained >= TOLD_SHARE else ""
+        tail = left_text(elapsed / gained * (1.0 - share)) if gained >= TOLD_SHARE else ""
         self.shown.update(self.bars[what], completed=share, note=note)
         self.steps.say(f"{what}: {note}, {100 * share:.0f} %{tail}")
 
@@ -170,7 +171,11 @@ def show_selection(selection: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
     screening = selection.screening
     rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in screening.proposal.choices if c.keep]
-    listing(f"keep: {len(rows)} of {len(screening.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
+    listing(
+        f"keep: {len(rows)} of {count_of(len(screening.channels), 'channel')}",
+        ["channel", "score", "why"],
+        rows[:SHOWN],
+    )
     if len(rows) > SHOWN:
         out.print(f"  ... and {len(rows) - SHOWN} more in {selection.files['page']}")
     out.print()

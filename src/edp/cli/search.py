@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.errors import count_of
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -197,9 +198,10 @@ class SearchDisplay:
         counts, left = study_log.counts(), study_log.seconds_left()
         # No more than are asked for: workers may be idle at the end of a batch.
         running = min(study_log.workers, counts["asked"] - counts["done"])
-        note = f"{self.title}: {counts['done']} trainings, {running} running, {counts['total'] - counts['done']} left"
+        remaining, done = max(0, counts["total"] - counts["done"]), count_of(counts["done"], "training")
+        note = f"{self.title}: {done}, {running} running, {remaining} left"
         self.shown.update(self.bar, completed=counts["done"] / max(1, counts["total"]), note=note)
-        self.steps.say(f"search: {note}" + ("" if left is None else f", at most {duration(left)}"))
+        self.steps.say(f"search: {note}" + ("" if not left else f", at most {duration(max(1.0, left))}"))
 
     def on_decision(self, decision: Decision) -> None:
         """Print what was decided, and why."""
@@ -232,7 +234,7 @@ def _facts(result: SearchResult) -> dict[str, Any]:
 
 
 def _show(result: SearchResult, page: Path) -> None:
-    out.print(f"study: {result.folder}, {result.state}; {result.trained} trainings now")
+    out.print(f"study: {result.folder}, {result.state}; {count_of(result.trained, 'training')} now")
     out.print(f"report: {page}")
     if result.teacher is None:
         out.print("next: the same command without --phase, or with a later one")
@@ -270,7 +272,8 @@ def _show_status(progress: dict[str, Any]) -> None:
     ]
     table("phases", ["phase", "trainings", "pruned", "failed", "training time", "state"], rows)
     out.print(
-        f"{counts['done']} trainings done, {progress['running']} running, {counts['total'] - counts['done']} left"
+        f"{count_of(counts['done'], 'training')} done, {progress['running']} running, "
+        f"{counts['total'] - counts['done']} left"
     )
     for decision in progress["decisions"]:
         for sentence in decision["sentences"]:

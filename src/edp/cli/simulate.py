@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
-from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
+from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, out, progress, table
+from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.errors import count_of
 
 if TYPE_CHECKING:
     from edp.sim.data_set import Simulated, SimulationOrder
@@ -57,7 +58,7 @@ def simulate(
         list[str],
         typer.Option("--set", help="One key of a scenario file, such as masses=[12,30] or files.layout=speedgoat."),
     ] = [],  # noqa: B006
-    workers: Annotated[int, typer.Option(help="Number of processes; 0: one for each core.")] = 0,
+    workers: WorkersOption = 0,
     limit: Annotated[
         bool, typer.Option("--limit", help="Also compute the limit of predictability: limit.json.")
     ] = False,
@@ -113,7 +114,7 @@ def simulate(
     def show() -> None:
         if limit_facts is not None:
             limit_table(limit_facts)
-        out.print(f"{len(paths)} recordings of {what_simulated}, {order.minutes:g} min, in {folder}")
+        out.print(f"{count_of(len(paths), 'recording')} of {what_simulated}, {order.minutes:g} min, in {folder}")
         for text in facts.get("faults", ()):
             out.print(f"fault: {text}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
@@ -144,7 +145,7 @@ def run(
             left = elapsed / max(1, counts["new"]) * (order.recordings - done)
             note = f"{counts['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
             shown.update(bar, advance=1, note=note)
-            steps.say(f"simulate: {done:g} of {order.recordings} recordings, {note}, {duration(left)} left")
+            steps.say(f"simulate: recordings {count_text(round(done), order.recordings)}, {note}{left_text(left)}")
 
         if workforce is not None:
             from edp.workflows.fleet.simulating import simulate_with
@@ -164,7 +165,7 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: in
         def on_done(done: int, total: int) -> None:
             left = (time.monotonic() - began) / done * (total - done)
             shown.update(bar, completed=done, total=total)
-            steps.say(f"limit: {done} of {total} recordings branched, {duration(left)} left")
+            steps.say(f"limit: recordings branched {count_text(done, total)}{left_text(left)}")
 
         return find_data_set_limit(folder, order, spec, workers, on_done)
 
@@ -183,7 +184,8 @@ def limit_table(limit: dict[str, Any]) -> None:
         rows.append([*row, spread, f"{commands_known['mae'][n][-1]:.2f}", f"{limit['persistence']['mae'][n][-1]:.2f}"])
     title = (
         f"Least mean absolute error of any predictor, {limit['unit']} "
-        f"({limit['moments']} moments of {limit['recordings']} recordings, {limit['branches']} futures each)"
+        f"({limit['moments']} moments of {count_of(limit['recordings'], 'recording')}, {limit['branches']} futures "
+        "each)"
     )
     table(title, ["k", *names, "mean", "95 %", "commands known", "persistence"], rows)
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, emit, err, listing, out, progress, table
 from edp.cli.inspect import FAULTY
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
+from edp.errors import count_of
 
 if TYPE_CHECKING:
     from edp.logs.store import StoreIndex, StoreProgress
@@ -61,8 +62,10 @@ def build(
 
         def note(reached: StoreProgress) -> None:
             refused = f", {reached.refused} refused" if reached.refused else ""
-            shown.update(bar, total=reached.of, completed=reached.logs, note=f"{reached.logs} logs{refused}")
-            steps.say(f"store: {reached.logs} of {reached.of} logs{refused}")
+            shown.update(
+                bar, total=reached.of, completed=reached.logs, note=f"{count_of(reached.logs, 'log')}{refused}"
+            )
+            steps.say(f"store: logs {count_text(reached.logs, reached.of)}{refused}")
 
         if cluster:
             from edp.workflows.fleet.storing import store_with
@@ -72,7 +75,10 @@ def build(
             index = source.store(folder, workers or os.cpu_count() or 1, note)
     _show(index, folder, as_json)
     if index.refused:
-        err.print(f"{len(index.refused)} log(s) are not in the store; mend them and give the same command again")
+        err.print(
+            f"{count_of(len(index.refused), 'log')} left out of the store: mend what is wrong and give the same "
+            "command again"
+        )
         raise typer.Exit(FAULTY)
 
 
@@ -109,7 +115,7 @@ def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
             ("recordings", f"{len(index.recordings):,}"),
             ("hours", f"{index.hours():.2f}"),
             ("channels", f"{len(facts['channels'])}"),
-            ("size", f"{size / 1e6:,.1f} MB in {len(index.files)} file(s)"),
+            ("size", f"{size / 1e6:,.1f} MB in {count_of(len(index.files), 'file')}"),
         ]
         table(f"store {folder}", ["", ""], rows)
         if index.refused:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
+from edp.cli.options import MOST_WORKERS
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def train(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     workers: Annotated[
-        int, typer.Option(min=0, help="Of the preset auto: parallel trainings; 0: one for each core.")
+        int, typer.Option(min=0, max=MOST_WORKERS, help="Of the preset auto: parallel trainings; 0: one for each core.")
     ] = 0,
     as_json: JsonFlag = False,
 ) -> None:
@@ -202,8 +203,8 @@ class TrainingDisplay:
 
     def on_candidate(self, label: str, done: int, count: int) -> None:
         """The training of another model begins, after `done` of `count`."""
-        self.best, self.model = None, f"{label} ({done + 1} of {count}), "
-        self.steps.say(f"train: {label}, model {done + 1} of {count}", force=True)
+        self.best, self.model = None, f"{label} ({count_text(done + 1, count)}), "
+        self.steps.say(f"train: {label}, model {count_text(done + 1, count)}", force=True)
 
     def on_event(self, event: TrainingProgress) -> None:
         """Show one event."""
@@ -211,9 +212,10 @@ class TrainingDisplay:
             self.best = event.row["validation_mae"]
         score = "" if self.best is None else f", validation MAE {self.best:.4g}"
         stage = "refit, " if event.refit else ""
-        note = f"{self.model}{stage}epoch {event.epoch}/{event.epochs}, {event.targets_per_s:,.0f} targets/s{score}"
+        epoch = count_text(event.epoch, event.epochs, "/")
+        note = f"{self.model}{stage}epoch {epoch}, {event.targets_per_s:,.0f} targets/s{score}"
         self.shown.update(self.bar, completed=event.share, note=note)
-        self.steps.say(f"train: {note}, {duration(event.seconds_left)} left", force=event.row is not None)
+        self.steps.say(f"train: {note}{left_text(event.seconds_left)}", force=event.row is not None)
 
 
 class SeriesDisplay:
@@ -240,12 +242,13 @@ class SeriesDisplay:
     def on_next(self, name: str, done: int, count: int) -> None:
         """Another one begins, after `done` of at most `count`."""
         self.done, self.count = done, max(1, count)
-        self.shown.update(self.bar, completed=min(1.0, done / self.count), note=name)
-        self.steps.say(f"{self.command}: {self.each} {done + 1} of {count}, {name}", force=True)
+        self.shown.update(self.bar, completed=done / self.count, note=name)
+        self.steps.say(f"{self.command}: {self.each} {count_text(done + 1, count)}, {name}", force=True)
 
     def on_training(self, name: str, event: TrainingProgress) -> None:
         """Show an event of the training that is at work."""
-        note = f"{name}, {self.each} {self.done + 1} of {self.count}, epoch {event.epoch}/{event.epochs}"
-        self.shown.update(self.bar, completed=min(1.0, (self.done + event.share) / self.count), note=note)
-        left = duration(event.seconds_left)
-        self.steps.say(f"{self.command}: {note}, {left} left of it", force=event.row is not None)
+        epoch = count_text(event.epoch, event.epochs, "/")
+        note = f"{name}, {self.each} {count_text(self.done + 1, self.count)}, epoch {epoch}"
+        self.shown.update(self.bar, completed=(self.done + event.share) / self.count, note=note)
+        left = left_text(event.seconds_left)
+        self.steps.say(f"{self.command}: {note}{left and f'{left} of it'}", force=event.row is not None)

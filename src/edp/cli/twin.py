@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_text, out, progress, table
+from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, within
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
+from edp.errors import count_of
+from edp.settings.bounds import MIN_MINUTES, above, span
 from edp.storage.paths import full_path, is_file_at
 
 if TYPE_CHECKING:
@@ -27,10 +30,15 @@ def twin(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     start: Annotated[Path | None, typer.Option(help="Run folder of a twin that goes on with these recordings.")] = None,
-    workers: Annotated[int, typer.Option(min=0, help="Parallel trainings; 0: one for each core.")] = 0,
+    workers: Annotated[
+        int, typer.Option(min=0, max=MOST_WORKERS, help="Parallel trainings; 0: one for each core.")
+    ] = 0,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Of a choice without twin.kind: processor time of its networks at most; default: no bound."),
+        typer.Option(
+            callback=within(span(MIN_MINUTES, MOST_MINUTES)),
+            help="Of a choice without twin.kind: processor time of its networks at most; default: no bound.",
+        ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -101,9 +109,16 @@ def show_trained(trained: TrainedTwin) -> None:
 def rollout(
     run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
     log: Annotated[Path, typer.Argument(help="One log.")],
-    seconds: Annotated[float, typer.Option(help="Length of the free run.")] = 60.0,
+    seconds: Annotated[
+        float, typer.Option(callback=within(above(0.0, MOST_SECONDS)), help="Length of the free run.")
+    ] = 60.0,
     start_s: Annotated[
-        float | None, typer.Option("--from", help="Start in the log, in seconds; default: as early as possible.")
+        float | None,
+        typer.Option(
+            "--from",
+            callback=within(span(0.0, MOST_SECONDS)),
+            help="Start in the log, in seconds; default: as early as possible.",
+        ),
     ] = None,
     measured: Annotated[list[str], typer.Option(help="A channel that stays measured; give it again for more.")] = [],  # noqa: B006
     file: Annotated[
@@ -179,7 +194,10 @@ def score_table(models: dict[str, Any]) -> None:
         rows.append([name, *(_number(one["stroke_error"][k]["mean"]) for one in models.values())])
     rows.append(["pressure, deviations", *(_number(one["pressure_nrmse"]["mean"]) for one in models.values())])
     rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in models.values())])
-    out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over actuators and runs:")
+    out.print(
+        f"{count_of(first['runs'], 'free run')} of {first['seconds']:g} s on commands alone, mean over actuators "
+        "and runs:"
+    )
     # A column a model: with a column a time it would be too wide for a terminal of 80.
     table("MAE of velocities, stroke error by time, NRMSE of pressures", ["", *models], rows)
 
@@ -188,7 +206,7 @@ def actuator_tables(models: dict[str, Any]) -> None:
     """Print a table an actuator: errors of its velocity and of its stroke by time, a row a model."""
     first = next(iter(models.values()))
     strokes = first["stroke_error"]
-    out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over runs:")
+    out.print(f"{count_of(first['runs'], 'free run')} of {first['seconds']:g} s on commands alone, mean over runs:")
     places = zip(first["velocity_mae"]["by_channel"], strokes[0]["by_channel"], strict=True)
     for velocity, stroke in places:
         unit, length = first["velocity_mae"]["units"][velocity], strokes[0].get("units", {}).get(stroke, "")
@@ -289,9 +307,7 @@ class FitDisplay:
         """How far it is."""
         error = "" if event.validation is None else f", free-run error {event.validation:.3g} deviations"
         # A fit that goes on beyond its plan has no time left to state.
-        more = event.update > event.updates
-        count = f"{event.update}, more than the {event.updates} planned" if more else f"{event.update}/{event.updates}"
-        left = "" if more else f", {duration(event.seconds_left)} left"
-        note = f"update {count}, runs of {event.length_s:g} s{error}"
-        self.shown.update(self.bar, completed=min(1.0, event.update / event.updates), note=note)
+        left = "" if event.update >= event.updates else left_text(event.seconds_left)
+        note = f"update {count_text(event.update, event.updates, '/')}, runs of {event.length_s:g} s{error}"
+        self.shown.update(self.bar, completed=event.update / max(1, event.updates), note=note)
         self.steps.say(f"{self.what}: {note}{left}")

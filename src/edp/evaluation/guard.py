@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -75,6 +75,7 @@ class ErrorVerdict:
         advice: what to do where it is worse.
         interval: 95 % interval, over recordings, of the relative change of the model's error; None for too few.
         recordings: number of recordings that were compared.
+        ground: on what both were compared, in the plural.
     """
 
     label: str
@@ -84,6 +85,7 @@ class ErrorVerdict:
     advice: str = ADVICE
     interval: tuple[float, float] | None = None
     recordings: int = 0
+    ground: str = "held-out recordings"
 
     @property
     def change(self) -> float:
@@ -105,11 +107,11 @@ class ErrorVerdict:
         if self.outcome is ErrorOutcome.WORSE:
             where = f" (on {', '.join(self.outputs)})" if self.outputs else ""
             return (
-                f"On the held-out recordings {self.label} has {100 * self.less:.1f} % less error than the "
+                f"On the {self.ground} {self.label} has {100 * self.less:.1f} % less error than the "
                 f"{self.judged}{where}: do not use this {self.judged}; {self.advice}."
             )
-        gain = f"{-100 * self.change:.1f} % less error"
-        who, other = f"On the held-out recordings the {self.judged}", f"{self.label}, the best of the others"
+        gain = f"{max(0.0, -100 * self.change):.1f} % less error"
+        who, other = f"On the {self.ground} the {self.judged}", f"{self.label}, the best of the others"
         if self.interval is None:
             count = self.recordings
             why = (
@@ -123,6 +125,27 @@ class ErrorVerdict:
         if self.outcome is ErrorOutcome.BETTER:
             return f"{who} has {gain} than {other} ({reach})."
         return f"{who} is not distinguishable from {other}: {gain} ({reach})."
+
+    def headline(self, figures: str) -> str:
+        """Return the headline of a page: the first line of the terminal, then figures of a model that may be used."""
+        return self.sentence() if self.outcome is ErrorOutcome.WORSE else f"{self.sentence()} {figures}"
+
+
+UNADAPTED = ErrorVerdict(
+    "the network without adaptation",
+    0.0,
+    (),
+    "adaptation",
+    "run the network without it, or choose other adapt settings",
+)
+BEFORE_TUNING = ErrorVerdict(
+    "the controller before",
+    0.0,
+    (),
+    "tuned controller",
+    "keep the gains as they were, or give more --trials and --loops",
+    ground="references that tuned nothing",
+)
 
 
 def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> ErrorVerdict | None:
@@ -273,6 +296,38 @@ def _verdict_on_free_runs(models: Mapping[str, Any], judged: str, what: str, adv
             mean = sum(ratios) / len(ratios)
             better.append((mean, ErrorVerdict(name, 1.0 - math.exp(-mean), lost, what, advice)))
     return max(better, key=lambda entry: entry[0], default=(0.0, None))[1]
+
+
+def adaptation_verdict(facts: Mapping[str, Any]) -> ErrorVerdict:
+    """Return the verdict on an adaptation against the same network without it.
+
+    Args:
+        facts: see `edp.workflows.adaptation.replay.Replay.to_json`.
+    """
+    return change_verdict(facts["change"], facts["change_by_recording"], UNADAPTED)
+
+
+def tuning_verdict(judged: Mapping[str, float]) -> ErrorVerdict:
+    """Return the verdict on tuned gains against the gains before, on the plant.
+
+    Args:
+        judged: position errors of the tip, ``before`` and ``after``.
+    """
+    change = judged["after"] / judged["before"] - 1.0 if judged["before"] > 0 < judged["after"] else 0.0
+    return change_verdict(change, {}, BEFORE_TUNING)
+
+
+def change_verdict(change: float, by_recording: Mapping[str, float], reference: ErrorVerdict) -> ErrorVerdict:
+    """Return the verdict on something made from its reference, whose errors are known relative to that reference.
+
+    Args:
+        change: error over that of the reference, less one, over all recordings.
+        by_recording: the same of each recording.
+        reference: a verdict with the label of the reference, what is judged, the advice and the ground.
+    """
+    mean = math.log1p(change)
+    logs = [math.log1p(one) for one in by_recording.values()]
+    return replace(reference, less=1.0 - math.exp(-mean), interval=_interval(logs, mean), recordings=len(logs))
 
 
 def free_run_error(scores: Mapping[str, Any], reference: Mapping[str, Any]) -> float:

@@ -1,10 +1,12 @@
-"""Smallest sensor changes that a monitor finds, measured by injecting them into healthy segments."""
+"""Smallest shift, scale and delay of each channel that a monitor finds, measured on healthy segments."""
 
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -19,29 +21,75 @@ FOUND_SHARE = 0.8
 """Fraction of the trials in which a change of the stated size must be found."""
 MAX_CHANNELS, MAX_SEGMENTS, SEGMENT_S = 12, 4, 120.0
 """Bounds of the work: channels, healthy segments per channel, and length of a segment."""
-SIGNS = (1.0, -1.0)
 ONSET = 0.3
 """Fraction of a segment after which the change begins."""
-FACTORS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Sizes that are tried, in standard deviations of the channel over healthy sessions."""
+EFFORT_SHARE, MIN_EFFORT_S = 0.2, 20.0
+"""Processor time that the trials may take: a share of that of the fit before, and at least some seconds."""
 _SHOWN = 4
 OUTSIDE = 1.5
 """Margin over what a healthy session reaches of the range of the others, before a residual is called outside of it."""
 
 
+class Change(StrEnum):
+    """Change of one channel that is injected."""
+
+    SHIFT = "shift"
+    SCALE = "scale"
+    DELAY = "delay"
+
+
+@dataclass(frozen=True)
+class _Injection:
+    """How a change is injected.
+
+    Attributes:
+        factors: sizes that are tried: standard deviations of a shift, shares of a scale, seconds of a delay.
+        signs: both directions, or one.
+        segments: number of healthy segments.
+        apply: returns the changed values, from the values, the onset, the signed size and the rate.
+    """
+
+    factors: tuple[float, ...]
+    signs: tuple[float, ...]
+    segments: int
+    apply: Callable[[Any, int, float, float], Any]
+
+
+def _shifted(values: Any, onset: int, size: float, rate_hz: float) -> Any:
+    return np.concatenate([values[:onset], values[onset:] + np.float32(size)])
+
+
+def _scaled(values: Any, onset: int, size: float, rate_hz: float) -> Any:
+    return np.concatenate([values[:onset], values[onset:] * np.float32(1.0 + size)])
+
+
+def _delayed(values: Any, onset: int, size: float, rate_hz: float) -> Any:
+    samples = min(max(1, round(size * rate_hz)), onset)
+    return np.concatenate([values[:onset], values[onset - samples : len(values) - samples]])
+
+
+INJECTIONS = {
+    Change.SHIFT: _Injection((0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0), (1.0, -1.0), MAX_SEGMENTS, _shifted),
+    Change.SCALE: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5), (1.0, -1.0), 2, _scaled),
+    Change.DELAY: _Injection((0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), (1.0,), 2, _delayed),
+}
+"""Shifts come first: they are measured with more trials, and the effort may end before the others."""
+
+
 @dataclass(frozen=True)
 class FoundSize:
-    """The smallest tried shift of a channel that was found.
+    """The smallest tried change of a channel that was found.
 
     Attributes:
         channel: name.
         unit: unit of the size, that of reports.
-        size: smallest shift found in `FOUND_SHARE` of the trials; None where the largest tried was not.
-        largest: largest shift that was tried.
+        size: smallest change found in `FOUND_SHARE` of the trials; None where the largest tried was not.
+        largest: largest change that was tried.
         within_s: median time from the onset to the alarm at `size`; None without a size.
         share: fraction of the trials in which `size` (or `largest`) was found.
         trials: number of trials per size.
         minutes: length of all healthy logs of the fit.
+        change: what was injected; earlier versions have shifts alone.
     """
 
     channel: str
@@ -52,78 +100,147 @@ class FoundSize:
     share: float
     trials: int
     minutes: float
+    change: str = Change.SHIFT
+
+    def amount(self) -> str:
+        """Return the smallest size found, else the largest that was tried, with its unit."""
+        size = self.largest if self.size is None else self.size
+        return f"{size:.3g}" if self.unit == "1" else f"{size:.3g} {self.unit}"
 
     def sentence(self) -> str:
         """Return the finding in words."""
-        size = self.largest if self.size is None else self.size
-        amount = f"{size:.3g} {self.unit}" if self.unit != "1" else f"{size:.3g}"
         share = f"{self.share:.0%} of {self.trials} trials"
+        what = f"a {self.change} of {self.channel} by {self.amount()}"
         if self.within_s is None:
-            return f"a shift of {self.channel} by {amount}, the largest tried, is found in {share} only"
-        return f"a shift of {self.channel} by {amount} is found within {self.within_s:.3g} s in {share}"
+            return f"{what}, the largest tried, is found in {share} only"
+        return f"{what} is found within {self.within_s:.3g} s in {share}"
+
+
+@dataclass(frozen=True)
+class FoundSizes:
+    """What was measured, and whether the effort ended before all was.
+
+    Attributes:
+        sizes: a row per change and channel, shifts first.
+        planned: number of rows that were planned.
+        seconds: processor time that the trials took.
+        allowed_s: processor time that they may take.
+    """
+
+    sizes: tuple[FoundSize, ...]
+    planned: int
+    seconds: float
+    allowed_s: float
+
+    def effort(self) -> dict[str, float]:
+        """Return what the provenance of a monitor keeps of the effort, for `effort_line`."""
+        return {
+            "measured": len(self.sizes),
+            "planned": self.planned,
+            "seconds": self.seconds,
+            "allowed_s": self.allowed_s,
+        }
+
+
+class _Effort:
+    """Processor time of the trials against what they may take."""
+
+    def __init__(self, allowed_s: float) -> None:
+        self.allowed_s, self._began = allowed_s, time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return time.process_time() - self._began
+
+    @property
+    def is_exhausted(self) -> bool:
+        return self.seconds >= self.allowed_s
 
 
 def measure_found_sizes(
-    monitor: Monitor, segments: Sequence[Recording], minutes: float, note: Callable[[str], None]
-) -> list[FoundSize]:
-    """Inject shifts into healthy segments that set no threshold, and return what is found, a row per channel.
+    monitor: Monitor, segments: Sequence[Recording], minutes: float, fit_s: float, note: Callable[[str], None]
+) -> FoundSizes:
+    """Inject changes into healthy segments that set no threshold, and return what is found.
 
     A change counts as found where the monitor raises an alarm after the onset that it does not raise on the same
-    segment unchanged. Sizes are searched by bisection over `FACTORS`, so that the work is bounded.
+    segment unchanged. Sizes are searched by bisection. The trials end once they took `EFFORT_SHARE` of the processor
+    time of the fit, and `MIN_EFFORT_S`.
 
     Args:
         monitor: as fitted.
         segments: healthy recordings that did not set the limits.
         minutes: length of all healthy logs of the fit.
+        fit_s: processor time of the fit before.
         note: called with what begins.
     """
+    effort = _Effort(max(MIN_EFFORT_S, EFFORT_SHARE * fit_s))
     cut = [one.rows(0, min(one.samples, round(SEGMENT_S * one.rate_hz))) for one in segments[:MAX_SEGMENTS]]
     quiet = [one for one in cut if not monitor.watch(one).alarms]
-    if not quiet:
-        return []
-    chosen = _spread(monitor.channels, MAX_CHANNELS)
-    rows = []
-    for number, channel in enumerate(chosen, start=1):
-        note(f"sizes that are found: channel {number} of {len(chosen)}")
-        rows.append(_of_channel(monitor, quiet, channel, minutes))
-    return rows
+    chosen = _spread(monitor.channels, MAX_CHANNELS) if quiet else []
+    planned = [(change, channel) for change in INJECTIONS for channel in chosen]
+    rows: list[FoundSize] = []
+    for number, (change, channel) in enumerate(planned, start=1):
+        note(f"changes that are found: {change} of {channel.name}, {number} of {len(planned)}")
+        row = _of_channel(monitor, quiet, channel, change, effort)
+        if row is None:
+            break
+        rows.append(replace(row, minutes=minutes))
+    return FoundSizes(tuple(rows), len(planned), effort.seconds, effort.allowed_s)
 
 
-def _of_channel(monitor: Monitor, segments: Sequence[Recording], channel: Channel, minutes: float) -> FoundSize:
-    column = monitor.inputs.index(channel.name)
-    spread = 1.0 / float(monitor.chain.summaries.spread[column])
-    kind = KINDS[channel.kind]
+def _of_channel(
+    monitor: Monitor, quiet: Sequence[Recording], channel: Channel, change: Change, effort: _Effort
+) -> FoundSize | None:
+    """Return the size that is found, by bisection; None where the effort ends before."""
+    injection = INJECTIONS[change]
+    factors, segments = injection.factors, quiet[: injection.segments]
+    unit, base, factor = _size_unit(monitor, channel, change)
     results: dict[int, list[float]] = {}
-    low, high, trials = 0, len(FACTORS) - 1, len(SIGNS) * len(segments)
+    low, high, trials = 0, len(factors) - 1, len(injection.signs) * len(segments)
     while low <= high:
+        if effort.is_exhausted:
+            return None
         middle = (low + high) // 2
-        results[middle] = _delays(monitor, segments, channel.name, FACTORS[middle] * spread)
+        results[middle] = _delays(monitor, segments, channel.name, injection, factors[middle] * base)
         if len(results[middle]) >= FOUND_SHARE * trials:
             high = middle - 1
         else:
             low = middle + 1
-    good = low if low < len(FACTORS) else None
-    delays = results.get(low if good is not None else len(FACTORS) - 1, [])
-    factor = kind.report_factor
+    good = low if low < len(factors) else None
+    delays = results.get(low if good is not None else len(factors) - 1, [])
     return FoundSize(
         channel.name,
-        kind.report_unit,
-        None if good is None else FACTORS[good] * spread * factor,
-        FACTORS[-1] * spread * factor,
+        unit,
+        None if good is None else factors[good] * base * factor,
+        factors[-1] * base * factor,
         None if good is None else float(np.median(delays)),
         len(delays) / trials,
         trials,
-        minutes,
+        0.0,
+        change,
     )
 
 
-def _delays(monitor: Monitor, segments: Sequence[Recording], name: str, shift: float) -> list[float]:
-    """Times from the onset to the alarm, of the trials in which the shift was found."""
+def _size_unit(monitor: Monitor, channel: Channel, change: Change) -> tuple[str, float, float]:
+    """Return the unit of a change, the size of its factor 1, and the factor from that size to the unit."""
+    if change is Change.SCALE:
+        return "%", 1.0, 100.0
+    if change is Change.DELAY:
+        return "s", 1.0, 1.0
+    kind = KINDS[channel.kind]
+    column = monitor.inputs.index(channel.name)
+    return kind.report_unit, 1.0 / float(monitor.chain.summaries.spread[column]), kind.report_factor
+
+
+def _delays(
+    monitor: Monitor, segments: Sequence[Recording], name: str, injection: _Injection, size: float
+) -> list[float]:
+    """Times from the onset to the alarm, of the trials in which the change was found."""
     delays = []
-    for segment, sign in itertools.product(segments, SIGNS):
-        onset = round(ONSET * segment.samples)
+    for segment, sign in itertools.product(segments, injection.signs):
+        onset, column = round(ONSET * segment.samples), segment.index(name)
         values = segment.values.copy()
-        values[onset:, segment.index(name)] += np.float32(sign * shift)
+        values[:, column] = injection.apply(values[:, column], onset, sign * size, segment.rate_hz)
         began = onset / segment.rate_hz
         raised = [alarm.raised_s for alarm in _alarms(monitor, replace(segment, values=values))]
         later = [at - began for at in raised if at > began]
@@ -165,24 +282,50 @@ def promise_lines(sizes: Sequence[FoundSize]) -> list[str]:
     if not sizes:
         return ["what it finds was not measured: no healthy segment outside of the limits is free of alarms"]
     minutes = f"with {sizes[0].minutes:.3g} healthy minutes"
-    shown = [size.sentence() for size in sizes[:_SHOWN]]
-    more = [f"and {len(sizes) - _SHOWN} more channels (--json)"] if len(sizes) > _SHOWN else []
-    return [f"{minutes} {'; '.join([*shown, *more])}"]
+    lines = []
+    for rows in _by_change(sizes):
+        more = [f"and {len(rows) - _SHOWN} more channels (--json)"] if len(rows) > _SHOWN else []
+        lines.append(f"{minutes} {'; '.join([*(size.sentence() for size in rows[:_SHOWN]), *more])}")
+    return lines
+
+
+def effort_line(provenance: Mapping[str, Any]) -> str:
+    """Return what was not measured because the trials would have taken too long; empty where all was.
+
+    Raises:
+        StorageError: the entry is damaged.
+    """
+    effort = provenance.get("found_effort")
+    if effort is None:
+        return ""  # a monitor of an earlier version
+    try:
+        measured, planned, seconds = int(effort["measured"]), int(effort["planned"]), float(effort["seconds"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise StorageError("the monitor's found_effort is damaged: fit the monitor again") from error
+    if measured >= planned:
+        return ""
+    return (
+        f"the trials of what it finds ended early, after {seconds:.3g} s of processor time: {measured} of {planned} "
+        "changes of channels were measured"
+    )
+
+
+def _by_change(sizes: Sequence[FoundSize]) -> list[list[FoundSize]]:
+    """Sizes of each change that was injected, in the order of `INJECTIONS`."""
+    groups = [[size for size in sizes if size.change == change] for change in INJECTIONS]
+    return [group for group in groups if group]
 
 
 def unseen_line(sizes: Sequence[FoundSize]) -> str:
-    """Return what silence does not exclude: the sizes below which a shift would not have been found."""
+    """Return what silence does not exclude: the sizes below which a change would not have been found."""
     if not sizes:
         return ""
-    parts = [
-        f"of {size.channel} below {size.size if size.size is not None else size.largest:.3g} {size.unit}".removesuffix(
-            " 1"
-        )
-        for size in sizes[:_SHOWN]
-    ]
-    more = ", and others" if len(sizes) > _SHOWN else ""
+    parts = []
+    for rows in _by_change(sizes):
+        named = ", ".join(f"of {size.channel} below {size.amount()}" for size in rows[:_SHOWN])
+        parts.append(f"a {rows[0].change} {named}{', and others' if len(rows) > _SHOWN else ''}")
     return (
-        f"with {sizes[0].minutes:.3g} healthy minutes a shift {', '.join(parts)}{more} would not have been found in "
+        f"with {sizes[0].minutes:.3g} healthy minutes {'; '.join(parts)} would not have been found in "
         f"{FOUND_SHARE:.0%} of trials"
     )
 

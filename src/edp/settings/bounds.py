@@ -34,6 +34,8 @@ MOST_THREADS = 4_096
 MOST_SEED = 2**32 - 1
 # Standardised errors, gradients and weights of loss terms are of the order of one; float32 squares overflow at 1.8e19.
 MOST_WEIGHT = 1e6
+LEAST_POSITIVE = 1.2e-38
+"""Least number that counts as above zero: the smallest normal number of float32, whose inverse is finite."""
 MOST_SHOWN = 60
 """Characters of a value that a message repeats."""
 
@@ -46,7 +48,7 @@ class Bound:
         low: least value.
         high: largest value, finite.
         integer: only integers.
-        above: `low` itself is out.
+        above: `low` itself is out; above zero, numbers below `LEAST_POSITIVE` are, too.
         below: `high` itself is out.
     """
 
@@ -63,6 +65,8 @@ class Bound:
             return False
         number: Any = value  # integers beyond what a float holds compare as they are
         over = number > self.low if self.above else number >= self.low
+        if self.above and self.low == 0.0 and number < LEAST_POSITIVE:
+            return False
         under = number < self.high if self.below else number <= self.high
         return bool(over and under)
 
@@ -71,6 +75,12 @@ class Bound:
         first, second = "<" if self.above else "<=", "<" if self.below else "<="
         kind = "integers, " if self.integer else ""
         return f"{kind}{self.low:,.12g} {first} {name} {second} {self.high:,.12g}"
+
+    def note(self, value: Any) -> str:
+        """Return what a message adds for a number that is above zero and counts as zero; else an empty text."""
+        entries = value if isinstance(value, tuple | list) else (value,)
+        tiny = any(isinstance(entry, Real) and 0.0 < entry < LEAST_POSITIVE for entry in entries)  # type: ignore[operator]
+        return f" (numbers below {LEAST_POSITIVE:g} count as zero)" if self.above and self.low == 0.0 and tiny else ""
 
 
 def integer(low: int, high: int) -> Bound:
@@ -124,7 +134,7 @@ def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
         value = getattr(spec, name)
         entries = value if isinstance(value, tuple | list) else () if value is None else (value,)
         if not all(bound.holds(entry) for entry in entries):
-            wrong.append(f"{name} = {shown(value)}; {bound.rule(name)} must hold")
+            wrong.append(f"{name} = {shown(value)}; {bound.rule(name)} must hold{bound.note(value)}")
     if wrong:
         raise ConfigError(f"{what}: {'; '.join(wrong)}")
 

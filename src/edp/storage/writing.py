@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from edp.errors import StorageError
+from edp.errors import EdpError, StorageError
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_at
 from edp.storage.portable import BINARY, NO_LINK, QUIETLY, hold_handle, lock_handle
 from edp.storage.seals import sealed
@@ -23,6 +23,30 @@ def storage_error(path: Path, error: OSError, doing: str) -> StorageError:
     """A message that says what could not be done, where and why."""
     reason = error.strerror or str(error)
     return StorageError(f"cannot {doing} '{path}': {reason}; free space or choose a folder you may write to")
+
+
+_OF_THE_SYSTEM = re.compile(
+    r"errno = (\d+)|No space left|File too large|Disk quota|Input/output error|Read-only file"
+    r"|disk I/O error|disk is full"
+)
+"""What libraries in C write into their own errors where the system refused to write."""
+
+
+def system_failure(error: BaseException) -> OSError | None:
+    """Return the error of the system from which an error of a library stems; None where it has another cause.
+
+    Libraries that write files (HDF5, Arrow, MDF, pictures) wrap it, chain it, or repeat its text.
+    """
+    seen: set[int] = set()
+    link: BaseException | None = error
+    while link is not None and id(link) not in seen:
+        if isinstance(link, OSError):
+            return link
+        if reason := _OF_THE_SYSTEM.search(str(link)):
+            return OSError(int(reason[1]), os.strerror(int(reason[1]))) if reason[1] else OSError(str(link)[:200])
+        seen.add(id(link))
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+    return None
 
 
 def make_folder(path: str | Path) -> Path:
@@ -133,8 +157,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise StorageError(f"cannot write '{target}': a folder of this name is in the way; remove or rename it") from (
             error
         )
-    except OSError as error:
-        raise storage_error(target, error, "write") from error
+    except EdpError:
+        raise
+    except Exception as error:
+        failure = system_failure(error)
+        if failure is None:
+            raise
+        raise storage_error(target, failure, "write") from error
     finally:
         if handle >= 0:
             os.close(handle)
@@ -167,8 +196,13 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
         if os.name == "nt" and is_folder_at(target):
             target.rmdir()  # Windows renames onto nothing that is there
         temporary.rename(target)
-    except OSError as error:
-        raise storage_error(target, error, "write") from error
+    except EdpError:
+        raise
+    except Exception as error:
+        failure = system_failure(error)
+        if failure is None:
+            raise
+        raise storage_error(target, failure, "write") from error
     finally:
         if handle >= 0:
             os.close(handle)

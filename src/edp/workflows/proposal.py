@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from edp.errors import ConfigError, StorageError
+from edp.errors import ConfigError, StorageError, count_of
 from edp.logs.proposal.experiments import Experiments, part_experiments
 from edp.logs.proposal.frames import refuse_frames
 from edp.logs.proposal.groups import LogGroup, group_logs
@@ -156,7 +156,9 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     notes += [*more, *pace_notes(proposal.look, proposal.clock, chosen), *beside_notes(source, paths)]
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
     if len(channels) > MOST_FEATURES:
-        notes.append(f"{len(channels)} channels move; the first {MOST_FEATURES} are features (task.features)")
+        notes.append(
+            f"of {count_of(len(channels), 'moving channel')} the first {MOST_FEATURES} are features (task.features)"
+        )
         channels = list(dict.fromkeys([*channels[:MOST_FEATURES], *targets]))
     split, why = choose_split(group, proposal, targets)
     if experiments is not None:
@@ -274,7 +276,7 @@ _FEW_ROWS = 700
 def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str], proposal: MapProposal) -> list[str]:
     look, clock = proposal.look, proposal.clock
     notes = [] if not look.part else [f"{look.path.name}: looked at {look.part}"]
-    notes += [f"{count} column(s) {reason}: left out" for reason, count in look.left_out.items()]
+    notes += [f"{count_of(count, 'column')} {reason}: left out" for reason, count in look.left_out.items()]
     notes += shape_notes(look)
     notes += [f"time: {clock.check}"] if clock.check else []
     rows = sum(look.rows for look in group.looks) * len(group.paths) / len(group.looks)
@@ -285,7 +287,9 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
             f"some {rows:,.0f} rows in all: too few to train and to test on; record more, or set rate_hz higher"
         )
     if len(group.looks) < len(group.paths):
-        notes.append(f"{len(group.looks)} of {len(group.paths)} logs were looked at; of the others the columns only")
+        notes.append(
+            f"{len(group.looks)} of {count_of(len(group.paths), 'log')} were looked at; of the others the columns only"
+        )
     for other in others:
         names = ", ".join(path.name[:40] for path in other.paths[:3])
         notes.append(f"other columns: {names}{', ...' if len(other.paths) > 3 else ''}; give such logs on their own")
@@ -293,7 +297,7 @@ def _notes(group: LogGroup, others: Sequence[LogGroup], broken: dict[Path, str],
     notes += ["labels: those that are known while the machine works may be features"] * ("label" in roles)
     notes += [f"not readable: {reason}" for reason in list(broken.values())[:3]]
     if len(broken) > 3:
-        notes.append(f"{len(broken) - 3} more logs are not readable")
+        notes.append(f"{count_of(len(broken) - 3, 'more log')} cannot be read")
     return notes
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from edp.data.even_split import blocks_where_time_is_uneven, rests_where_it_tests
 from edp.data.splits import ByName, ByTime
+from edp.errors import count_of
 from edp.logs.proposal.columns import LogLook
 from edp.logs.proposal.groups import LogGroup
 from edp.logs.proposal.propose import MapProposal
@@ -60,7 +61,8 @@ def _rests_in_most(group: LogGroup, proposal: MapProposal, targets: Sequence[str
         moving = sizes > _MOVES * sizes.max()
         if moving.mean() < _IN_MOST and tests * moving.mean() < _LEAST_TESTED:
             return (
-                f"{guess.column[:40]} moves in {np.count_nonzero(moving)} of {len(sizes)} logs: the end of each log "
+                f"{guess.column[:40]} moves in {np.count_nonzero(moving)} of {count_of(len(sizes), 'log')}: the end "
+                "of each log "
                 "tests, since a whole one shows little of the others (split)"
             )
     return ""

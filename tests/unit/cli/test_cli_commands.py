@@ -114,6 +114,35 @@ def test_json_of_a_process_is_all_of_standard_output(trained):
     assert done.stderr == ""
 
 
+def test_report_states_a_budget_where_one_is_given(edp, trained, tmp_path):
+    """Limits of a controller stand on the page of a run once `--budget` names the controller."""
+    page = trained / "report.html"
+    edp("report", trained)
+    assert "loader board" not in page.read_text(encoding="utf-8")
+    board = tmp_path / "board.toml"
+    board.write_text('name = "loader board"\nram_bytes = 12345\n')
+    edp("report", trained, "--budget", board)
+    shown = page.read_text(encoding="utf-8")
+    assert "loader board" in shown
+    assert "12,345" in shown
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [("ram_bytes = -1", "ram_bytes"), ("ram = 3", "ram"), ("[[", "board.toml"), (None, "board.toml")],
+)
+def test_report_refuses_a_file_that_is_no_budget(edp, trained, tmp_path, content, said):
+    board = tmp_path / "board.toml"
+    if content is not None:
+        board.write_text(content)
+    kept = {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()}
+    ended = edp("report", trained, "--budget", board)
+    assert ended.code == 2 or ended.code == 1
+    assert said in ended.err
+    assert "Traceback" not in ended.err
+    assert {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()} == kept
+
+
 def test_demo_runs_its_four_steps(edp, tmp_path, monkeypatch, small):
     monkeypatch.setattr(demo, "MINUTES", 0.8)
     monkeypatch.setattr(demo, "RECORDINGS", 4)

@@ -5,15 +5,153 @@ import re
 from pathlib import Path
 
 import pytest
+import typer
 from typer.main import get_command
 
-from edp.cli import app, console, verdicts
-from edp.evaluation.guard import BEATEN, ErrorOutcome, ErrorVerdict, network_verdict, outcome_of
+from edp.cli import app, console
+from edp.cli.verdicts import end_with, show_verdict, verdict_facts
+from edp.evaluation.guard import (
+    BEATEN,
+    MACHINE,
+    ErrorOutcome,
+    ErrorVerdict,
+    adaptation_verdict,
+    machine_verdict,
+    network_verdict,
+    outcome_of,
+    tuning_verdict,
+    twin_verdict,
+)
+from edp.report.transfer.facts import transfer_verdict
 
 ROOT = Path(__file__).parents[3]
 COMMANDS = ROOT / "src/edp/cli"
-JUDGING = {"evaluate", "twin", "identify", "finetune"}
-"""Files of commands that end with a verdict."""
+JUDGING = {"evaluate", "twin", "identify", "finetune", "adapt", "replay", "tune"}
+"""Commands that end with a verdict."""
+HEADLINE = {"search run", "search report", "compare"}
+"""Commands that take the outcome's words for a page and end with 0: they compare several, none of which is judged."""
+EVALUATED_LATER = {"train", "distil", "compress", "quantise", "pretrain"}
+"""Commands that make a network, state its validation error or its cost, and leave the verdict to `edp evaluate`."""
+NO_COMPARISON = {
+    *("demo", "simulate", "init", "inspect", "screen", "animate", "rollout", "forecast", "control", "live"),
+    *("footprint", "export", "parity", "report", "runs", "doctor", "store build", "store check", "search status"),
+    *("search export", "fleet report", "fleet network", "registry add", "registry list", "registry show"),
+    *("monitor fit", "monitor run", "monitor report"),
+}
+"""Commands that hold no model against a reference by its error on recordings."""
+
+
+def commands(group, words=()):
+    """Each command of the tree by its words."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*words, name))
+        else:
+            yield " ".join((*words, name)), command
+
+
+TREE = dict(commands(get_command(app)))
+FILES = {TREE[name].callback.__module__.rsplit(".", 1)[1] for name in JUDGING}
+
+
+def test_every_command_of_the_tree_is_declared_once():
+    declared = [*JUDGING, *HEADLINE, *EVALUATED_LATER, *NO_COMPARISON]
+    assert sorted(declared) == sorted(TREE)
+
+
+def free_runs(ratio, judged):
+    """Scores of free runs with error 1 of what is judged, and of one floor."""
+
+    def scored(error):
+        return {"velocity_mae": {"by_channel": {"v": error}}, "stroke_error": [{"by_channel": {"v": error}}]}
+
+    return {judged: scored(1.0), "Static map": scored(ratio)}
+
+
+def adapted(*ratios):
+    """Replayed recordings whose error with adaptation is 1, and `ratios` without."""
+    changes = {f"r{i}": 1.0 / ratio - 1.0 for i, ratio in enumerate(ratios)}
+    return {"change": sum(changes.values()) / len(changes), "change_by_recording": changes}
+
+
+class Methods:
+    """Scores of a fine-tuned network with error 1 beside one other method."""
+
+    horizons, methods, content = (1,), {"tuned": {"label": "Tuned"}, "direct": {"label": "Direct"}}, {"method": "tuned"}
+
+    def __init__(self, ratio):
+        self.ratio = ratio
+
+    def score(self, name, horizon):
+        return {"mae": 1.0 if name == "tuned" else self.ratio}
+
+
+VERDICTS = {
+    "evaluate": lambda *ratios: network_verdict(scores(*ratios)),
+    "twin": lambda *ratios: twin_verdict(free_runs(ratios[0], "twin")),
+    "identify": lambda *ratios: machine_verdict(free_runs(ratios[0], MACHINE)),
+    "finetune": lambda *ratios: transfer_verdict(Methods(ratios[0])),
+    "adapt": lambda *ratios: adaptation_verdict(adapted(*ratios)),
+    "replay": lambda *ratios: adaptation_verdict(adapted(*ratios)),
+    "tune": lambda *ratios: tuning_verdict({"before": ratios[0], "after": 1.0}),
+}
+WITH_INTERVALS = {"evaluate", "adapt", "replay"}
+CASES = {
+    ErrorOutcome.WORSE: (0.5, 0.6, 0.7, 0.55),
+    ErrorOutcome.BETTER: (1.5, 1.6, 1.7, 1.55),
+    ErrorOutcome.OPEN: (1.9, 0.6, 3.0, 0.7),
+}
+
+
+def test_every_judging_command_has_a_verdict_function_here():
+    assert set(VERDICTS) == JUDGING
+
+
+@pytest.mark.parametrize("command", sorted(JUDGING))
+@pytest.mark.parametrize("outcome", list(ErrorOutcome))
+def test_exit_code_first_line_and_headline_agree(command, outcome, capsys):
+    verdict = VERDICTS[command](*CASES[outcome])
+    # Scores without recordings of their own have no interval, so that they never show a gain for certain.
+    expected = ErrorOutcome.OPEN if outcome is ErrorOutcome.BETTER and command not in WITH_INTERVALS else outcome
+    assert verdict.outcome is expected
+    show_verdict(verdict)
+    first = " ".join(capsys.readouterr().out.split())
+    assert first == verdict.sentence()
+    page = verdict.headline("Figures.")
+    assert page.startswith(first)
+    worse = expected is ErrorOutcome.WORSE
+    assert ("do not use" in first) is ("Figures." not in page) is (verdict_facts(verdict)["beaten_by"] is not None)
+    assert ("do not use" in first) is worse
+    if worse:
+        with pytest.raises(typer.Exit) as ended:
+            end_with(verdict)
+        assert ended.value.exit_code == BEATEN == verdict.exit_code
+    else:
+        end_with(verdict)
+        assert verdict.exit_code == 0
+
+
+def test_pages_take_their_headline_from_the_verdict():
+    """A page that calls a verdict function makes its headline by `ErrorVerdict.headline`."""
+    users = {
+        file
+        for file in (ROOT / "src/edp/report").rglob("*.py")
+        if re.search(r"\b(network|twin|transfer|machine|adaptation|tuning)_verdict\(", file.read_text(encoding="utf-8"))
+    }
+    assert len(users) >= 3
+    for file in users:
+        text = file.read_text(encoding="utf-8")
+        assert "judged.headline(figures)" in text, file
+        assert "judged.sentence()" not in text, file
+
+
+def test_the_docs_name_the_commands_that_judge_and_those_that_do_not():
+    page = (ROOT / "docs/commands.md").read_text(encoding="utf-8").split("## Verdicts and exit codes")[1]
+    rows = page.split("| Command | Compares | With |")[1].split("\n\n")[0]
+    named = set(re.findall(r"`edp ([a-z ]+)`", rows))
+    assert named == JUDGING | {name.removesuffix(" run") for name in HEADLINE - {"search report"}}
+    sentence = page.split("compare nothing:")[0].split("\n")[-1]
+    assert set(re.findall(r"`edp ([a-z ]+)`", sentence)) == EVALUATED_LATER
 
 
 def scores(*ratios, horizons=(1,)):
@@ -73,8 +211,7 @@ def test_every_command_file_ends_by_the_rule():
             ends.add(file.stem)
             assert text.count("end_with(verdict)") == text.count("show_verdict(verdict)"), file.name
             assert text.count("end_with(verdict)") == text.count("verdict_facts(verdict)"), file.name
-    assert ends == JUDGING
-    assert callable(verdicts.end_with)
+    assert ends == FILES
 
 
 def test_a_command_whose_help_or_module_compares_with_a_reference_is_one_that_judges():
@@ -84,8 +221,7 @@ def test_a_command_whose_help_or_module_compares_with_a_reference_is_one_that_ju
         for file in COMMANDS.glob("*.py")
         if re.search(r"_verdict\b|beaten_by\(", file.read_text(encoding="utf-8")) and file.name != "verdicts.py"
     } - {"inspect", "quality"}
-    assert users == JUDGING
-    assert set(get_command(app).commands) >= JUDGING
+    assert users == FILES
 
 
 def test_exit_codes_of_the_docs_are_those_of_the_code():
@@ -98,3 +234,17 @@ def test_exit_codes_of_the_docs_are_those_of_the_code():
         codes = re.findall(r"^(?:FAULTY|ALARMS|BROKEN) = (\d+)", file.read_text(encoding="utf-8"), re.MULTILINE)
         named |= set(map(int, codes))
     assert stated == named
+
+
+def test_pages_promise_the_exit_code_for_commands_that_judge():
+    """Every paragraph of the docs with exit code 6 names a command that ends by the rule."""
+    promised = []
+    for file in sorted((ROOT / "docs").glob("*.md")):
+        for text in re.split(r"\n\s*\n", file.read_text(encoding="utf-8")):
+            if re.search(r"exit\s+code\s+6|\[exit code 6\]", text) and file.name not in ("results.md", "findings.md"):
+                named = set(re.findall(r"`edp ([a-z]+)", text))
+                promised.append(file.name)
+                assert not named or named & JUDGING, (file.name, text)
+    assert {"auto.md", "faq.md", "own_logs.md", "twin.md", "control.md", "adaptation.md"} <= set(promised)
+    evaluate = TREE["evaluate"].callback.__doc__
+    assert f"exit code {BEATEN}" in evaluate

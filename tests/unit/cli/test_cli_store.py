@@ -27,7 +27,7 @@ def test_refused_logs_end_with_a_code_of_their_own(edp, logs, tmp_path):
     ended = edp("store", "build", tmp_path / "logs", "--out", tmp_path / "store", "--workers", 1)
     assert ended.code == 3
     assert "bad.parquet" in ended.out
-    assert "1 log(s) are not in the store" in ended.err
+    assert "1 log left out of the store" in ended.err
     assert edp("inspect", tmp_path / "store", "--no-coverage").code == 0
 
 

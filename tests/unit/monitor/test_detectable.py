@@ -8,9 +8,19 @@ import numpy as np
 import pytest
 from small_monitors import fitted_monitor
 
+from edp.errors import StorageError
 from edp.logs import write_recording
 from edp.logs.source import DataSource
-from edp.monitor.detectable import FACTORS, found_sizes, measure_found_sizes, outside_line, unseen_line
+from edp.monitor.detectable import (
+    INJECTIONS,
+    Change,
+    effort_line,
+    found_sizes,
+    measure_found_sizes,
+    outside_line,
+    promise_lines,
+    unseen_line,
+)
 from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.report.monitor.facts import headline, verdict
 from edp.testing.monitor import rig_sessions
@@ -30,8 +40,8 @@ def shifted(session, name, size):
 
 def test_every_channel_has_a_size_with_its_trials_and_minutes(monitor):
     sizes = found_sizes(monitor.provenance)
-    assert [size.channel for size in sizes] == list(monitor.inputs)
-    assert all(size.trials >= 2 and size.minutes == pytest.approx(4.0) for size in sizes)
+    assert [(size.change, size.channel) for size in sizes] == [(c, n) for c in INJECTIONS for n in monitor.inputs]
+    assert all(size.trials >= 1 and size.minutes == pytest.approx(4.0) for size in sizes)
     assert all(size.share >= 0.8 and size.within_s > 0 for size in sizes if size.size is not None)
 
 
@@ -46,7 +56,7 @@ def test_a_size_that_is_promised_is_found_on_other_sessions_and_a_small_part_of_
 
 def test_segments_with_alarms_of_their_own_measure_nothing(monitor):
     loud = [shifted(session, "stroke", 0.2) for session in rig_sessions(2, 2000, seed=3)]
-    assert measure_found_sizes(monitor, loud, 4.0, lambda text: None) == []
+    assert measure_found_sizes(monitor, loud, 4.0, 0.0, lambda text: None).sizes == ()
     assert unseen_line([]) == ""
 
 
@@ -55,9 +65,46 @@ def test_work_is_bounded_by_bisection(monitor, monkeypatch):
     watch = type(monitor).watch
     monkeypatch.setattr(type(monitor), "watch", lambda self, *a: calls.append(1) or watch(self, *a))
     segments = rig_sessions(1, 2000, seed=5)
-    measure_found_sizes(monitor, segments, 4.0, lambda text: None)
-    steps = int(np.ceil(np.log2(len(FACTORS) + 1)))
-    assert len(calls) <= 1 + 2 * steps * len(monitor.inputs)
+    measure_found_sizes(monitor, segments, 4.0, 0.0, lambda text: None)
+    most = sum(len(one.signs) * int(np.ceil(np.log2(len(one.factors) + 1))) for one in INJECTIONS.values())
+    assert len(calls) <= 1 + most * len(monitor.inputs)
+
+
+def test_the_trials_end_at_a_share_of_the_fit_and_say_so(monitor, monkeypatch):
+    module = importlib.import_module("edp.monitor.detectable")
+    clock = iter(range(10_000))
+    # One second for each look at the clock: what is tried depends on the share alone.
+    monkeypatch.setattr(module.time, "process_time", lambda: float(next(clock)))
+    segments = rig_sessions(1, 2000, seed=5)
+    results = [measure_found_sizes(monitor, segments, 4.0, fit_s, lambda text: None) for fit_s in (0.0, 1e6)]
+    assert [one.allowed_s for one in results] == [module.MIN_EFFORT_S, module.EFFORT_SHARE * 1e6]
+    short, whole = results
+    assert 0 < len(short.sizes) < short.planned == len(whole.sizes)
+    assert short.sizes == whole.sizes[: len(short.sizes)]
+    line = effort_line({"found_effort": short.effort()})
+    assert f"{len(short.sizes)} of {short.planned} changes" in line
+    assert effort_line({"found_effort": whole.effort()}) == effort_line({}) == ""
+    with pytest.raises(StorageError, match="found_effort is damaged"):
+        effort_line({"found_effort": {"measured": "x"}})
+
+
+@pytest.mark.parametrize("change", list(Change))
+def test_a_change_begins_at_the_onset_and_has_its_size(change):
+    values = np.arange(1.0, 201.0, dtype=np.float32)
+    changed = INJECTIONS[change].apply(values, 60, 0.1, 100.0)
+    assert np.array_equal(changed[:60], values[:60])
+    expected = {Change.SHIFT: values + 0.1, Change.SCALE: values * 1.1, Change.DELAY: values - 10}[change]
+    assert changed[60:] == pytest.approx(expected[60:], rel=1e-5)
+    assert changed.dtype == np.float32
+    assert len(changed) == len(values)
+
+
+def test_each_change_has_its_line_and_older_monitors_are_shifts(monitor):
+    sizes = found_sizes(monitor.provenance)
+    lines = promise_lines(sizes)
+    assert [line.split(" of ")[0].rsplit(" ", 1)[1] for line in lines] == list(INJECTIONS)
+    rows = [{k: v for k, v in row.items() if k != "change"} for row in monitor.provenance["found_sizes"]]
+    assert {size.change for size in found_sizes({"found_sizes": rows})} == {Change.SHIFT}
 
 
 def test_no_alarm_repeats_what_would_not_have_been_found(monitor, tmp_path):

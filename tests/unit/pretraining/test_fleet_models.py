@@ -165,7 +165,7 @@ def test_reasons_are_what_departs_from_the_fleet(content):
     why = {one.name: " ".join(one.why) for one in facts.rows}
     assert "grew by 80 %" in why["m3"]
     assert "input lever lies" in why["<b>m4</b>"]
-    assert "2 change(s), first: pump leaks" in why["m5"]
+    assert "2 changes, first: pump leaks" in why["m5"]
     assert "change 2.2 times as fast" in why["m5"]
     assert why["m0"] == ""
     assert headline(facts).startswith("12 machines, median error")

@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from browser import check_page
+from browser import check_page, page_faults
 from safetensors.numpy import load_file, save_file
 from typer.testing import CliRunner
 
@@ -85,7 +85,7 @@ def test_what_goes_both_ways_is_not_told_apart(make_run):
     run = make_run("first", recordings=6)
     comparison = compare_runs([run, changed(run, "second", [1.3, 0.7, 1.2, 0.8, 1.1, 0.9])])
     assert not comparison.differences(comparison.measures[0])["second"].told_apart
-    assert "second cannot be told apart" in comparison.headline()
+    assert "second is not distinguishable" in comparison.headline()
 
 
 def test_p_values_are_adjusted_for_the_number_of_runs(make_run):
@@ -112,7 +112,7 @@ def test_one_common_recording_is_compared_in_blocks(make_run):
     assert difference.count == 9  # of 10 s
     assert difference.change == pytest.approx(-0.2, abs=0.02)
     assert difference.told_apart
-    assert any("say nothing of other recordings" in line for line in comparison.remarks)
+    assert any("cannot speak for other recordings" in line for line in comparison.remarks)
 
 
 def test_too_little_in_common_has_no_interval(make_run):
@@ -238,3 +238,11 @@ def test_costs_of_all_runs_are_listed(pair):
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, pair, tmp_path):
     check_page(browser, write_compare_page(compare_runs(pair), tmp_path / "compare.html"), "comparison")
+
+
+@pytest.mark.processes
+def test_numbers_of_an_axis_are_never_cut_short(browser, make_run, tmp_path):
+    first, second = make_run("first"), make_run("second")
+    browser.open(write_compare_page(compare_runs([first, second]), tmp_path / "compare.html"))
+    browser.run("window.dispatchEvent(new Event('beforeprint'))")
+    assert [fault for fault in page_faults(browser) if "number cut short" in fault] == []

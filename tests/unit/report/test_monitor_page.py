@@ -130,4 +130,4 @@ def test_times_of_day_are_shown_where_the_start_is_known(facts):
 def test_the_page_in_a_browser(browser, facts, tmp_path):
     page = tmp_path / "monitor.html"
     page.write_text(render(facts))
-    check_page(browser, page, "monitor")
+    check_page(browser, page, "monitor", ("the boom", "boom head", "boom cylinder"))

@@ -98,4 +98,5 @@ def test_the_sentence_says_what_there_is():
 def test_the_page_in_a_browser(browser, tmp_path):
     recording = machine_like()
     found = cover([recording], split=ByTime().split([recording], 10))
-    check_page(browser, build_coverage_page(found, tmp_path / "coverage.html", "data"), "coverage")
+    page = build_coverage_page(found, tmp_path / "coverage.html", "data")
+    check_page(browser, page, "coverage", ("Soil contact", "boom", "bucket"))

@@ -235,7 +235,7 @@ def test_the_limit_of_the_data_becomes_a_line(run_folder, tmp_path):
     assert not any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder)))
     for place in (data, data / "limit.json"):
         (line,) = [text for text in verdict_lines(read_facts(run_folder, place)) if "limit" in text]
-        assert "5.04 mm/s (95 %: 4.10 to 6.20)" in line
+        assert "5.0 mm/s (95 %: 4.1 to 6.2)" in line
         assert "its error would be 0.33" in line
     provenance = json.loads((run_folder / "provenance.json").read_text())
     provenance["data"]["reader"] = {"path": str(data)}

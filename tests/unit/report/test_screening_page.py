@@ -108,7 +108,7 @@ def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
     assert "<td>u<b></td>" not in text
     assert list(figures_of(text)) == ["matrices", "lags", "stability", "importance", "value"]
     assert all(f'id="figure-{name}"' in text for name in figures_of(text))
-    for words in ("leak of the future", "4.200", "+0.100 to +0.500", "9.000", "lack BmUp", "A note.", "reason 3"):
+    for words in ("leak of the future", "4.200", "+0.10 to +0.50", "9.000", "lack BmUp", "A note.", "reason 3"):
         assert words in text
     assert "The longest lead is 12 samples." in text
 

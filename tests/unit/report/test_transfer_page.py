@@ -86,9 +86,7 @@ def test_the_table_has_the_form_and_figures_of_the_thesis(folder):
     assert texts[5][:7] == ("Fine-Tuned", "Bucket", "59.0", "4.00", "0.9774", "15.40", "31.2")
     assert sheet.marked == {3, 4, 5}
     assert facts.gain("10") == pytest.approx(1 - 8.8 / 24.0)
-    assert transfer_facts.headline(facts).startswith(
-        "Fine-Tuned: 63 % less error than direct transfer, 2.93 instead of 8"
-    )
+    assert "Fine-Tuned: 63 % less error than direct transfer, 2.93 instead of 8" in transfer_facts.headline(facts)
     lines = " ".join(transfer_facts.verdict(facts))
     assert "R² is 0.9737 (Boom), 0.9906 (Arm) and 0.9774 (Bucket)." in lines
     assert "Boom, Arm and Bucket have a bias above 5.0 % of their MAE" in lines
@@ -124,7 +122,7 @@ def test_what_is_not_there_is_not_shown(folder):
             row["domains"]["target"]["10"][name]["r2"] = None
     held["methods"]["two_phase"]["domains"] = held["methods"]["direct"]["domains"]
     facts = read_transfer(folder(held))
-    assert transfer_facts.headline(facts).startswith("No epoch was better on the validation part")
+    assert transfer_facts.headline(facts).find("No epoch was better on the validation part") > 0
     assert "source" not in " ".join(transfer_facts.verdict(facts))
     assert "MAE on the source" not in [c.heading for c in transfer_facts.method_sheet(facts, "10").columns]
     assert "On the source" not in render(facts, transfer_facts.sheets_of(facts, "10"))
@@ -161,4 +159,4 @@ def test_what_cannot_be_read_is_refused(folder, spoil, reason):
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, folder):
-    check_page(browser, write_transfer_page(folder(content())), "transfer")
+    check_page(browser, write_transfer_page(folder(content())), "transfer", CYLINDERS)

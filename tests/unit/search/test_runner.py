@@ -255,7 +255,7 @@ def test_a_lost_training_stops_the_search_and_is_tried_again(six_sessions, plan,
         def gather(self):
             return Killed()
 
-    with pytest.raises(LostError, match=r"8 trainings were lost.*signal 9.*same command again") as told:
+    with pytest.raises(LostError, match=r"8 trainings lost.*signal 9.*same command again") as told:
         run_search(six_sessions, plan, tmp_path, Unlucky(workers=1), "isolation")
     assert told.value.exit_code == 75
     assert run_search(six_sessions, plan, tmp_path, CREW, "isolation").trained == 8

@@ -172,7 +172,8 @@ const Figure = (function () {
       const barred = this.shown().some((t) => t.type === "heatmap" && t.showscale !== false);
       panels.forEach((panel) => {
         const { x, y, second } = panel;
-        const texts = (axis) => axis.ticks(200).map((row) => row[1]);
+        // A higher panel has finer ticks, whose numbers are longer; its height is not known yet.
+        const texts = (axis) => [120, 200, 300, 450].flatMap((high) => axis.ticks(high).map((row) => row[1]));
         const labelled = (axis) => axis && axis.options.visible !== false && (axis.options.showticklabels !== false || grid.stacked);
         panel.labels = { x: labelled(x), y: labelled(y) };
         const longest = labelled(y) ? Math.min(Math.max(0, ...texts(y).map((t) => width(t))), room) : 0;
@@ -283,7 +284,9 @@ const Figure = (function () {
       if (y.options.visible !== false) {
         const rows = y.ticks(bottom - top);
         const every = y.categories ? Math.ceil((rows.length * 13) / Math.max(bottom - top, 1)) : 1;
-        const named = fittingAll(rows.map((row) => row[1]), panel.pad.left - 8 - (y.options.title.text ? 20 : 0));
+        const labels = rows.map((row) => row[1]);
+        // Names may be cut short, numbers never.
+        const named = y.categories || y.options.tickvals ? fittingAll(labels, panel.pad.left - 8 - (y.options.title.text ? 20 : 0)) : labels;
         rows.forEach(([at], i) => {
           const up = y.at(at);
           if (y.options.showgrid) line(`M${left} ${up.toFixed(1)}H${right}`, RULE);

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME
-from edp.report.common.wording import MISSING, count_text, decimals_for, duration, moment, number, percent
+from edp.report.common.wording import MISSING, count_text, decimals_for, duration, figure, moment, number, percent
 from edp.report.run.budget import budget_rows
 from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
@@ -129,7 +130,9 @@ def worst_recordings_table(facts: Facts, most: int = 10) -> TextTable | None:
     picked = list(range(len(order)))[::-1][:most]
     lines = tuple((order[i], *(number(errors[name][i], places) for name in models)) for i in picked)
     columns = (("Recording", ""), *((label_of(facts, name), facts.unit) for name in models))
-    return TextTable(f"The {len(picked)} hardest recordings, {horizon_text(facts, horizon)} ahead", columns, lines)
+    return TextTable(
+        f"The {count_of(len(picked), 'hardest recording')}, {horizon_text(facts, horizon)} ahead", columns, lines
+    )
 
 
 @dataclass(frozen=True)
@@ -229,12 +232,12 @@ def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
     data = source.get("data", {})
     add("Data", data.get("source"))
     add("Data digest", data.get("digest"))
-    add("Rate", f"{facts.rate_hz:g} Hz" if facts.rate_hz else None)
+    add("Rate", f"{figure(facts.rate_hz)} Hz" if facts.rate_hz else None)
     for part in ("train", "validation", "test"):
         part_facts = data.get(part)
         if isinstance(part_facts, Mapping):
             hours = f", {number(part_facts['hours'], 2)} h" if part_facts.get("hours") is not None else ""
-            add(part.capitalize(), f"{count_text(part_facts.get('recordings'))} recordings{hours}")
+            add(part.capitalize(), f"{count_of(part_facts.get('recordings'), 'recording')}{hours}")
     for key, value in source.get("environment", {}).items():
         add(key.replace("_", " ").capitalize(), value)
     return rows

@@ -7,6 +7,8 @@ from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
 
+from edp.errors import count_of
+
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
 
@@ -47,4 +49,5 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["themed"] = themed
+    environment.globals["count_of"] = count_of
     return environment

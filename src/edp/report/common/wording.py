@@ -7,12 +7,16 @@ import math
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 
 MISSING = "–"
 MAX_LABEL = 32
 """Characters of a name in a picture: more leave too little of a panel to the drawing."""
+MAX_DIGITS = 4
+"""Significant digits of a number with decimals: nothing that is measured here is known better."""
+HUGE, TINY = 1e15, 1e-6
+"""Sizes beyond which a number is shown with a power of ten."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 """With what a spreadsheet takes a cell for a formula."""
 
@@ -26,15 +30,51 @@ def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
 
 
 def number(value: float | None, decimals: int | None = None, signed: bool = False) -> str:
-    """A figure with thousands separated and a true minus sign; a dash where there is none."""
+    """Return a number as text, with thousands separated and a true minus sign; a dash if there is no number.
+
+    Decimals that would be the fifth significant digit or a later one are left out, whatever `decimals` asks for.
+    """
     if value is None or not math.isfinite(value):
         return MISSING
-    places = decimals_for([value]) if decimals is None else decimals
+    if abs(value) >= HUGE:
+        return f"{value:{'+' if signed else ''}.{MAX_DIGITS - 1}g}".replace("-", "−")
+    places = min(decimals_for([value]) if decimals is None else decimals, _useful_decimals(value))
     text = f"{value:{'+' if signed else ''},.{places}f}"
     # A rounded zero must not carry a sign.
     if float(text.replace(",", "")) == 0:
         text = text.lstrip("+-")
     return text.replace("-", "−")
+
+
+def figure(value: float | None) -> str:
+    """Return a setting or measured quantity as text: four significant digits, without zeros at the end.
+
+    Whole numbers are shown in full.
+    """
+    if value is None or not math.isfinite(value):
+        return MISSING
+    if 0 < abs(value) < TINY:
+        return f"{value:.{MAX_DIGITS - 1}g}".replace("-", "−")
+    text = number(value, 0 if float(value).is_integer() else _useful_decimals(value))
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def interval(low: float | None, high: float | None, signed: bool = False) -> str:
+    """Return an interval as text, with as many digits as its width gives meaning to: two of the width."""
+    places = None if low is None or high is None else interval_decimals(low, high)
+    return f"{number(low, places, signed)} to {number(high, places, signed)}"
+
+
+def interval_decimals(low: float, high: float) -> int:
+    """Return the decimals that show the width of an interval with two significant digits, 0 to 6."""
+    return decimals_for([high - low or high], significant=2)
+
+
+def _useful_decimals(value: float) -> int:
+    """Return the decimals with which a number has at most `MAX_DIGITS` significant digits."""
+    # The exponent after rounding: 9.9996 has two digits before the point once it is rounded.
+    exponent = int(f"{abs(value):.{MAX_DIGITS - 1}e}".partition("e")[2])
+    return max(MAX_DIGITS - 1 - exponent, 0)
 
 
 def percent(share: float | None, signed: bool = False) -> str:
@@ -43,6 +83,19 @@ def percent(share: float | None, signed: bool = False) -> str:
         return MISSING
     # 0.0995 is where one decimal would round up to ten percent.
     return number(100 * share, 1 if abs(share) < 0.0995 else 0, signed) + " %"
+
+
+def setting_text(value: object) -> str:
+    """Return a setting as text, exactly as it was given; members of a list have commas between them."""
+    if isinstance(value, Mapping):
+        return "; ".join(f"{key}: {setting_text(inner)}" for key, inner in value.items()) or "none"
+    if isinstance(value, list | tuple | set | frozenset):
+        return ", ".join(map(setting_text, value)) or "none"
+    if value is None or value == "":
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 def printable(text: str) -> str:

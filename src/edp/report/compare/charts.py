@@ -21,7 +21,7 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import short_labels
+from edp.report.common.wording import figure, short_labels
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import FREE, ComparedRun, Measure
 from edp.report.run.figures import log_ticks
@@ -152,7 +152,7 @@ def learning_chart(comparison: Comparison) -> Chart | None:
     up = ChartAxis(
         "Validation loss" if free else "Validation error",
         kind="log" if ticks else "linear",
-        ticks=tuple((tick, f"{tick:g}") for tick in ticks),
+        ticks=tuple((tick, figure(tick)) for tick in ticks),
     )
     across = ChartAxis("Epochs, or seconds")
     return Chart("learning", (Panel(tuple(marks), across, up),), choices=(Control("way", "Against", ways),), height=340)

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError
-from edp.report.common.wording import listed, number, percent
+from edp.errors import DataError, count_of
+from edp.evaluation.guard import ErrorOutcome
+from edp.report.common.wording import figure, listed, number, percent
 from edp.report.compare.runs import FREE, MEAN, ComparedRun, Measure, read_runs, recording_that_differs
 from edp.report.run.facts import NETWORK, TRUTH
 from edp.stats.multiple import holm
@@ -120,7 +121,7 @@ class Comparison:
                 sign = percent(difference.change, signed=True)
                 ends = (difference.low, difference.high)
                 reach = "" if None in ends else f", 95 % interval {' to '.join(percent(e, signed=True) for e in ends)}"
-                parts.append(f"{name} cannot be told apart ({sign}{reach})")
+                parts.append(f"{name} is {ErrorOutcome.OPEN} ({sign}{reach})")
         rest = len(self.runs) - 1 - len(parts)
         more = f"; {rest} more below" if rest > 0 else ""
         error = f"{number(self.error(first, measure))} {measure.unit}".rstrip()
@@ -175,7 +176,8 @@ def _remarks(runs: Sequence[ComparedRun], names: set[str]) -> list[str]:
         without = listed(left) if len(left) <= NAMED else f"{left[0]} and {len(left) - 1} more"
         if left:
             remarks.append(
-                f"{run.name} was judged on {len(run.recordings)} recordings; compared are the {len(names)} that all "
+                f"{run.name} was judged on {count_of(len(run.recordings), 'recording')}; compared are the "
+                f"{len(names)} that all "
                 f"runs share, without {without}."
             )
     digests = {run.digest for run in runs if run.digest}
@@ -196,8 +198,8 @@ def _remarks(runs: Sequence[ComparedRun], names: set[str]) -> list[str]:
         remarks.append("The runs sample at different rates; times ahead are compared in seconds.")
     if len(names) < FEWEST:
         remarks.append(
-            f"{len(names)} common recording{'s' if len(names) > 1 else ''} say nothing of other recordings: intervals "
-            f"are over blocks of {BLOCK_S:g} s of what was kept of them."
+            f"{count_of(len(names), 'common recording')} cannot speak for other recordings: intervals "
+            f"are over blocks of {figure(BLOCK_S)} s of what was kept of them."
         )
     return remarks
 

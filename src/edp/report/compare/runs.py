@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import ConfigError, DataError
+from edp.errors import ConfigError, DataError, count_of
+from edp.report.common.wording import figure
 from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
 from edp.report.twin.facts import TWIN, holds_free_runs, read_free_runs
 from edp.storage import read_object
@@ -49,7 +50,7 @@ class Measure:
     @property
     def when(self) -> str:
         """What of the output, and how far ahead."""
-        return f"{1000 * self.ahead_s:g} ms ahead" if self.what == "mean absolute error" else self.what
+        return f"{figure(1000 * self.ahead_s)} ms ahead" if self.what == "mean absolute error" else self.what
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +114,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[ComparedRun]:
     """
     paths = [Path(folder) for folder in folders]
     if not 2 <= len(paths) <= MOST_RUNS:
-        raise ConfigError(f"{len(paths)} run(s) came; edp compare takes 2 to {MOST_RUNS} run folders")
+        raise ConfigError(f"{count_of(len(paths), 'run')} came; edp compare takes 2 to {MOST_RUNS} run folders")
     real = [full_path(path) for path in paths]
     for position, path in enumerate(real):
         if path in real[:position]:
@@ -221,7 +222,7 @@ def _twin(path: Path, name: str) -> ComparedRun:
     errors: dict[Measure, dict[str, float]] = {}
     for recording, scores in twin["by_recording"].items():
         for end in scores["stroke_error"]:
-            _add(errors, end, recording, f"stroke error after {end['at_s']:g} s", float(end["at_s"]))
+            _add(errors, end, recording, f"stroke error after {figure(end['at_s'])} s", float(end["at_s"]))
         _add(errors, scores["velocity_mae"], recording, "velocity error over the run", float(twin["seconds"]))
     strokes = twin["by_horizon"]["strokes"]["by_channel"]
     curves = {output: (twin["by_horizon"]["seconds"], values) for output, values in strokes.items()}

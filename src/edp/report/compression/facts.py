@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edp.errors import StorageError
+from edp.errors import StorageError, count_of
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
@@ -186,9 +186,11 @@ def caveats(facts: CompressionFacts) -> list[str]:
         "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
         "constants, as the exported C code holds them (INT8, which has no such code: as in Table 4.9). The high "
         "estimate decides.",
-        f"Networks are compared and chosen on {parts['validation']} validation recordings, which chose their best "
+        f"Networks are compared and chosen on {count_of(parts['validation'], 'validation recording')}, which chose "
+        "their best "
         "epochs too: the least of many errors is a little too good there.",
-        f"The sealed test set, {parts['test']} recordings, was opened for the chosen network and the teacher alone.",
+        f"The sealed test set, {count_of(parts['test'], 'recording')}, was opened for the chosen network and the "
+        "teacher alone.",
         "One training each: differences of a percent between neighbours may be chance.",
     ]
     if held_out.get("seen_before"):

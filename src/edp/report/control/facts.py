@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from edp.errors import count_of
 from edp.recording import Recording
 from edp.report.animation.page import Scene
 from edp.report.common.sheets import Column, Sheet, Value, figures
@@ -45,14 +46,16 @@ def verdict(facts: ControlFacts) -> list[str]:
     content = facts.content
     summary = content["summary"]
     lines = [
-        f"{len(facts.loops)} loops of the task {content['task']['kind']} on {content['plant']}.",
+        f"{count_of(len(facts.loops), 'loop')} of the task {content['task']['kind']} on {content['plant']}.",
         "The position error is the distance of the tip to where the reference is at that time; the path error is its "
         "distance to the nearest point of the path, which alone would reward standing still.",
     ]
     if summary["violations"]:
-        lines.append(f"Limits were violated at {summary['violations']} ticks.")
+        lines.append(f"Limits were violated at {count_of(summary['violations'], 'tick')}.")
     if summary["missed"]:
-        lines.append(f"The controller had no answer at {summary['missed']} ticks and gave the safe command.")
+        lines.append(
+            f"The controller had no answer at {count_of(summary['missed'], 'tick')} and gave the safe command."
+        )
     return lines
 
 

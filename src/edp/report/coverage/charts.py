@@ -24,7 +24,7 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import label_by_name
+from edp.report.common.wording import figure, label_by_name
 
 MAX_AXIS = 22
 """Characters of a name beside a panel, three of which stand in a row."""
@@ -65,7 +65,7 @@ def spectrum_chart(coverage: Coverage) -> Chart | None:
             name=f"{name}, flat to {inputs.flat_to_hz[i]:.2g} Hz", colour=LINES[i % len(LINES)],
             dash=DASHES[i % len(DASHES)], hover="{x:.3g} Hz: {y:.1f} dB", remark="",
         ))  # fmt: skip
-    flat_up_to = f"wanted: within {FLAT_DB:g} dB up to {inputs.used_hz:.2g} Hz"
+    flat_up_to = f"wanted: within {figure(FLAT_DB)} dB up to {inputs.used_hz:.2g} Hz"
     marks.append(Texts(x=[inputs.used_hz], y=[-FLAT_DB], texts=[flat_up_to], raised=True, colour=SOFT))
     up = ChartAxis("Density below its maximum [dB]", limits=(-60.0, 3.0))
     return Chart("spectrum", (Panel(tuple(marks), ChartAxis("Frequency [Hz]", kind="log"), up),), height=360)
@@ -163,4 +163,4 @@ def _centres(occupancy: Occupancy, axis: int) -> list[float]:
 
 def _middles(ends: tuple[float, float], count: int) -> list[float]:
     edges = np.linspace(*ends, count + 1)
-    return [float(f"{value:.5g}") for value in 0.5 * (edges[1:] + edges[:-1])]
+    return [float(f"{value:.4g}") for value in 0.5 * (edges[1:] + edges[:-1])]

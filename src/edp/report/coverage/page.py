@@ -8,10 +8,11 @@ from typing import Any
 from edp.data.coverage import INTEGRATED, Coverage
 from edp.data.coverage_targets import BEYOND, OCCUPANCY, wanted
 from edp.data.spectrum import FLAT_DB
+from edp.errors import count_of
 from edp.logs import DataQuality
 from edp.report.common.tables import TextTable
 from edp.report.common.templates import template
-from edp.report.common.wording import MISSING, count_text, listed, number, percent, unbroken
+from edp.report.common.wording import MISSING, count_text, figure, listed, number, percent, unbroken
 from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
@@ -40,8 +41,8 @@ def render_coverage(coverage: Coverage, title: str, quality: DataQuality | None 
     charts = coverage_charts(coverage)
     context: dict[str, Any] = {
         "title": title,
-        "size": f"{coverage.recordings} recording{'s' * (coverage.recordings != 1)}, {number(coverage.hours, 2)} h at "
-        f"{coverage.rate_hz:g} Hz",
+        "size": f"{count_of(coverage.recordings, 'recording')}, {number(coverage.hours, 2)} h at "
+        f"{figure(coverage.rate_hz)} Hz",
         "headline": unbroken(headline(coverage)),
         "verdict": verdict(coverage),
         "tiles": tiles(coverage),
@@ -79,7 +80,7 @@ def verdict(coverage: Coverage) -> list[str]:
     inputs = coverage.spectrum
     if inputs is not None and any(inputs.flat_to_hz) and min(inputs.flat_to_hz) < inputs.used_hz:
         lines.append(
-            f"Commands fall by {FLAT_DB:g} dB before {inputs.used_hz:.2g} Hz, where they lie up to "
+            f"Commands fall by {figure(FLAT_DB)} dB before {inputs.used_hz:.2g} Hz, where they lie up to "
             f"{number(max(inputs.drop_db), 0)} dB below their maximum: faster changes teach little here."
         )
     if coverage.occupancy is not None and coverage.occupancy.share < OCCUPANCY:
@@ -97,7 +98,11 @@ def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
         tiles.append((number(100 * coverage.occupancy.share, 0), "%", f"of {cells} cells of the strokes visited"))
     if coverage.spectrum is not None and coverage.spectrum.flat_to_hz:
         tiles.append(
-            (number(min(coverage.spectrum.flat_to_hz), 2), "Hz", f"every command within {FLAT_DB:g} dB up to here")
+            (
+                number(min(coverage.spectrum.flat_to_hz), 2),
+                "Hz",
+                f"commands within {figure(FLAT_DB)} dB up to here",
+            )
         )
     if coverage.singular:
         lags = max(coverage.singular)
@@ -118,7 +123,7 @@ def wanted_table(coverage: Coverage) -> TextTable | None:
         (
             _first_up(w.name),
             f"{number(w.value, 2)} {w.unit}",
-            f"{'at least' if w.at_least else 'at most'} {w.bound:g} {w.unit}",
+            f"{'at least' if w.at_least else 'at most'} {figure(w.bound)} {w.unit}",
             "met" if w.met else "not met",
         )
         for w in wanted(coverage)

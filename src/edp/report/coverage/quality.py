@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+from edp.errors import count_of
 from edp.logs import DataQuality, Finding, QualityReport
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, count_text, number, percent
+from edp.report.common.wording import MISSING, count_text, figure, number, percent
 
 SHOWN_CHANNELS = 400
 """Rows of the table of channels; the rest is in the JSON."""
@@ -28,7 +29,7 @@ def recordings_table(quality: DataQuality) -> TextTable:
         (
             report.name,
             number(report.duration_s, 1),
-            f"{report.rate_hz:g}",
+            figure(report.rate_hz),
             number(report.jitter, 3),
             count_text(sum(clock.gaps for clock in report.clocks)),
             count_text(sum(channel.missing for channel in report.channels)),
@@ -99,7 +100,7 @@ def _count(report: QualityReport, severity: str) -> str:
 
 
 def _where(names: list[str]) -> str:
-    return "several recordings" if not names else names[0] if len(names) == 1 else f"{len(names)} recordings"
+    return "several recordings" if not names else names[0] if len(names) == 1 else count_of(len(names), "recording")
 
 
 def _figure(value: float | None) -> str:

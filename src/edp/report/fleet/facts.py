@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from edp.errors import count_of
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import number, percent
+from edp.report.common.wording import figure, number, percent
 
 WORST = 10
 SURE_T = 4.0
@@ -98,10 +99,10 @@ class _Usual:
         self.still = float(np.median([row["persistence"] for row in judged])) if judged else 0.0
         self.inputs: dict[tuple[str, str], tuple[float, float]] = {}
         for name in judged[0]["inputs"] if judged else ():
-            for figure in ("mean", "std"):
-                values = np.array([row["inputs"][name][figure] for row in judged])
+            for statistic in ("mean", "std"):
+                values = np.array([row["inputs"][name][statistic] for row in judged])
                 middle = float(np.median(values))
-                self.inputs[name, figure] = (middle, NORMAL * float(np.median(np.abs(values - middle))))
+                self.inputs[name, statistic] = (middle, NORMAL * float(np.median(np.abs(values - middle))))
 
     def row(self, row: Mapping[str, Any]) -> FleetRow:
         drift, alarms = row["drift"], row["alarms"]
@@ -125,7 +126,7 @@ class _Usual:
             reasons.append(f"the error grew by {grown} from the first half of its time to the second")
         alarms = row["alarms"]
         if alarms and alarms.get("changes"):
-            reasons.append(f"the monitor told of {alarms['changes']} change(s), first: {alarms['first'][0]}")
+            reasons.append(f"the monitor told of {count_of(alarms['changes'], 'change')}, first: {alarms['first'][0]}")
         return [*reasons, *self._unusual(row)]
 
     def _outputs(self, row: Mapping[str, Any]) -> list[str]:
@@ -145,9 +146,9 @@ class _Usual:
         """The input that departs most from the fleet's, in robust deviations."""
         words = {"mean": "lies", "std": "varies"}
         far = []
-        for (name, figure), (middle, spread) in self.inputs.items():
-            away = abs(row["inputs"][name][figure] - middle) / spread if spread > 0 else 0.0
-            far.append((away, name, figure))
+        for (name, statistic), (middle, spread) in self.inputs.items():
+            away = abs(row["inputs"][name][statistic] - middle) / spread if spread > 0 else 0.0
+            far.append((away, name, statistic))
         away, name, figure = max(far, default=(0.0, "", "mean"))
         return [f"input {name} {words[figure]} {away:.0f} deviations off the fleet"] if away > FAR else []
 
@@ -158,7 +159,8 @@ def headline(facts: FleetFacts) -> str:
         return f"None of {len(facts.failed)} machines could be judged."
     worst = facts.rows[0]
     return (
-        f"{len(facts.rows)} machines, median error {number(facts.median)} {facts.unit} {facts.ahead_ms:g} ms ahead; "
+        f"{count_of(len(facts.rows), 'machine')}, median error {number(facts.median)} {facts.unit} "
+        f"{figure(facts.ahead_ms)} ms ahead; "
         f"the worst is {worst.name} with {number(worst.mae)} {facts.unit}."
     )
 
@@ -174,7 +176,7 @@ def verdict(facts: FleetFacts) -> list[str]:
     else:
         lines.append("No monitor watched.")
     if facts.failed:
-        lines.append(f"{len(facts.failed)} machine(s) could not be judged; they stand at the end.")
+        lines.append(f"{count_of(len(facts.failed), 'machine')} could not be evaluated: see the end of the table.")
     own = sum(row.own for row in facts.rows)
     if own:
         lines.append(f"{own} ran under their own delta.")

@@ -28,7 +28,7 @@ from edp.report.common.chart import (
     Range,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import label_by_name
+from edp.report.common.wording import figure, label_by_name
 from edp.report.run import figures
 from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
 
@@ -265,7 +265,7 @@ def learning_chart(facts: Facts) -> Chart | None:
     )
     error = DataSeries(y=curves["validation_mae"], remark="Validation error", colour=BLUE, **shared)
     ticks = figures.log_ticks([*curves["train_loss"], *curves["validation_loss"]])
-    up = ChartAxis(kind="log" if ticks else "linear", ticks=tuple((tick, f"{tick:g}") for tick in ticks))
+    up = ChartAxis(kind="log" if ticks else "linear", ticks=tuple((tick, figure(tick)) for tick in ticks))
     panels = (
         Panel((*best_epoch, *loss), ChartAxis("Epoch"), up, "Loss"),
         Panel((*best_epoch, error), ChartAxis("Epoch"), title=with_unit("Validation error", facts.unit)),

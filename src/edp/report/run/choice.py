@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from edp.errors import StorageError
+from edp.errors import StorageError, count_of
 from edp.report.common.tables import TextTable
 from edp.report.common.wording import MISSING, decimals_for, number, percent
 from edp.report.run.facts import NETWORK, Facts, Target, horizon_text, label_of, score
@@ -241,7 +241,7 @@ def promise_line(content: Mapping[str, Any]) -> str:
     if not interval or not tested:
         return ""
     inside, count = _within(tested, interval)
-    line = f"The promised error held on {inside} of {count} outputs and horizons (within its 90 % interval)"
+    line = f"The promised error held on {inside} of {count_of(count, 'output')} and horizons (within its 90 % interval)"
     pairs = [
         (promised, skill["test"][k][name])
         for k, row in skill.get("promise", {}).items()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError, StorageError
-from edp.evaluation.guard import MEASURE, MEASURE_NAME, ErrorOutcome, network_verdict
+from edp.errors import DataError, StorageError, count_of
+from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import read_scores
-from edp.report.common.wording import decimals_for, listed, number, percent
+from edp.report.common.wording import decimals_for, figure, listed, number, percent
 from edp.report.run.budget import budget_name, budget_rows
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
@@ -261,8 +261,8 @@ def _check_predictions(facts: Facts) -> None:
 def horizon_text(facts: Facts, samples: int) -> str:
     """A horizon in milliseconds, or in samples where the rate is unknown."""
     if facts.rate_hz is None:
-        return f"{samples} sample{'s' if samples != 1 else ''}"
-    return f"{1000 * samples / facts.rate_hz:g} ms"
+        return count_of(samples, "sample")
+    return f"{figure(1000 * samples / facts.rate_hz)} ms"
 
 
 def main_horizon(facts: Facts) -> int | None:
@@ -316,12 +316,14 @@ def headline(facts: Facts) -> str:
         missing = f"This run has no scores yet; `edp evaluate {facts.folder}` makes them"
         return f"{unfinished_text(facts.folder) or missing}."
     judged = network_verdict(facts.scores, minutes_of(facts.folder)) if facts.scores else None
-    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
-        return judged.sentence()
-    first = "" if judged is None else judged.sentence()
+    figures = _figures(facts, rows, samples)
+    return figures if judged is None else judged.headline(figures)
+
+
+def _figures(facts: Facts, rows: Sequence[Mapping[str, Any]], samples: int) -> str:
     if not facts.averaged and facts.scores:
         targets = [(target.name, target.description, target.unit) for target in facts.targets]
-        return f"{first} {by_output(facts.scores, samples, targets, horizon_text(facts, samples))}".strip()
+        return by_output(facts.scores, samples, targets, horizon_text(facts, samples))
     unit = facts.unit
     values = {row["model"]: score(facts.models[row["model"]], samples) for row in rows}
     places = min(max(decimals_for(values.values(), significant=2), 1), 4 if unit else 8)
@@ -329,7 +331,7 @@ def headline(facts: Facts) -> str:
     shown = parts if len(parts) <= 4 else [*parts[:3], f"{len(parts) - 3} more above that"]
     ours = f"{number(values[NETWORK], places)} {unit}".rstrip()
     start = f"At {horizon_text(facts, samples)} ahead the network is off by {ours}"
-    return f"{first} {'; '.join([f'{start} ({MEASURE_NAME})', *shown])}.".strip()
+    return f"{'; '.join([f'{start} ({MEASURE_NAME})', *shown])}."
 
 
 def verdict_lines(facts: Facts) -> list[str]:
@@ -346,7 +348,7 @@ def verdict_lines(facts: Facts) -> list[str]:
         )
         won, both = recordings_won(facts, best["model"])
         if both:
-            lines.append(f"It is the better of the two on {won} of {both} test recordings.")
+            lines.append(f"It is the better of the two on {won} of {count_of(both, 'test recording')}.")
     lines += [line for line in (losses_line(facts.scores) if facts.scores else "",) if line]
     judged = judged_line(facts.scores, facts.provenance) if facts.scores else ""
     beyond = situation_line(facts.scores) if facts.scores else ""

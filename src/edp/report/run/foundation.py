@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.report.common.sheets import Column, Sheet, Value, figures, plainly
+from edp.report.common.wording import figure
 
 
 def parts_sheet(foundation: Mapping[str, Any]) -> Sheet:
@@ -34,7 +35,7 @@ def contexts_sheet(foundation: Mapping[str, Any], unit: str = "report units") ->
 
 
 def _short(value: Value) -> str:
-    return f"{value:g}" if isinstance(value, int | float) else plainly(value)
+    return figure(value) if isinstance(value, int | float) else plainly(value)
 
 
 def _context(row: Mapping[str, Any]) -> tuple[Value, ...]:

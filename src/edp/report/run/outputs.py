@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.data.splits import kind_of_name
+from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_object
@@ -33,10 +34,8 @@ def losses_line(scores: Mapping[str, Any]) -> str:
         for loss in losses[:SHOWN]
     ]
     more = f" and {len(losses) - SHOWN} more" if len(losses) > SHOWN else ""
-    return (
-        f"At some time ahead a baseline has less error on {len(losses)} of {len(scores['targets'])} outputs: "
-        f"{listed(parts)}{more}."
-    )
+    outputs = count_of(len(scores["targets"]), "output")
+    return f"At some time ahead a baseline has less error on {len(losses)} of {outputs}: {listed(parts)}{more}."
 
 
 def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> str:
@@ -50,7 +49,7 @@ def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None)
     if not judged:
         return ""
     shown = listed(judged[:SHOWN]) if len(judged) <= SHOWN else f"{', '.join(judged[:SHOWN])} and others"
-    line = f"Judged on {len(judged)} test log{'s' if len(judged) > 1 else ''}: {shown}."
+    line = f"Judged on {count_of(len(judged), 'test log')}: {shown}."
     trained = (provenance or {}).get("data", {}).get("train", {}).get("names", [])
     kinds = {kind_of_name(name) for name in judged}
     others = {kind_of_name(name) for name in trained} - kinds
@@ -89,7 +88,7 @@ def situation_line(scores: Mapping[str, Any]) -> str:
 
 def _changed(row: Mapping[str, Any]) -> str:
     """A target that changes otherwise than in training, in words."""
-    ahead = f"{row['target']} in {row['horizon']} tick{'s' if row['horizon'] > 1 else ''}"
+    ahead = f"{row['target']} in {count_of(row['horizon'], 'tick')}"
     if 1 / NOTED <= row["ratio"] <= NOTED:
         return f"{percent(row['beyond'])} of the changes of {ahead} are larger than any in training"
     return f"changes of {ahead} are {row['ratio']:.2g} times as large as in training"
@@ -119,7 +118,7 @@ def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[s
         beside = "" if best is None else f" ({best} {number(finite[best], _places(finite[best]))})"
         of_unit = "" if unit in ("", "1") else f" {unit}"
         parts.append(f"{number(ours, _places(ours))}{of_unit} in {description[:1].lower()}{description[1:]}{beside}")
-    more = f"; {len(targets) - SHOWN} more outputs below" if len(targets) > SHOWN else ""
+    more = f"; {count_of(len(targets) - SHOWN, 'more output')} below" if len(targets) > SHOWN else ""
     return f"At {ahead} ahead the network is off by ({MEASURE_NAME}) {', '.join(parts)}{more}."
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edp.errors import StorageError
-from edp.report.common.wording import number
+from edp.report.common.wording import interval, interval_decimals, number
 from edp.storage import read_json
 from edp.storage.paths import is_file_at, is_folder_at
 
@@ -48,10 +48,12 @@ def limit_line(facts: Facts, samples: int | None) -> str:
         return ""
     row = list(limit["horizons"]).index(samples)
     unknown = limit["commands_unknown"]
-    least, low, high = (number(unknown[key][row][-1], 2) for key in ("mae", "low", "high"))
+    least, low, high = (unknown[key][row][-1] for key in ("mae", "low", "high"))
+    least_error = number(least, interval_decimals(low, high))
     error_with_commands = number(limit["commands_known"]["mae"][row][-1], 2)
     return (
-        f"The limit of predictability here is {least} {facts.unit} (95 %: {low} to {high}): even a predictor that "
+        f"The limit of predictability here is {least_error} {facts.unit} (95 %: {interval(low, high)}): even a "
+        "predictor that "
         f"knows the true state has that mean absolute error, for it knows neither the operator's next choices nor the "
         f"noise to come; with the commands known, its error would be {error_with_commands}."
     )

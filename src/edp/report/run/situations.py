@@ -16,7 +16,7 @@ WORDS = {
     "stopping": "stopping",
     "reversing": "reversing",
     "fast": "faster than half of the fastest",
-    "dead_band": "moving, lever in its dead band",
+    "dead_band": "moving, command in its dead band",
     "end_stop": "near an end stop",
     "other": "none of these",
 }

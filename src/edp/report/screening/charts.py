@@ -29,7 +29,7 @@ from edp.report.common.chart import (
     finite,
     with_unit,
 )
-from edp.report.common.wording import label_by_name
+from edp.report.common.wording import figure, label_by_name
 from edp.report.screening.views import (
     METRICS,
     UNITS,
@@ -118,7 +118,7 @@ def lag_chart(views: Sequence[LagView], rate_hz: float) -> Chart | None:
             ))  # fmt: skip
     lags = views[0].curves[0].lags
     across = ChartAxis(
-        f"Lag [samples of {1e3 / rate_hz:g} ms]; left: the channel leads",
+        f"Lag [samples of {figure(1e3 / rate_hz)} ms]; left: the channel leads",
         limits=(float(lags.min()), float(lags.max())),
         grid=True,
     )

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edp.errors import count_of
 from edp.logs import DataQuality
 from edp.report.common.picture import write_pictures
 from edp.report.common.templates import template
-from edp.report.common.wording import count_text, duration, listed, number, unbroken
+from edp.report.common.wording import count_text, duration, figure, listed, number, setting_text, unbroken
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
 from edp.report.screening import tables as tables
@@ -75,14 +76,14 @@ def render_screening(
     hours = screening.samples / screening.rate_hz / 3600
     context: dict[str, Any] = {
         "title": title,
-        "size": f"{len(screening.recordings)} recording{'s' * (len(screening.recordings) != 1)}, {number(hours, 2)} h "
-        f"at {screening.rate_hz:g} Hz",
+        "size": f"{count_of(len(screening.recordings), 'recording')}, {number(hours, 2)} h "
+        f"at {figure(screening.rate_hz)} Hz",
         "headline": unbroken(headline(screening)),
         "verdict": verdict(screening, quality),
         "tiles": tiles(screening),
         **shown(charts),
         "found": screening,
-        "ahead": f"{screening.horizon} samples ({1e3 * screening.horizon / screening.rate_hz:g} ms)",
+        "ahead": f"{screening.horizon} samples ({figure(1e3 * screening.horizon / screening.rate_hz)} ms)",
         "kept": tables.kept_table(screening),
         "dropped": tables.dropped_table(screening),
         "flags": tables.flags_table(screening),
@@ -94,7 +95,7 @@ def render_screening(
         "trial_notes": () if trials is None else tuple(trials["notes"]),
         "held_out": () if trials is None else tuple(trials["held_out"]),
         "quality": {} if quality is None else quality_tables(quality),
-        "options": sorted((key, str(value)) for key, value in screening.options.items()),
+        "options": sorted((key.replace("_", " "), setting_text(value)) for key, value in screening.options.items()),
         "notes": tuple(notes),
         "window_reason": sentence(screening.proposal.window_reason),
         "seconds": duration(sum(screening.seconds.values())),
@@ -106,8 +107,9 @@ def headline(screening: ScreeningResult) -> str:
     """The proposal in a sentence."""
     proposed, window = len(screening.proposal.kept), screening.proposal.window
     return (
-        f"{proposed} of {len(screening.channels)} channels are proposed to predict {listed(screening.targets)}, with a "
-        f"memory of {window} samples ({1e3 * window / screening.rate_hz:g} ms)."
+        f"{proposed} of {count_of(len(screening.channels), 'channel')} are proposed to predict "
+        f"{listed(screening.targets)}, with a "
+        f"memory of {window} samples ({figure(1e3 * window / screening.rate_hz)} ms)."
     )
 
 
@@ -142,7 +144,7 @@ def tiles(screening: ScreeningResult) -> list[tuple[str, str, str]]:
     from edp.data.screening import FlagKind  # late: see `verdict`
 
     tiles = [
-        (count_text(len(screening.proposal.kept)), "", f"of {len(screening.channels)} channels proposed"),
+        (count_text(len(screening.proposal.kept)), "", f"of {count_of(len(screening.channels), 'channel')} proposed"),
         (count_text(screening.proposal.window), "samples", "suggested memory W"),
     ]
     counts = {kind: len({flag.channel for flag in screening.flags if flag.kind is kind}) for kind in FlagKind}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, count_text, duration, number, percent
+from edp.report.common.wording import MISSING, count_text, duration, interval, number, percent
 from edp.report.screening.views import lag_ranges
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def trials_table(trials: Mapping[str, Any]) -> TextTable:
         for horizon in horizons:
             gap = (trial["difference"] or {}).get(horizon)
             cells.append(number(trial["error"][horizon], 3))
-            cells.append(MISSING if gap is None else f"{number(gap['low'], 3, True)} to {number(gap['high'], 3, True)}")
+            cells.append(MISSING if gap is None else interval(gap["low"], gap["high"], signed=True))
         rows.append((trial["name"], count_text(len(trial["channels"])), count_text(trial["parameters"]), *cells))
     rows.append(
         (

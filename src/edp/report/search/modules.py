@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from edp.errors import count_of
 from edp.report.common.sheets import Column, Sheet, chance, figures
-from edp.report.common.wording import number
+from edp.report.common.wording import interval
 from edp.report.search.facts import StudyFacts, known, of_phase, real
 
 GROUPS = {
@@ -108,7 +109,7 @@ def _verdict(study: StudyFacts, name: str, entry: Mapping[str, Any] | None, pass
     if entry is None:
         return "not in phase 3" if "confirmation" in study.facts else "goes on"
     if entry["dropped_after"]:
-        return f"dropped after {entry['dropped_after']} runs"
+        return f"dropped after {count_of(entry['dropped_after'], 'run')}"
     return "confirmed" if entry["confirmed"] else "not confirmed"
 
 
@@ -199,5 +200,4 @@ def span(entry: Mapping[str, Any], scale: float = 100.0) -> str | None:
     """An interval as text."""
     if entry.get("low") is None or entry.get("high") is None:
         return None
-    low, high = (number(scale * real(entry[end]), 2, signed=True) for end in ("low", "high"))
-    return f"{low} to {high}"
+    return interval(scale * real(entry["low"]), scale * real(entry["high"]), signed=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from edp.errors import count_of
 from edp.report.common.sheets import Column, Sheet, Value, chance, figures, plainly
 from edp.report.common.wording import count_text, duration, moment, number, percent
 from edp.report.search.facts import StudyFacts, known, of_phase, real
@@ -43,8 +44,8 @@ def variance_sheet(study: StudyFacts) -> Sheet | None:
     heads = [(f"{name}{part}", study.unit) for name in ("MAE", "Composite") for part in ("", ", σ split", ", σ seed")]
     columns = (Column("Architecture"), Column("Features"), *_numbers(heads, [row[2:] for row in rows]))
     facts = study.facts["isolation"]
-    seeds = f"{facts['seeds']} seed{'s' * (facts['seeds'] != 1)}"
-    caption = f"Variance by architecture and feature set: {facts['runs']} runs of {seeds} each"
+    seeds = count_of(facts["seeds"], "seed")
+    caption = f"Variance by architecture and feature set: {count_of(facts['runs'], 'run')} of {seeds} each"
     marked = frozenset(index for index, row in enumerate(rows) if row[1] == facts["features"])
     return Sheet("variance", caption, columns, tuple(rows), marked)
 

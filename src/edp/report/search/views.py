@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from edp.errors import count_of
 from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, pair, real
 from edp.stats.effects import effect_interval
 
@@ -242,7 +243,9 @@ CHANGE = "Change of the baseline's mean score [%]; left is better"
 
 def _sound(study: StudyFacts, entry: Mapping[str, Any]) -> EffectView:
     after = int(entry["dropped_after"])
-    remark = "confirmed" if entry["confirmed"] else f"dropped after {after} runs" if after else "not confirmed"
+    remark = (
+        "confirmed" if entry["confirmed"] else f"dropped after {count_of(after, 'run')}" if after else "not confirmed"
+    )
     value, low, high = (100.0 * real(entry[name]) for name in ("change", "low", "high"))
     p, adjusted = real(entry["p"]), real(entry["adjusted"])
     return EffectView(study.module(entry["module"]), value, low, high, p, adjusted, bool(entry["confirmed"]), remark)

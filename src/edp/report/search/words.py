@@ -6,8 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from edp.errors import count_of
 from edp.evaluation.guard import ErrorOutcome, outcome_of
-from edp.report.common.wording import count_text, duration, listed, number, percent
+from edp.report.common.wording import count_text, duration, listed, number, percent, setting_text
 from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, real
 from edp.report.search.smaller import chosen_words
 from edp.report.search.views import titled
@@ -19,7 +20,7 @@ def headline(study: StudyFacts) -> str:
         return _result(study)
     decided = sum(phase.name in study.facts for phase in study.phases)
     how = {"running": "is running", "finished": "ended early"}.get(study.state, f"was {study.state}")
-    done = _count(len(study.history), "training")
+    done = count_of(len(study.history), "training")
     return f"The search {how}: {decided} of {len(study.phases)} phases are decided, {done} done."
 
 
@@ -30,7 +31,7 @@ def _result(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     names = listed(own) if len(own) <= 3 else f"{len(own)} modules"
     if ours is None or base is None:
         return "A final training failed, so that nothing can be said of the test sessions."
-    sessions = _count(len(study.test), "test session")
+    sessions = count_of(len(study.test), "test session")
     gain = facts["test_gain"]
     outcome = outcome_of(ours / base - 1, None if gain is None else real(gain["high"]))
     what = f"With {names}" if own else "Tuned anew, with no module,"
@@ -124,7 +125,7 @@ def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
         confirmed, asked = study.facts["confirmation"]["confirmed"], study.facts["screening"]["registered"]
         tiles.append((count_text(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
     openings = len(study.openings)
-    sealed = _count(len(study.test) + len(study.second), "session")
+    sealed = count_of(len(study.test) + len(study.second), "session")
     tiles.append((count_text(openings), "", f"opening{'s' * (openings != 1)} of {sealed} set apart"))
     return tiles
 
@@ -133,7 +134,7 @@ def caveats(study: StudyFacts) -> list[str]:
     """What such trainings can and cannot show, from the settings of this study."""
     spec = study.spec
     updates, final = int(spec["updates"]), int(spec["final_updates"])
-    horizon = _count(int(spec["horizon"]), "sample")
+    horizon = count_of(int(spec["horizon"]), "sample")
     caveats = [
         f"Every comparison is between trainings of {_length(spec, updates)}, judged {horizon} ahead. It shows which "
         "part learns more from so little: a part that pays only after long training is missed, and one that only "
@@ -147,8 +148,9 @@ def caveats(study: StudyFacts) -> list[str]:
         + ". Intervals and p-values speak of sessions like these, not of another machine.",
         *_power(study),
         "Modules are tried on one baseline with one feature set; on another network they may do otherwise.",
-        f"Winners were tuned further than the baseline ({_count(int(spec['joint_trials']), 'more question')} in phase "
-        f"4, {count_text(int(spec['free_trials']))} in phase 5), so part of their gain may be tuning and not modules.",
+        f"Winners were tuned further than the baseline ({count_of(int(spec['joint_trials']), 'more question')} in "
+        f"phase 4, {count_text(int(spec['free_trials']))} in phase 5), so part of their gain may be "
+        "tuning and not modules.",
         "The best of many questions is the best partly by chance, so scores of winners on development sessions are too "
         "good. Only test sessions and fresh folds count.",
     ]
@@ -179,7 +181,8 @@ def _sound_power(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[str, ...]
     effect = percent(real(study.spec["least_effect"]))
     runs, power, limit = int(facts["runs"]), real(facts["power"]), real(facts["limit"])
     text = (
-        f"{runs} runs of each arm were planned to show an effect of {effect}, which they do with a probability of "
+        f"{count_of(runs, 'run')} of each arm were planned to show an effect of {effect}, which they do with a "
+        "probability of "
         f"{number(power, 2)}: a module that is not confirmed is not shown to be useless."
     )
     if facts["enough"] is None:
@@ -203,7 +206,7 @@ def decided(study: StudyFacts) -> list[tuple[str, tuple[str, ...]]]:
         lines = study.sentences.get(phase.name)
         if lines is None:
             count = sum(training.phase == phase.name for training in study.history)
-            lines = (f"Under way: {_count(count, 'training')} done." if phase.began else "Has not begun.",)
+            lines = (f"Under way: {count_of(count, 'training')} done." if phase.began else "Has not begun.",)
         decisions.append((phase.heading, _grouped(lines)))
     return decisions
 
@@ -228,16 +231,4 @@ def missing(study: StudyFacts, *names: str) -> str:
 
 def settings(study: StudyFacts) -> list[tuple[str, str]]:
     """Settings of the search as text."""
-    return [(key.replace("_", " "), _plain(value)) for key, value in study.spec.items()]
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, dict):
-        return "; ".join(f"{key}: {_plain(inner)}" for key, inner in value.items()) or "none"
-    if isinstance(value, list | tuple):
-        return ", ".join(map(_plain, value)) or "none"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _count(many: int, what: str) -> str:
-    return f"{count_text(many)} {what}{'s' * (many != 1)}"
+    return [(key.replace("_", " "), setting_text(value)) for key, value in study.spec.items()]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from edp.errors import StorageError
-from edp.evaluation.guard import ErrorOutcome, ErrorVerdict
+from edp.errors import StorageError, count_of
+from edp.evaluation.guard import ErrorVerdict
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
@@ -195,8 +195,11 @@ def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
 def headline(facts: Transfer) -> str:
     """One sentence: what was gained."""
     judged = transfer_verdict(facts)
-    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
-        return judged.sentence().removesuffix(".")
+    figures = _figures(facts)
+    return figures if judged is None else judged.headline(figures)
+
+
+def _figures(facts: Transfer) -> str:
     horizon = facts.horizons[-1]
     before, after = (facts.score(name, horizon)["mae"] for name in facts.pair)
     gain = facts.gain(horizon)
@@ -233,9 +236,10 @@ def caveats(facts: Transfer) -> list[str]:
     minutes = facts.content["data"]["minutes"]
     return [
         f"Trained on {minutes['train']:.1f} min, epochs chosen on {minutes['validation']:.1f} min, judged on "
-        f"{minutes['test']:.1f} min: the end of each of {facts.content['data']['recordings']} logs, a gap of W + k "
+        f"{minutes['test']:.1f} min: the end of each of {count_of(facts.content['data']['recordings'], 'log')}, a "
+        "gap of W + k "
         "apart.",
-        "The test part holds the conditions of the logs, not others: another soil, load or temperature is not in it.",
+        "The test part holds the conditions of the logs, not others: another load or temperature is not in it.",
         "One training each: differences of a percent between methods may be chance.",
         *facts.content["notes"],
     ]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edp.report.common.sheets import Column, Sheet, Value
-from edp.report.common.wording import number
+from edp.report.common.wording import figure, number
 
 
 def mixed_units(scores: Mapping[str, Any]) -> bool:
@@ -18,7 +18,7 @@ def actuator_sheet(models: Mapping[str, Mapping[str, Any]]) -> Sheet:
     """A row for each actuator and model: errors of its velocity, and of its stroke by time, with their units."""
     columns = {
         name: [("Velocity MAE", one["velocity_mae"])]
-        + [(f"Stroke after {row['at_s']:g} s", row) for row in one["stroke_error"]]
+        + [(f"Stroke after {figure(row['at_s'])} s", row) for row in one["stroke_error"]]
         for name, one in models.items()
     }
     return _sheet("actuators", "The twin and its floors, each actuator in its units", columns)
@@ -50,7 +50,7 @@ def _sheet(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, Ma
 def actuator_tiles(twin: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Key figures of each actuator: value, unit, what it is."""
     row = twin["stroke_error"][-1] if twin["stroke_error"] else twin["velocity_mae"]
-    what = f"error of {{}} after {row['at_s']:g} s" if "at_s" in row else "mean absolute error of {}"
+    what = f"error of {{}} after {figure(row['at_s'])} s" if "at_s" in row else "mean absolute error of {}"
     return [(number(value), _unit(row, name), what.format(name)) for name, value in row["by_channel"].items()]
 
 

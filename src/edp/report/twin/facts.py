@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from edp.errors import StorageError
-from edp.evaluation.guard import ErrorOutcome, twin_verdict
+from edp.errors import StorageError, count_of
+from edp.evaluation.guard import twin_verdict
 from edp.evaluation.scores_file import (
     COUNT,
     NAME,
@@ -28,7 +28,7 @@ from edp.evaluation.scores_file import (
     read_shaped,
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import listed, number, percent, short_labels
+from edp.report.common.wording import figure, listed, number, percent, short_labels
 from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.report.twin.ground import ground_line
@@ -217,18 +217,21 @@ def _check_arrays(facts: FreeRunFacts, path: Path) -> None:
 
 def headline(facts: FreeRunFacts) -> str:
     """The error of the strokes at the end of the runs in one sentence; of the answers where they are plain numbers."""
-    twin = facts.twin
     judged = twin_verdict(facts.models)
-    if judged is not None and judged.outcome is ErrorOutcome.WORSE:
-        return judged.sentence().removesuffix(".")
+    figures = _figures(facts)
+    return figures if judged is None else judged.headline(figures)
+
+
+def _figures(facts: FreeRunFacts) -> str:
+    twin = facts.twin
     plain = _plain_answers(facts)
     if plain:
         off = number(twin["velocity_mae"]["mean"])
-        return f"{plain} off by {off} on average in {twin['seconds']:g} s on commands alone"
+        return f"{plain} off by {off} on average in {figure(twin['seconds'])} s on commands alone"
     last = twin["stroke_error"][-1] if twin["stroke_error"] else None
     if last is None or last["mean"] is None:
-        return f"{twin['runs']} free runs of {twin['seconds']:g} s on commands alone"
-    return f"Strokes off by {number(last['mean'])} {last['unit']} after {last['at_s']:g} s on commands alone"
+        return f"{count_of(twin['runs'], 'free run')} of {figure(twin['seconds'])} s on commands alone"
+    return f"Strokes off by {number(last['mean'])} {last['unit']} after {figure(last['at_s'])} s on commands alone"
 
 
 def _plain_answers(facts: FreeRunFacts) -> str:
@@ -242,9 +245,10 @@ def verdict(facts: FreeRunFacts) -> list[str]:
     """What the runs are, and how far the floors are off."""
     twin = facts.twin
     lines = [
-        f"{twin['runs']} free runs of {twin['seconds']:g} s in {twin['recordings']} recordings that trained nothing."
+        f"{count_of(twin['runs'], 'free run')} of {figure(twin['seconds'])} s in "
+        f"{count_of(twin['recordings'], 'recording')} that trained nothing."
         if facts.provenance
-        else f"{twin['runs']} free runs of {twin['seconds']:g} s."
+        else f"{count_of(twin['runs'], 'free run')} of {figure(twin['seconds'])} s."
     ]
     lines += [f"It is {sentence}" for sentence in (choice_sentence(facts.candidates),) if sentence]
     ground = ground_line(facts.provenance)
@@ -268,7 +272,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     else:
         rows = [(number(velocity["mean"]), velocity["unit"] or "", "mean absolute error of the velocities")]
         rows += [
-            (number(row["mean"]), row["unit"] or "", f"stroke error after {row['at_s']:g} s")
+            (number(row["mean"]), row["unit"] or "", f"stroke error after {figure(row['at_s'])} s")
             for row in (*twin["stroke_error"][:1], *twin["stroke_error"][-1:])
         ]
     if twin["pressure_nrmse"]["by_channel"]:
@@ -318,7 +322,7 @@ def _summary_sheet(
     heads: list[tuple[str, str]] = []
     for label, entry in summaries.items():
         strokes = entry["stroke_error"]
-        heads = [(f"Stroke after {row['at_s']:g} s", row["unit"] or "") for row in strokes]
+        heads = [(f"Stroke after {figure(row['at_s'])} s", row["unit"] or "") for row in strokes]
         velocity = entry["velocity_mae"]
         cells = (velocity["mean"], *(row["mean"] for row in strokes), entry["pressure_nrmse"]["mean"])
         rows.append((label, entry["runs"], *cells, percent(entry["diverged"])))
@@ -357,14 +361,14 @@ def _coverage_sheet(intervals: Mapping[str, Any]) -> Sheet:
         heads += [Column(f"{part.capitalize()} inside"), Column("half width", unit, widths)]
     for row in intervals["at"]:
         cells = [cell for part in parts for cell in (percent(row[part]["share"]), row[part]["half_width"]["mean"])]
-        rows.append((f"{row['at_s']:g} s", *cells))
+        rows.append((f"{figure(row['at_s'])} s", *cells))
     caption = f"Share of the free runs whose truth lies in intervals meant to hold {percent(intervals['coverage'])}"
     return Sheet("intervals", caption, tuple(heads), tuple(rows))
 
 
 def _ahead_sheet(facts: FreeRunFacts) -> Sheet:
     first = facts.twin["ahead"]
-    caption = f"{first['seconds']:g} s ahead of measured ports, told the commands in between"
+    caption = f"{figure(first['seconds'])} s ahead of measured ports, told the commands in between"
     if mixed_units(facts.twin):
         return ahead_by_actuator(facts.models, caption)
     rows: list[tuple[Value, ...]] = []
@@ -390,5 +394,7 @@ def _beside_sheet(beside: Mapping[str, Any]) -> Sheet:
         Column("Twin, told the commands", "", both),
         Column(beside["label"], "", both),
     )
-    caption = f"Beside a look-ahead predictor, {beside['seconds']:g} s ahead at the same {beside['moments']:,} moments"
+    caption = (
+        f"Beside a look-ahead predictor, {figure(beside['seconds'])} s ahead at the same {beside['moments']:,} moments"
+    )
     return Sheet("beside", caption, heads, tuple(rows))

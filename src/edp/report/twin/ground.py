@@ -23,4 +23,4 @@ def ground_line(provenance: Mapping[str, Any]) -> str:
     shares = [f"{percent(x)} ({part})" for part, x in parts if isinstance(x, float) and math.isfinite(x)]
     name = f"ground '{kind}'" if isinstance(kind, str) else "ground"
     what = listed(shares) or "nothing"
-    return f"{name}: explains {what} of the squares of the forces where the tip digs"
+    return f"{name}: explains {what} of the squares of the forces where the tip touches the ground"

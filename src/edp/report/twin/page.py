@@ -62,11 +62,11 @@ def render(facts: FreeRunFacts, title: str | None = None) -> str:
 
 def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Where the twin comes from, as name and text."""
-    data, soil = provenance.get("data"), provenance.get("ground_data")
+    data, contact = provenance.get("data"), provenance.get("ground_data")
     seconds = provenance.get("seconds")
     rows = [
         ("Recordings", str(data.get("source", "")) if isinstance(data, dict) else ""),
-        ("Recordings in soil", str(soil.get("source", "")) if isinstance(soil, dict) else ""),
+        ("Recordings with ground contact", str(contact.get("source", "")) if isinstance(contact, dict) else ""),
         ("Trained in", duration(seconds) if isinstance(seconds, int | float) else ""),
         ("Written", moment(provenance.get("created"))),
         ("Command", str(provenance.get("command", ""))),

@@ -11,7 +11,7 @@ import numpy as np
 from edp.errors import StorageError
 from edp.evaluation.scores_file import COUNT, NAME, REAL, SIZE, KeyedObject, Listed, read_shaped
 from edp.report.common.chart import Chart, ChartAxis, Control, DataSeries, Mark, Panel, Range, with_unit
-from edp.report.common.wording import label_by_name
+from edp.report.common.wording import figure, label_by_name
 from edp.storage.paths import is_file_at
 
 FILE, COMMAND = "step_response.json", "command"
@@ -64,7 +64,8 @@ def steps_chart(steps: Mapping[str, Any]) -> Chart | None:
         title = with_unit(labels[first["name"]], first["unit"])
         panels.append(Panel(tuple(marks), ChartAxis("Time since the step [s]"), title=title))
     options = tuple(
-        (step["command"], f"{step['command']}, step of {step['size']:g} {step['unit']}") for step in steps["steps"]
+        (step["command"], f"{step['command']}, step of {figure(step['size'])} {step['unit']}")
+        for step in steps["steps"]
     )
     return Chart(
         "steps", tuple(panels), columns=2, choices=(Control(COMMAND, "Command", options),),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError
+from edp.settings.bounds import LEAST_POSITIVE
 from edp.settings.tree import SettingsTree
 from edp.sim.machine import layout as at
 from edp.sim.machine import option_checks
@@ -26,24 +27,30 @@ LEAST_LEVER = 0.08
 """Least lever arm |dx/dpsi| (m/rad) as a share of the stroke (m): below it an impact can turn the linkage over."""
 
 
+LARGEST = 1e15
+"""Largest number of a machine, of either sign; bristles and oil are of the order of 1e9."""
+
+
 @dataclass(frozen=True)
 class ParameterBound:
-    """Limits of a number; `above` makes the lower one strict."""
+    """Limits of a number; `above` makes the lower one strict, and above zero refuses numbers below `LEAST_POSITIVE`."""
 
-    low: float = -math.inf
-    high: float = math.inf
+    low: float = -LARGEST
+    high: float = LARGEST
     above: bool = False
     integer: bool = False
 
     def holds(self, value: float) -> bool:
         """Whether the value lies within."""
         fits = (value > self.low if self.above else value >= self.low) and value <= self.high
+        if self.above and self.low == 0.0 and value < LEAST_POSITIVE:
+            return False
         return fits and (not self.integer or value == int(value))
 
     def __str__(self) -> str:
         text = "an integer " if self.integer else ""
-        if math.isinf(self.high):
-            return f"{text}{'above' if self.above else 'at least'} {self.low:g}"
+        if self.high == LARGEST:
+            return f"{text}{'above' if self.above else 'at least'} {self.low:g} and at most {self.high:g}"
         return f"{text}{f'above {self.low:g} and at most' if self.above else f'from {self.low:g} to'} {self.high:g}"
 
 
@@ -243,7 +250,9 @@ def _check_numbers(value: float | tuple[float, ...], bound: ParameterBound, wher
 
 def _check_number(value: float, bound: ParameterBound, where_key: str) -> None:
     if not math.isfinite(value) or not bound.holds(value):
-        raise ConfigError(f"{where_key} = {value!r} must be {bound if bound is not ANY else 'finite'}")
+        raise ConfigError(
+            f"{where_key} = {value!r} must be {bound if math.isfinite(value) or bound is not ANY else 'finite'}"
+        )
 
 
 def _check_ratings(value: Rating | Ratings, key: str, where_key: str) -> None:

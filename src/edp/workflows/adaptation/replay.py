@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -81,6 +81,13 @@ class Replay:
         rows = np.concatenate(selected)
         return rows.mean(axis=0, dtype=np.float64) if len(rows) else None
 
+    def errors_by_target(self, parts: Sequence[Replayed]) -> NDArray[np.float64]:
+        """Return the MAE of each horizon and target without and with adaptation, shape (2, horizon * target)."""
+        some = replace(self, recordings=list(parts))
+        rows = [(some.mae("base", k), some.mae("adapted", k)) for k in self.horizons]
+        pairs = [(base, adapted) for base, adapted in rows if base is not None and adapted is not None]
+        return np.concatenate(pairs, axis=1) if pairs else np.empty((2, 0))
+
     def to_json(self, task: Task, kinds: Sequence[Kind]) -> dict[str, Any]:
         """MAE by horizon and time in motion, in the units of reports, and how often the adaptation was taken back."""
         facts = [KINDS[kind] for kind in kinds]
@@ -99,9 +106,23 @@ class Replay:
             "recordings": [part.name for part in self.recordings],
             "targets": [{"name": n, "unit": f.report_unit} for n, f in zip(task.targets, facts, strict=True)],
             "mae": rows,
+            "change": relative_change(self.errors_by_target(self.recordings)),
+            "change_by_recording": {
+                part.name: relative_change(self.errors_by_target([part])) for part in self.recordings
+            },
             "fallback": float((status == RlsStatus.FALLBACK).mean()),
             "taught": int((status == RlsStatus.LEARNING).sum()),
         }
+
+
+def relative_change(errors: NDArray[np.float64]) -> float:
+    """Return the geometric mean of the ratios of adapted to plain errors, less one; 0 without comparable errors.
+
+    Args:
+        errors: shape (2, n), without and with adaptation.
+    """
+    positive = errors[:, (errors > 0.0).all(axis=0)]
+    return float(np.expm1(np.log(positive[1] / positive[0]).mean())) if positive.size else 0.0
 
 
 def motion_s(adaptation: Adaptation, targets: Rows) -> NDArray[np.float64]:

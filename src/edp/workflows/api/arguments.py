@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError, closest
+from edp.errors import DataError, closest, count_of
 from edp.logs.read import RATE_TOLERANCE
 from edp.logs.units import check_unit
 from edp.recording import Recording
@@ -39,7 +39,7 @@ def check_together(recordings: Sequence[Recording]) -> None:
         if ours != theirs:
             both = zip(ours, theirs)
             other = next((f"'{a[0]}' ({a[1]}) is '{b[0]}' ({b[1]}) there" for a, b in both if a != b), "")
-            counts = f"{len(first.channels)} and {len(recording.channels)} channels"
+            counts = f"{len(first.channels)} and {count_of(len(recording.channels), 'channel')}"
             raise DataError(
                 f"mixed channels: '{first.name}' and '{recording.name}' differ: {other or counts}; give equal channels "
                 "in equal order"
@@ -76,7 +76,8 @@ def check_width(tables: Sequence[NDArray[Any]], names: Sequence[str]) -> Sequenc
     for number, values in enumerate(tables):
         if values.shape[1] != len(names):
             raise DataError(
-                f"array {number} has shape {values.shape}; {len(names)} channels must hold ({', '.join(names[:8])})"
+                f"array {number} has shape {values.shape}; {count_of(len(names), 'channel')} must hold "
+                f"({', '.join(names[:8])})"
             )
     return tables
 
@@ -115,7 +116,7 @@ def units_of(units: Sequence[str | None] | Mapping[str, str] | None, names: Sequ
         pairs = list(units.items())
     else:
         if isinstance(units, str) or len(units) != len(names):
-            raise DataError(f"units has {len(units)} entries for {len(names)} channels; give one for each")
+            raise DataError(f"units has {len(units)} entries for {count_of(len(names), 'channel')}; give one for each")
         pairs = [(name, unit) for name, unit in zip(names, units, strict=True) if unit is not None]
     wrong = [name for name, unit in pairs if not isinstance(unit, str)]
     if wrong:

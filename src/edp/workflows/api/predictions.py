@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import ConfigError, DataError, closest
+from edp.errors import ConfigError, DataError, closest, count_of
 from edp.recording import FloatArray, Recording
 from edp.report.common.tables import TextTable
 from edp.report.notebook import BandLine, html_of, prediction_figure, text_of
@@ -80,7 +80,9 @@ class Predictions(OneFrame):
             return names.index(recording)
         # Negative numbers count from the end, as in any Python sequence.
         if not -len(names) <= recording < len(names):
-            raise DataError(f"there are predictions of {len(names)} recording(s); {recording} is not one of them")
+            raise DataError(
+                f"there are predictions of {count_of(len(names), 'recording')}; {recording} is not one of them"
+            )
         return recording
 
     def _line(self, source: Recording, which: int, output: int, horizon: int) -> BandLine:

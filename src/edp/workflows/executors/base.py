@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self
 
-from edp.errors import ConfigError
+from edp.errors import ConfigError, count_of
 from edp.registry import Registry
 from edp.settings.bounds import MOST_THREADS, check_bounds, integer
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus
@@ -204,7 +204,7 @@ def complete(
             # Everything is submitted before the first wait, so that no worker is idle while others train.
             record = executor.wait_any()
             if record is None:
-                raise RuntimeError(f"the executor gave up {len(waiting)} trainings without a word")
+                raise RuntimeError(f"the executor gave up {count_of(len(waiting), 'training')} without a word")
             waiting.discard(record.key)
             # Into the ledger before anybody hears of it: what was told must survive a kill.
             ledger.put(record)

@@ -13,7 +13,7 @@ from edp.config.experiment import Experiment, FeatureSettings, TaskSettings
 from edp.data.feature_files import set_text
 from edp.data.features import FEATURE_SETS, FeatureSet
 from edp.data.screening import FlagKind, OnProgress, ScreeningResult, ScreeningSpec, screen
-from edp.errors import DataError, closest
+from edp.errors import DataError, closest, count_of
 from edp.logs import DataQuality, Repair, common_channels, open_log
 from edp.logs.formats.base import is_truth
 from edp.logs.resolve import resolve
@@ -196,7 +196,10 @@ def _candidates(first: Recording, order: SelectionOrder) -> tuple[ScreeningSpec,
         hidden = [name for name in chosen if is_truth(name) and name not in spec.targets]
         chosen = [name for name in chosen if name not in hidden]
         if hidden:
-            notes.append(f"{len(hidden)} channels that only a simulation knows are no candidates (--truth takes them).")
+            notes.append(
+                f"{count_of(len(hidden), 'channel')} that only a simulation knows are no candidates (--truth takes "
+                "them)."
+            )
     return replace(spec, candidates=tuple(chosen)), notes
 
 
@@ -250,7 +253,8 @@ def _proposal_text(screening: ScreeningResult, features: FeatureSettings) -> str
         if target not in screening.proposal.kept:
             reasons[target] = "a target: its present value, which mode = 'delta' needs"
     head = [
-        f"Proposed by edp screen: {len(features.channels)} of {len(screening.channels)} channels, most useful first.",
+        f"Proposed by edp screen: {len(features.channels)} of {count_of(len(screening.channels), 'channel')}, most "
+        "useful first.",
         "edp train DATA --set task.features=THIS_FILE",
     ]
     dropped = [

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import ConfigError, ExportError, closest
+from edp.errors import ConfigError, ExportError, closest, count_of
 from edp.evaluation.monitor_footprint import MonitorFootprint, monitor_footprint
 from edp.export.golden import at_thresholds, grown_tolerance, stream, tolerance
 from edp.export.monitor import (
@@ -117,7 +117,7 @@ def monitor_parts(monitor: Monitor, golden: bool = True) -> MonitorParts:
     sources = tuple(part for source in monitor.sources for part in source_parts(source, columns))
     chain = chain_part(monitor.chain)
     parts = MonitorParts(
-        title=f"monitor of {len(monitor.inputs)} channels",
+        title=f"monitor of {count_of(len(monitor.inputs), 'channel')}",
         digest=str(monitor.provenance.get("digest", "")) or digest_of(chain),
         promise=f"{monitor.limit.sentence()}.",
         inputs=monitor.channels,

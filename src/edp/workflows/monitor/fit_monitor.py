@@ -16,7 +16,7 @@ import numpy as np
 from edp.config.monitor import MonitorExperiment, monitor_toml
 from edp.errors import BundleError, ConfigError, DataError, LostError, closest
 from edp.logs.source import DataSource
-from edp.monitor.detectable import found_sizes, healthy_range, measure_found_sizes, promise_lines
+from edp.monitor.detectable import effort_line, found_sizes, healthy_range, measure_found_sizes, promise_lines
 from edp.monitor.fitting import FittedChain, doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
@@ -71,7 +71,9 @@ class FittedMonitor:
     @property
     def finds(self) -> list[str]:
         """Sentences on what the monitor finds with these logs."""
-        return promise_lines(found_sizes(self.monitor.provenance))
+        provenance = self.monitor.provenance
+        stopped = effort_line(provenance)
+        return [*promise_lines(found_sizes(provenance)), *([stopped] if stopped else [])]
 
 
 def fit_monitor(
@@ -196,8 +198,10 @@ def fit_to_recordings(
             return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
     monitor = _assembled(material, sources, fitted, sessions, rest)
     # Validation sessions set no limit.
-    sizes = measure_found_sizes(monitor, validation, 60.0 * float(monitor.provenance["hours"]), note)
-    measured = {"found_sizes": [asdict(size) for size in sizes], "healthy_range": healthy_range(fitted)}
+    minutes, fit_s = 60.0 * float(monitor.provenance["hours"]), time.process_time() - began
+    trials = measure_found_sizes(monitor, validation, minutes, fit_s, note)
+    measured = {"found_sizes": [asdict(size) for size in trials.sizes], "found_effort": trials.effort()}
+    measured["healthy_range"] = healthy_range(fitted)
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     provenance = dict(monitor.provenance) | measured | {"seconds": time.process_time() - began}
     monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, note, side_by_side)

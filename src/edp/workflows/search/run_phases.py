@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from edp.errors import ConfigError, DataError, LostError
+from edp.errors import ConfigError, DataError, LostError, count_of
 from edp.storage.ledger import TrainingStatus
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.phases import PHASES
@@ -81,11 +81,14 @@ def _sound(outcomes: list[Outcome]) -> list[Outcome]:
     lost = [outcome for outcome in outcomes if outcome.status == TrainingStatus.LOST]
     if lost:
         raise LostError(
-            f"{len(lost)} trainings were lost: {lost[0].message}. What is done is kept; free memory or take fewer "
+            f"{count_of(len(lost), 'training')} lost: {lost[0].message}. What is done is kept; free memory or take "
+            "fewer "
             "workers, and give the same command again"
         )
     # One failure is a result; a whole batch of them is a fault that a decision must not rest on.
     failed = [outcome for outcome in outcomes if outcome.status == TrainingStatus.FAILED]
     if len(outcomes) > 1 and len(failed) == len(outcomes):
-        raise DataError(f"all {len(outcomes)} trainings of a batch failed; the first says: {failed[0].message}")
+        raise DataError(
+            f"all {count_of(len(outcomes), 'training')} of a batch failed; the first says: {failed[0].message}"
+        )
     return outcomes

@@ -164,7 +164,7 @@ def run_search(
     if parts is not None:
         source = DataSource(target / SESSIONS_FILE)
         callbacks.on_note(
-            f"{len(recordings)} log(s) are too few for sessions: divided into {len(data.names)} sessions of "
+            f"too few logs for sessions ({len(recordings)}): divided into {len(data.names)} sessions of "
             f"{parts.seconds:.3g} s or more ({source.path}); what is found holds for these logs, not for other days"
         )
     with ExitStack() as open_things:

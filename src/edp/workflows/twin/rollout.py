@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from edp.data.derived_velocities import matched
-from edp.errors import ConfigError, DataError, closest
+from edp.errors import ConfigError, DataError, closest, count_of
 from edp.evaluation.beyond import RANGES, commands_beyond
 from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
 from edp.logs import write_recording
@@ -119,7 +119,7 @@ def rollout_log(
 def _only(recordings: Sequence[Recording]) -> Recording:
     if len(recordings) != 1:
         names = ", ".join(recording.name for recording in recordings[:5])
-        raise DataError(f"{len(recordings)} recordings came ({names}); a twin runs along one: give one log")
+        raise DataError(f"{count_of(len(recordings), 'recording')} came ({names}); a twin runs along one: give one log")
     return recordings[0]
 
 

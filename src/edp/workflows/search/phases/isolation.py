@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.config.experiment import Table
-from edp.errors import DataError
+from edp.errors import DataError, count_of
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
@@ -105,7 +105,7 @@ class Isolation:
         for backbone, comparison in facts["comparisons"].items():
             sentences.append(
                 f"{backbone}: {chosen} against {comparison['reference']} {100 * comparison['change']:+.2f} % "
-                f"(one-sided p {comparison['p']:.2g}, two-way clustered t over {spec.variance_runs} runs)."
+                f"(one-sided p {comparison['p']:.2g}, two-way clustered t over {count_of(spec.variance_runs, 'run')})."
             )
         for backbone, comparison in facts["backbones"].items():
             sentences.append(

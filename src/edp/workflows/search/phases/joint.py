@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from edp.config.experiment import Table
-from edp.errors import DataError
+from edp.errors import DataError, count_of
 from edp.stats.pareto import pareto
 from edp.workflows.search.context import Outcome, SearchContext
 from edp.workflows.search.modules import contradicting, present_options
@@ -83,7 +83,9 @@ def winner_of(
     """
     winner = best(answers)
     if winner is None:
-        raise DataError(f"{name}: none of {len(answers)} trainings ended well; see their messages in the ledger")
+        raise DataError(
+            f"{name}: none of {count_of(len(answers), 'training')} ended well; see their messages in the ledger"
+        )
     done = [answer for answer in answers if answer.score is not None]
     facts: dict[str, Any] = {
         "settings": winner.settings,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
+from edp.errors import count_of
 from edp.stats.power import plan_runs
 from edp.stats.thesis_power import thesis_plan
 from edp.stats.variance import PairedVariance
@@ -47,7 +48,9 @@ def _sound(context: SearchContext) -> Decision:
     runs = plan.runs or spec.most_runs - spec.most_runs % spec.folds
     sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} {context.unit}: {plan.reason}."]
     if plan.runs is None:
-        sentences.append(f"{runs} runs are made nevertheless; effects below what they can show will be missed.")
+        sentences.append(
+            f"{count_of(runs, 'run')} are made nevertheless; effects below what they can show will be missed."
+        )
     return Decision("planning", {**asdict(plan), "runs": runs, "enough": plan.runs}, tuple(sentences))
 
 

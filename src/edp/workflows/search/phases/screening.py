@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.config.experiment import Table
+from edp.errors import count_of
 from edp.stats.factorial import Factorial, least_runs, two_level_design
 from edp.stats.importance import main_effects
 from edp.workflows.search.context import Decision, Outcome, SearchContext
@@ -117,7 +118,8 @@ def _passed_by_design(
     table = {effect.factor: asdict(effect) | {"change": effect.effect / mean} for effect in effects}
     sentences = [
         f"{len(passed)} of {len(effects)} modules show a sign of an improvement and go on: "
-        f"{', '.join(MODULES[name].title for name in passed) or 'none'}; {len(rows)} trainings, {failed} failed."
+        f"{', '.join(MODULES[name].title for name in passed) or 'none'}; {count_of(len(rows), 'training')}, "
+        f"{failed} failed."
     ]
     facts = {"passed": passed, "registered": list(design.factors), "modules": table, "alias": design.alias}
     return Decision("screening", facts, tuple(sentences))

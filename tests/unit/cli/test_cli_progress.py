@@ -1,0 +1,206 @@
+"""Every progress display with a total: never above it, and no time left of zero while work goes on."""
+
+import ast
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from edp.cli import console
+from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, counted, left_text, progress
+from edp.cli.fleet import MachineDisplay
+from edp.cli.quality import LogDisplay
+from edp.cli.screen import ScreeningDisplay
+from edp.cli.search import SearchDisplay
+from edp.cli.train import SeriesDisplay, TrainingDisplay
+from edp.cli.twin import FitDisplay
+from edp.training import TrainingProgress
+from edp.training.free_run import FreeRunProgress
+
+COMMANDS = Path(console.__file__).parent
+
+
+def epoch(number):
+    return TrainingProgress(number, 2, 10, 10, 1e5, 0.0, {"best": True, "validation_mae": 1.0})
+
+
+def steps():
+    return Steps(quiet=False, every_s=0.0)
+
+
+def train(shown):
+    display = TrainingDisplay(shown, steps())
+    display.on_candidate("ridge", 2, 2)
+    for number in (1, 2, 3):
+        display.on_event(epoch(number))
+
+
+def series(shown):
+    display = SeriesDisplay(shown, False, "finetune", "method")
+    display.steps = steps()
+    for done in (0, 1, 2, 3):
+        display.on_next("x", done, 2)
+        display.on_training("x", epoch(2))
+
+
+def fit(shown):
+    display = FitDisplay(shown, quiet=False)
+    display.steps = steps()
+    for update in (1, 64, 88):
+        display.on_event(FreeRunProgress(update, 64, 1.0, 0.2 if update == 1 else 0.0, None, False))
+
+
+def screening(shown):
+    display = ScreeningDisplay(shown, steps())
+    for done in (0, 1, 2, 3):
+        display.on_progress("ranks", done / 2)
+        display.on_trial("x", done, 2, epoch(3))
+
+
+def search(shown):
+    display = SearchDisplay(shown, steps(), quiet=False)
+    for done in (0, 2, 5):
+        counts = {"done": done, "asked": 2, "total": 2}
+        display.on_progress(SimpleNamespace(counts=lambda c=counts: c, seconds_left=lambda: 0.2, workers=2))
+
+
+def logs(shown):
+    display = LogDisplay(shown, steps())
+    for number in (1, 2, 3, 4):
+        display.on_log(Path("x"), number, 2)
+
+
+def machines(shown):
+    display = MachineDisplay(shown, steps(), "fleet")
+    for done in (0, 2, 3):
+        display.on_machine("x", done, 2)
+
+
+def count(shown):
+    on_next = counted(shown, steps(), "replay", "done")
+    for done in (0, 1, 2, 3):
+        on_next("x", done, 2)
+
+
+USERS = {
+    "TrainingDisplay": train,
+    "SeriesDisplay": series,
+    "FitDisplay": fit,
+    "ScreeningDisplay": screening,
+    "SearchDisplay": search,
+    "LogDisplay": logs,
+    "MachineDisplay": machines,
+    "counted": count,
+}
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_no_display_exceeds_its_total_or_says_that_nothing_is_left(user, capsys):
+    with progress() as shown:
+        USERS[user](shown)
+        assert shown.tasks
+        for task in shown.tasks:
+            assert 0 <= task.completed <= task.total
+    text = capsys.readouterr().err
+    assert text.strip()
+    assert not re.search(r"\b0 s left|at most 0 s|-\d+ left", text)
+    for done, total in re.findall(r"(\d+)(?:/| of )(\d+)\b", text):
+        assert int(done) <= int(total), text
+
+
+@pytest.mark.parametrize("change", [{"completed": 9}, {"advance": 9}, {"completed": 9, "total": 3}, {"completed": -1}])
+def test_a_bar_is_cut_at_its_total(change):
+    with progress() as shown:
+        bar = shown.add_task("x", total=2.0, note="")
+        shown.update(bar, **change)
+        assert 0 <= shown.tasks[0].completed <= shown.tasks[0].total
+
+
+def test_the_bar_shows_no_zero_while_it_works():
+    working = SimpleNamespace(finished=False, time_remaining=0)
+    assert TimeLeft().render(working).plain == ""
+    working.time_remaining = 0.3
+    assert TimeLeft().render(working).plain == "1 s left"
+    assert TimeLeft().render(SimpleNamespace(finished=True, finished_time=3.0)).plain == "3 s"
+
+
+def test_time_left_and_counts_of_a_plan():
+    assert [left_text(s) for s in (0.0, -3.0, float("nan"), float("inf"))] == [""] * 4
+    assert left_text(0.2) == ", 1 s left"
+    assert left_text(75.0) == ", 1 min 15 s left"
+    assert (count_text(2, 3), count_text(3, 3, "/"), count_text(4, 3)) == (
+        "2 of 3",
+        "3/3",
+        "4, more than the 3 planned",
+    )
+
+
+def functions():
+    """Functions of the command line that show progress, by file and name."""
+    for file in sorted(COMMANDS.glob("*.py")):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                calls = {ast.unparse(c.func) for c in ast.walk(node) if isinstance(c, ast.Call)}
+                if any(name.endswith((".say", "shown.update")) for name in calls):
+                    yield file.name, node
+
+
+def unplanned(node):
+    """F-strings with one number over another, which could exceed it."""
+    for text in (n for n in ast.walk(node) if isinstance(n, ast.JoinedStr)):
+        for before, between, after in zip(text.values, text.values[1:], text.values[2:], strict=False):
+            numbers = isinstance(before, ast.FormattedValue) and isinstance(after, ast.FormattedValue)
+            if numbers and isinstance(between, ast.Constant) and between.value in ("/", " of "):
+                yield ast.unparse(text)
+
+
+def test_counts_and_times_of_progress_are_written_in_one_place():
+    found = list(functions())
+    assert len(found) >= 12
+    for file, node in found:
+        assert not list(unplanned(node)) or (file, node.name) == ("console.py", "count_text"), (file, node.name)
+    for file in COMMANDS.glob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        if file.name != "console.py":
+            assert not re.search(r"duration\(.*\)\} left|\bmin\(1\.0, ", text), file.name
+
+
+def test_the_lint_finds_what_it_forbids():
+    assert list(unplanned(ast.parse("f'{done}/{total}'")))
+    assert list(unplanned(ast.parse("f'log {done} of {total}'")))
+    assert not list(unplanned(ast.parse("f'{done} and {total}'")))
+
+
+def runtime_imports(tree):
+    """Modules that a file imports, without those for types alone."""
+    aside = {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node not in aside:
+            yield node.module or ""
+        if isinstance(node, ast.Import) and node not in aside:
+            yield from (name.name for name in node.names)
+
+
+def test_no_other_display_exists():
+    """Bars come from `progress` alone, and each class that keeps one is tried above."""
+    owners, importers = set(), set()
+    for file in Path(console.__file__).parents[1].rglob("*.py"):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        if any(
+            name.startswith(("rich.progress", "rich.live", "rich.status", "tqdm")) for name in runtime_imports(tree)
+        ):
+            importers.add(file.name)
+        owners |= {
+            node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and "add_task(" in ast.unparse(node)
+        }
+    assert importers == {"console.py"}
+    assert owners == set(USERS) - {"counted"}
+    with progress() as shown:
+        assert isinstance(shown, BoundedProgress)
