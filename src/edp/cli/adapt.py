@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
 from edp.cli.settings import SettingsOption
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 
 
@@ -57,7 +57,7 @@ def adapt(
 
 def replay(
     run: Annotated[Path, typer.Argument(help="Run folder of edp adapt, or its bundle.")],
-    logs: Annotated[Path, typer.Argument(help="Logs: a log, a folder of logs, a data-set file, or a store.")],
+    logs: LogsArgument,
     carry: Annotated[
         bool, typer.Option(help="Carry the learned coefficients from one log to the next, as on one machine.")
     ] = False,

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 def finetune(
     bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
     logs: Annotated[
-        Path | None, typer.Argument(help="Logs of the target: a log, folder, data-set file, or store.")
+        list[Path] | None,
+        typer.Argument(
+            metavar="LOGS...", help="Logs of the target: logs and folders; or one data-set file, or one store."
+        ),
     ] = None,
     *,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
@@ -71,7 +74,7 @@ def finetune(
     spec, others = command_settings("finetune", FinetuneSpec, config, changes, TRAINING_TABLES)
     workforce = workforce_of(workers, cluster, open_cluster)
     if fleet is not None:
-        if logs is not None or signal_map is not None or repair:
+        if logs or signal_map is not None or repair:
             raise ConfigError("LOGS, --map and --repair do not go with --fleet, whose store holds mapped logs already")
         from edp.workflows.fleet.personal import PersonalOrder
 
@@ -79,7 +82,7 @@ def finetune(
         personal = PersonalOrder(method=method, spec=spec, changes=others, **size)
         _finetune_fleet(bundle, fleet, folder, personal, workforce, as_json)
         return
-    if logs is None or delta_kb is not None:
+    if not logs or delta_kb is not None:
         raise ConfigError("give LOGS of one machine, or --fleet with a store of many, to which --delta-kb belongs")
     order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
     source = source_of(logs, signal_map, repair)

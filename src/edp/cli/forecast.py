@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.errors import count_of
 
 MODELS = ("twin", "persistence")
@@ -17,7 +17,7 @@ MODELS = ("twin", "persistence")
 
 def forecast(
     run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="New folder for the logs with forecasts (Parquet).")],
     ahead: Annotated[list[int], typer.Option(help="Ticks ahead; give it again for more.")] = [10],  # noqa: B006
     answer: Annotated[

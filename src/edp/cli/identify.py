@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.twin import FitDisplay, score_table
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def identify(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    data: LogsArgument,
     file: Annotated[Path, typer.Option("--out", help="Machine file (.toml) to write; numbers beside it as .json.")],
     machine: Annotated[
         str, typer.Option(help="M22, C14, or a machine file: pins, lengths and bores, and a guess of the rest.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +11,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, show_lines, show_report, verdict_text
-from edp.cli.train import MapOption
+from edp.cli.train import LogsArgument, MapOption, shell_words
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import DataError, EdpError, count_of
 from edp.storage.paths import full_path, is_file_at
@@ -32,7 +33,7 @@ MOST_CHANNELS = 12
 
 
 def inspect(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    data: LogsArgument,
     signal_map: MapOption = None,
     details: Annotated[
         bool | None,
@@ -85,13 +86,13 @@ def inspect(
     if quality.proposed and (covered or asked):
         why = "no signal map says which channels command and which move; edp init proposes one (--map)"
         if asked:
-            raise DataError(f"'{data}': {why}")
+            raise DataError(f"'{source.label}': {why}")
     elif not errors and (covered or asked):
         coverage_facts, why = _coverage(source, split, names, asked, inspection)
     if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
 
-        build_coverage_page(coverage_facts, page, full_path(data).stem, quality)
+        build_coverage_page(coverage_facts, page, full_path(data[0]).stem, quality)
 
     def show() -> None:
         few = len(quality.reports) == 1 and len(quality.reports[0].channels) <= MOST_CHANNELS
@@ -110,7 +111,9 @@ def inspect(
             out.print(f"page: {full_path(page)}")
         out.print(verdict_text(quality))
         if quality.proposed or (errors and signal_map is None and _undescribed(quality)):
-            out.print(f"next: edp init {data}, which writes a signal map and settings; then edp train with both")
+            out.print(
+                f"next: edp init {shell_words(data)}, which writes a signal map and settings; then edp train with both"
+            )
         elif not errors:
             out.print(f"next: {_training(data, signal_map)}")
 
@@ -130,14 +133,14 @@ def _undescribed(quality: DataQuality) -> bool:
     return any(not report.channels for report in quality.reports)
 
 
-def _training(data: Path, signal_map: Path | None) -> str:
+def _training(data: Sequence[Path], signal_map: Path | None) -> str:
     """The command that trains: with the settings of `edp init` where they lie beside its map or data-set file."""
-    described = signal_map or (data if data.suffix == ".toml" else None)
+    described = signal_map or (data[0] if data[0].suffix == ".toml" else None)
     settings = None if described is None else described.parent / SETTINGS
     mapped = "" if signal_map is None else f" --map {signal_map}"
     if settings is None or not is_file_at(settings):
-        return f"edp train {data}{mapped} --out runs/first"
-    return f"edp train {data}{mapped} --config {settings} --out {settings.parent / 'runs' / 'first'}"
+        return f"edp train {shell_words(data)}{mapped} --out runs/first"
+    return f"edp train {shell_words(data)}{mapped} --config {settings} --out {settings.parent / 'runs' / 'first'}"
 
 
 def _coverage(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.workforce import WorkersOption
 from edp.errors import count_of
 from edp.storage.paths import full_path
@@ -130,7 +130,7 @@ def show_fitted(fitted: FittedMonitor) -> None:
 @app.command("run")
 def run(
     folder: Annotated[Path, typer.Argument(metavar="MONITOR", help="Folder that edp monitor fit wrote.")],
-    logs: Annotated[Path, typer.Argument(metavar="LOGS", help="A log, a folder of logs, a data-set file, or a store.")],
+    logs: LogsArgument,
     target: Annotated[
         Path | None, typer.Option("--out", help="Folder for the alarms (JSON lines, CSV) and what the page shows.")
     ] = None,

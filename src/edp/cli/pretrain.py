@@ -9,12 +9,12 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
 from edp.cli.settings import SettingsOption
-from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, TrainingDisplay, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 
 
 def pretrain(
-    data: Annotated[Path, typer.Argument(help="Recordings of many machines: folder, data-set file, or store.")],
+    data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     method: Annotated[str, typer.Option(help="joint, codes, fomaml, maml or reptile.")] = "joint",
     start: Annotated[

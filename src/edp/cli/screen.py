@@ -12,7 +12,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listing, out, progress, table
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import count_of
 
@@ -36,7 +36,7 @@ TOLD_SHARE = 0.005
 
 
 def screen(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Folder for page, pictures, feature sets and figures.")],
     targets: Annotated[str, typer.Option(help="Channels to predict: a,b. Default: the velocities.")] = "",
     horizon: Annotated[
@@ -244,10 +244,10 @@ def facts_of(selection: Selection) -> dict[str, Any]:
     }
 
 
-def next_command(data: Path, signal_map: Path | None, repair: Sequence[str], selection: Selection) -> str:
+def next_command(data: Sequence[Path], signal_map: Path | None, repair: Sequence[str], selection: Selection) -> str:
     """The training that the proposal is for."""
     chosen = signal_map or selection.map
-    parts = [f"edp train {data}"] + ([f"--map {chosen}"] if chosen is not None else [])
+    parts = [f"edp train {shell_words(data)}"] + ([f"--map {chosen}"] if chosen is not None else [])
     parts += [f"--repair {entry}" for entry in repair]
     return " ".join([*parts, f"--config {selection.files['settings']}", "--out runs/first"])
 

@@ -31,8 +31,11 @@ app = typer.Typer(
 @app.command("build")
 def build(
     data: Annotated[
-        Path,
-        typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or an address: s3://, gs://, az://."),
+        list[Path],
+        typer.Argument(
+            metavar="LOGS...",
+            help="Logs and folders of logs; or one data-set file (.toml), or one address: s3://, gs://, az://.",
+        ),
     ],
     folder: Annotated[
         Path, typer.Option("--out", help="Folder of the store; an existing one is continued or added to.")

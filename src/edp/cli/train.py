@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,13 @@ AUTO = "auto"
 """`edp.config.experiment.AUTO`, known here without loading that module."""
 MOST_EXPECTED = 12
 """Outputs of which the terminal says what to expect; the report has all."""
+LogsArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOGS...",
+        help="Logs and folders of logs; or one data-set file (.toml), or one store.",
+    ),
+]
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
     list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
@@ -30,7 +38,7 @@ RepairOption = Annotated[
 
 
 def train(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
     preset: Annotated[
@@ -142,7 +150,7 @@ def _expected_table(facts: dict[str, Any]) -> None:
 
 
 def run(
-    data: Path,
+    data: Path | Sequence[Path],
     folder: Path,
     config: Path | None = None,
     preset: str = "standard",
@@ -162,7 +170,12 @@ def run(
     return bundle, display.best
 
 
-def source_of(data: Path, signal_map: Path | None, repair: list[str]) -> DataSource:
+def shell_words(paths: Iterable[Path]) -> str:
+    """Return paths as arguments of a command that can be typed."""
+    return shlex.join(str(path) for path in paths)
+
+
+def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
     """A data source from command-line options."""
     from edp.config.experiment import build
     from edp.errors import ConfigError

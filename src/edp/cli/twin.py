@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_text, out, progress, table
 from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, within
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
 from edp.settings.bounds import MIN_MINUTES, above, span
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def twin(
-    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, a data-set file (.toml), or a store.")],
+    data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.kind=recurrent.")] = [],  # noqa: B006

@@ -37,11 +37,11 @@ def si_names(names: Iterable[str], kinds: Iterable[Kind]) -> list[str]:
         kinds: of the same channels.
     """
     listed = list(names)
-    wanted = [_si_name(name, kind) for name, kind in zip(listed, kinds, strict=True)]
+    si_forms = [_si_name(name, kind) for name, kind in zip(listed, kinds, strict=True)]
     # Names that stay are never given to another channel.
-    used = {name for name, new in zip(listed, wanted, strict=True) if name == new}
+    used = {name for name, new in zip(listed, si_forms, strict=True) if name == new}
     out: list[str] = []
-    for name, new in zip(listed, wanted, strict=True):
+    for name, new in zip(listed, si_forms, strict=True):
         chosen, number = new, 0
         while name != new and chosen in used:
             number += 1
@@ -61,10 +61,10 @@ def _si_name(name: str, kind: Kind) -> str:
         if unit is None or unit == si_unit or not stem:
             return name
         return stem if si_unit == "1" else f"{stem}{gap}{opening}{si_unit}{closing}"
-    found = _unit_at_end(name)
-    if found is None or found[2] == si_unit:
+    ending = _unit_at_end(name)
+    if ending is None or ending[2] == si_unit:
         return name
-    stem, gap, _ = found
+    stem, gap, _ = ending
     return stem if si_unit == "1" else f"{stem}{gap}{_word_of(si_unit)}"
 
 

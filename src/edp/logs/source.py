@@ -71,24 +71,46 @@ class DataSource:
         signal_map: columns to channels; None takes the vocabulary's names.
         repair: what may be repaired.
         at_most_h: of a store, evenly spread stretches of at most so many hours, about, in place of all; None for all.
+        more: further logs and folders of logs; a log that is named twice is read once.
 
     Raises:
-        ConfigError: not a positive number of hours.
+        ConfigError: not a positive number of hours, or a data-set file, a store or an address next to other paths.
     """
 
     path: Path
     signal_map: SignalMap | None = None
     repair: Repair | None = None
     at_most_h: float | None = None
+    more: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
+        for path in self.paths if self.more else ():
+            if path.suffix == ".toml" or bucket_address(path) or is_store(path):
+                raise ConfigError(
+                    f"'{path}' came with {len(self.more)} other path(s), expected logs or folders of logs; give a "
+                    "data-set file, a store or an address alone"
+                )
         if self.at_most_h is not None:
             checked_hours(self.at_most_h)
 
     @staticmethod
-    def of(path: str | Path, map_file: str | Path | None = None, repair: Repair | None = None) -> DataSource:
-        """A source from paths."""
-        return DataSource(Path(path), None if map_file is None else load_signal_map(map_file), repair)
+    def of(
+        path: str | Path | Sequence[Path], map_file: str | Path | None = None, repair: Repair | None = None
+    ) -> DataSource:
+        """Return a source from one path or several."""
+        first, *more = [Path(path)] if isinstance(path, str | Path) else path
+        signal_map = None if map_file is None else load_signal_map(map_file)
+        return DataSource(first, signal_map, repair, more=tuple(more))
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All paths that were given, in order."""
+        return (self.path, *self.more)
+
+    @property
+    def label(self) -> str:
+        """Where the recordings come from, for results and messages."""
+        return str(self.path) if not self.more else f"{self.path} and {len(self.more)} more"
 
     @property
     def stored(self) -> bool:
@@ -113,6 +135,8 @@ class DataSource:
             plain["repair"] = plain_tree(self.repair)
         if self.at_most_h is not None:
             plain["at_most_h"] = self.at_most_h
+        if self.more:
+            plain["more"] = [str(full_path(path)) for path in self.more]
         return plain
 
     @staticmethod
@@ -120,7 +144,8 @@ class DataSource:
         """The source that `to_plain` described."""
         signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
-        return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"))
+        more = tuple(Path(path) for path in plain.get("more", ()))
+        return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"), more)
 
     def logs(self) -> list[Log]:
         """The logs of the source, unread, each with the map that belongs to it; a store has none."""
@@ -130,7 +155,8 @@ class DataSource:
             return _listed(self.path, self.signal_map, self.repair)
         if self.address:
             return _in_bucket(self.address, self.signal_map, self.repair)
-        return [Log(path, self.signal_map, self.repair) for path in find_recordings(self.path)]
+        files = dict.fromkeys(file for path in self.paths for file in find_recordings(path))
+        return [Log(path, self.signal_map, self.repair) for path in files]
 
     def read(self) -> list[Recording]:
         """All recordings, at one rate.
@@ -145,7 +171,7 @@ class DataSource:
             return stored if self.at_most_h is None else drawn_recordings(stored, self.at_most_h)
         self._refuse_bucket_and_sample()
         if self.path.suffix != ".toml":
-            return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
+            return read_data_set(self.paths, self.signal_map, repair=self.repair)
         recordings = [log.read() for log in self.logs()]
         _check_listed(recordings, self.path)
         return recordings

@@ -221,7 +221,7 @@ def _provenance(
         "seconds": round(seconds, 2),
         "device": experiment.training.device,
         "data": {
-            "source": str(source.path),
+            "source": source.label,
             "reader": source.to_plain(),
             "rate_hz": rate,
             "train": part(data.train),

@@ -133,7 +133,7 @@ def _provenance(source: DataSource, experiment: Experiment, data: Prepared, reci
         "device": experiment.training.device,
         "search": {"phase": NAME, "recipe": recipe.to_json()},
         "data": {
-            "source": str(source.path),
+            "source": source.label,
             "reader": source.to_plain(),
             "rate_hz": rate,
             **{name: part(name) for name in ("train", "validation", "test")},

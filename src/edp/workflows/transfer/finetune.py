@@ -140,7 +140,7 @@ def finetune(
             notes.append(f"{METHODS[name].label} is left out: {end}")
             callbacks.on_note(notes[-1])
     result, shown = _result(begun, data, experiment, order, results)
-    result |= {"logs": str(logs.path), "notes": notes}
+    result |= {"logs": logs.label, "notes": notes}
     write_bytes(make_folder(folder) / SHOWN, save(shown))
     write_json(folder / RESULT, result | {FILES: digests_of(folder, SHOWN)})
     return result

@@ -175,7 +175,7 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
         "environment": environment(1),
         "seed": experiment.training.seed,
         "seconds": round(fitted.seconds, 2),
-        "data": {"source": str(source.path), "reader": source.to_plain(), "digest": data.digest, "names": parts},
+        "data": {"source": source.label, "reader": source.to_plain(), "digest": data.digest, "names": parts},
     }
 
 
