@@ -14,6 +14,7 @@ from edp.config.experiment import plain_tree
 from edp.logs.read import unique_names
 from edp.logs.source import DataSource, Log
 from edp.recording import Recording
+from edp.storage.paths import full_path
 
 SESSIONS_FILE = "sessions.toml"
 _SESSIONS = 12
@@ -70,7 +71,7 @@ def divide_logs(source: DataSource, recordings: Sequence[Recording], gap: int) -
             if stop - start < _MIN_GAPS * gap:
                 return None
             rows = (first + start, first + stop)
-            parts.append(replace(log, path=log.path.resolve(), name=f"{recording.name}_{number}", rows=rows))
+            parts.append(replace(log, path=full_path(log.path), name=f"{recording.name}_{number}", rows=rows))
     names = unique_names([str(log.name) for log in parts], [log.path for log in parts])
     named = tuple(replace(log, name=name) for log, name in zip(parts, names, strict=True))
     read = [log.read() for log in named]
