@@ -52,7 +52,7 @@ def test_the_command_line_says_what_takes_long(monkeypatch, capsys):
 
 def test_maps_pass_unchanged():
     plain = SignalMap(
-        (ChannelMap("a", "b", "bar", Kind.PRESSURE, None, 2.0, "x"), ChannelMap("c", "", constant=1e300)),
+        (ChannelMap("a", "b", "bar", Kind.PRESSURE, None, 2.0, "x"), ChannelMap("c", "", constant=1e30)),
         "t", "ms", None, 50.0, False, ("t", "b"), "v", ";", ",", True,
     )  # fmt: skip
     assert map_of(plain_map(plain)) == plain

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 import pytest
 
@@ -55,11 +57,12 @@ def test_a_link_and_a_young_file_stay(tmp_path):
 
 
 @pytest.mark.parametrize("writer", [replacing, replacing_folder])
-def test_what_somebody_still_writes_stays_however_old_it_is(tmp_path, writer, monkeypatch):
+def test_what_somebody_still_writes_stays_however_old_it_is(tmp_path, writer):
+    program = "import sys; from edp.storage import write_bytes; write_bytes(sys.argv[1], b'1')"
     with writer(tmp_path / "long") as temporary:
         os.utime(temporary, (0, 0))
-        monkeypatch.setattr(writing, "_cleaned", set())
-        write_bytes(tmp_path / "other.json", b"1")
+        subprocess.run([sys.executable, "-c", program, str(tmp_path / "other.json")], check=True)
+        assert (tmp_path / "other.json").exists()
         assert temporary.exists()
         if writer is replacing:
             temporary.write_bytes(b"whole")

@@ -19,6 +19,7 @@ from edp.logs.detect import format_for
 from edp.logs.formats.base import FORMATS
 from edp.logs.served import keep_temporary_files_in_memory
 from edp.logs.source import load_signal_map
+from edp.registry import load_plugins
 from edp.signals import SignalMap
 from edp.sim import Snapshot
 from edp.training import load_bundle
@@ -118,6 +119,7 @@ def main() -> None:
     for path in [file for file in files if file.name.startswith("honest")]:
         ends[path.name] = read(path)
     keep_temporary_files_in_memory()
+    load_plugins()  # an unknown name looks for them, once a process
     for path in [file for file in files if not file.name.startswith(("honest", "other"))]:
         trace.seen, trace.now, trace.armed = [], os.path.realpath(path), True
         ends[path.name] = read(path)

@@ -214,8 +214,8 @@ def test_a_refused_step_is_one_error(stranger):
     ("change", "message"),
     [
         (lambda text: text.replace("{plant}", "{other}"), "cannot be instantiated"),
-        (lambda text: text.replace('m="-1" s="-2"', 'm="-1" s="-2" factor="100000"'), "N/m2; Pa must hold"),
-        (lambda text: text.replace('<Real unit="m"/>', '<Real unit="mm"/>'), "mm; m must hold"),
+        (lambda text: text.replace('m="-1" s="-2"', 'm="-1" s="-2" factor="100000"'), "is in N/m2; expected Pa"),
+        (lambda text: text.replace('<Real unit="m"/>', '<Real unit="mm"/>'), "is in mm; expected m"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_a_loop(stranger, change, message):

@@ -145,7 +145,7 @@ def test_messages_hold_what_went_in():
 
 
 def test_names_are_bounded_text():
-    assert label("a" * 500) == "a" * (MOST_LABEL - 1) + "…"
+    assert label("a" * 250 + "b" * 250) == "a" * (MOST_LABEL - 32) + "…" + "b" * 31
     assert (
         label("x\u202ey\x1b[2J\n") == "x\N{REPLACEMENT CHARACTER}y\N{REPLACEMENT CHARACTER}[2J\N{REPLACEMENT CHARACTER}"
     )

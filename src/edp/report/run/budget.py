@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from edp.evaluation.controller import Budget
-
 
 def budget_name(footprint: Mapping[str, Any] | None) -> str:
     """Return the name of the stated controller in a run's ``footprint.json``; empty without one."""
+    # Here, since pages are also written where torch cannot be imported, which this module needs.
+    from edp.evaluation.controller import Budget
+
     budget = (footprint or {}).get("budget")
     # Earlier versions held every run against the thesis's controller.
     return str(budget.get("name") or "") if isinstance(budget, Mapping) and budget != asdict(Budget()) else ""
