@@ -14,7 +14,7 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
 from edp.evaluation.free_run_parts import by_channel, by_horizon, by_name, nrmse_by_channel, situations
-from edp.networks.twin import FreeRunIntervals, Twin, calibrate, even_starts
+from edp.networks.twin import FreeRunIntervals, Twin, TwinScales, calibrate, even_starts, starts_within
 from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
 
 Array = NDArray[np.float32]
@@ -149,15 +149,8 @@ def free_runs(twin: Twin, series: Sequence[Series], seconds: float, starts: int)
     Raises:
         DataError: no stretch has a tick behind the prefix.
     """
-    rate, prefix = twin.channels.rate_hz, twin.prefix_ticks
-    longest = max((part.samples for part in series), default=0)
-    ticks = min(round(seconds * rate), longest - prefix - 1)
-    if ticks < 1:
-        raise DataError(
-            f"the longest recording has {longest} ticks ({longest / rate:g} s); the twin needs {prefix} measured ones "
-            "and two more to be judged: give longer recordings"
-        )
-    length = prefix + ticks + 1
+    prefix = twin.prefix_ticks
+    length = _run_ticks(twin.channels, prefix, series, seconds)
     runs = even_starts(twin, series, length, starts)
     answers, truths = [], []
     for first in range(0, len(runs), LANES):
@@ -171,6 +164,37 @@ def free_runs(twin: Twin, series: Sequence[Series], seconds: float, starts: int)
     whole_truth = np.concatenate(truths)
     names = tuple(part.name for part, _ in runs)
     return runs_of(twin, names, np.concatenate(answers), whole_truth)
+
+
+def check_runs(
+    channels: TwinChannels, scales: TwinScales, prefix: int, series: Sequence[Series], seconds: float, starts: int
+) -> None:
+    """Refuse stretches in which `free_runs` would find no start, before the twin is trained.
+
+    Args:
+        channels: of the twin to be.
+        scales: with its end stops.
+        prefix: its measured ticks before a free run.
+        series: what it will be judged on.
+        seconds: length of a run, see `free_runs`.
+        starts: runs in each stretch.
+
+    Raises:
+        DataError: no stretch has a tick behind the prefix, or all starts lie beyond an end stop.
+    """
+    starts_within(channels, scales, series, _run_ticks(channels, prefix, series, seconds), starts)
+
+
+def _run_ticks(channels: TwinChannels, prefix: int, series: Sequence[Series], seconds: float) -> int:
+    """Measured ticks of a free run with its prefix; refuse where no stretch is long enough."""
+    rate, longest = channels.rate_hz, max((part.samples for part in series), default=0)
+    ticks = min(round(seconds * rate), longest - prefix - 1)
+    if ticks < 1:
+        raise DataError(
+            f"the longest recording has {longest} ticks ({longest / rate:g} s); the twin needs {prefix} measured ones "
+            "and two more to be judged: give longer recordings"
+        )
+    return prefix + ticks + 1
 
 
 def runs_of(twin: Twin, names: tuple[str, ...], answers: Array, truth: Array) -> FreeRuns:

@@ -87,6 +87,19 @@ class Conditioning:
         return Conditioning(**values, clip=clip)
 
 
+def check_blocks(blocks: int, points: int) -> None:
+    """Refuse fewer blocks than an operating point of so many numbers needs.
+
+    Raises:
+        DataError: too few blocks.
+    """
+    if blocks < 4 * points:
+        raise DataError(
+            f"{blocks} blocks of healthy sessions are too few for an operating point of {points} numbers; bring "
+            f"{4 * points} at least, or make block_s smaller"
+        )
+
+
 def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: float) -> Conditioning:
     """From healthy sessions, shapes (blocks, summaries) and (blocks, points) each.
 
@@ -99,11 +112,7 @@ def fit_conditioning(summaries: Sequence[Array], points: Sequence[Array], clip: 
     s, p = np.concatenate(list(summaries)), np.concatenate(list(points))
     fine = np.isfinite(s).any(axis=1)
     s, p = s[fine], p[fine]
-    if len(s) < 4 * p.shape[1]:
-        raise DataError(
-            f"{len(s)} blocks of healthy sessions are too few for an operating point of {p.shape[1]} numbers; bring "
-            f"{4 * p.shape[1]} at least, or make block_s smaller"
-        )
+    check_blocks(len(s), p.shape[1])
     offset: Array = p[:, 1:].mean(axis=0)
     scatter = p[:, 1:].std(axis=0)
     width: Array = np.where(scatter > 1e-9, scatter, 1.0).astype(np.float64)

@@ -12,13 +12,20 @@ from edp.errors import DataError
 from edp.monitor.adaptation import SlowDrift
 from edp.monitor.calibration import AlarmLimit, calibrated
 from edp.monitor.chain import MonitorChain
-from edp.monitor.conditioning import Conditioning, fit_conditioning
+from edp.monitor.conditioning import Conditioning, check_blocks, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
 from edp.monitor.detectors.separate_cusums import SeparateCusumsSpec
 from edp.monitor.residuals.base import ResidualSource, SideBySide, note_nothing, sisters_of
-from edp.monitor.session_blocks import BlocksJob, SessionBlocks, fit_summaries, summarised
+from edp.monitor.session_blocks import (
+    BlocksJob,
+    SessionBlocks,
+    block_ticks,
+    fit_summaries,
+    operating_numbers,
+    summarised,
+)
 from edp.monitor.summaries import BlockSummaries
-from edp.monitor.watches import BankSpec, Watch, WatchSpec, fit_watch, scaled_alike
+from edp.monitor.watches import BankSpec, Watch, WatchSpec, check_rows, fit_watch, scaled_alike
 from edp.recording import Recording
 from edp.settings.bounds import above, below, check_bounds, check_count, integer, span
 from edp.signals import Channel
@@ -129,12 +136,7 @@ def fit_chain(
         ConfigError: too few hours for the promise; says for which there are enough.
         DataError: too few sessions or blocks.
     """
-    least = min(spec.folds, LEAST_SESSIONS)
-    if len(sessions) < least:
-        raise DataError(
-            f"{len(sessions)} healthy sessions are left for conditioning and limits; {least} at least must hold: "
-            "bring more sessions, or cut long ones"
-        )
+    _check_sessions(spec, len(sessions))
     note("summaries of healthy sessions")
     summaries = fit_summaries(spec.block_s, sources, channels, sessions)
     jobs = [
@@ -142,12 +144,57 @@ def fit_chain(
         for number, session in enumerate(sessions)
     ]
     blocks = list(side_by_side(summarised, jobs))
-    rate_hz = sessions[0].rate_hz
+    settle = _settle_blocks(spec, sessions, summaries.block)
+    return fit_from_blocks(spec, summaries, blocks, sessions[0].rate_hz, settle, promised_hours, note, side_by_side)
+
+
+def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], sessions: Sequence[Recording]) -> None:
+    """Refuse sessions that are too few or too short for `fit_chain`, before any residual is fitted.
+
+    Lengths and channels alone tell it; sessions that turn out doubtful can still leave too little.
+
+    Args:
+        spec: options.
+        channels: raw inputs, in order.
+        sessions: healthy ones that no residual is fitted to.
+
+    Raises:
+        DataError: too few sessions or blocks.
+    """
+    _check_sessions(spec, len(sessions))
+    block = block_ticks(spec.block_s, sessions)
+    settle = _settle_blocks(spec, sessions, block)
+    points = operating_numbers(channels, sessions, block)
+    lengths = [session.samples // block - settle for session in sessions]
+    folds = min(spec.folds, len(sessions))
+    for fold in (NO_FOLD, *range(folds)):
+        left_out = set(_left_out(fold, len(sessions), folds))
+        others = [length for index, length in enumerate(lengths) if index not in left_out]
+        check_blocks(sum(others), points)
+        for watch in spec.watches:
+            check_rows(watch, others, sessions[0].rate_hz / block)
+
+
+def _check_sessions(spec: ChainSpec, count: int) -> None:
+    least = min(spec.folds, LEAST_SESSIONS)
+    if count < least:
+        raise DataError(
+            f"{count} healthy sessions are left for conditioning and limits; {least} at least must hold: "
+            "bring more sessions, or cut long ones"
+        )
+
+
+def _settle_blocks(spec: ChainSpec, sessions: Sequence[Recording], block: int) -> int:
+    """Blocks at the start of every session that are not watched."""
     shortest = min(session.samples for session in sessions)
     # A tenth: one-minute cycles of a rig would otherwise lose most of what they have.
-    settle_ticks = min(round(spec.settle_s * rate_hz), shortest // 10)
-    settle = -(-settle_ticks // summaries.block)
-    return fit_from_blocks(spec, summaries, blocks, rate_hz, settle, promised_hours, note, side_by_side)
+    settle_ticks = min(round(spec.settle_s * sessions[0].rate_hz), shortest // 10)
+    return -(-settle_ticks // block)
+
+
+def _left_out(fold: int, sessions: int, folds: int) -> range:
+    """Places of the sessions that a fold is not fitted to."""
+    return range(0) if fold == NO_FOLD else range(fold, sessions, folds)
 
 
 def fit_from_blocks(
@@ -218,7 +265,7 @@ class _Part:
     @property
     def left_out(self) -> range:
         """Places of the sessions that it is not fitted to."""
-        return range(0) if self.fold == NO_FOLD else range(self.fold, len(self.sessions), self.folds)
+        return _left_out(self.fold, len(self.sessions), self.folds)
 
 
 def _fit_part(job: _Part) -> tuple[Conditioning, list[Watch], list[list[Array]]]:

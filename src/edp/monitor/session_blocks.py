@@ -38,11 +38,7 @@ def fit_summaries(
     block_s: float, sources: Sequence[ResidualSource], channels: Sequence[Channel], sessions: Sequence[Recording]
 ) -> BlockSummaries:
     """Blocks and scales from some healthy sessions."""
-    rate_hz, names = sessions[0].rate_hz, [channel.name for channel in channels]
-    block = max(round(block_s * rate_hz), LEAST_TICKS)
-    block = min(block, max(1, min(session.samples for session in sessions) // 2))
-    places = np.unique(np.linspace(0, len(sessions) - 1, min(len(sessions), SCALED_SESSIONS)).astype(int))
-    chosen = [sessions[i] for i in places]
+    names, block, chosen = [channel.name for channel in channels], block_ticks(block_s, sessions), _scaling(sessions)
     scales = []
     for source in sources:
         values = np.concatenate(residuals_of(source, chosen)).astype(np.float64)
@@ -66,6 +62,25 @@ def fit_summaries(
         level=level,
         drivers=drivers_of(channels, sessions[0], [names[i] for i in judged]),
     )
+
+
+def block_ticks(block_s: float, sessions: Sequence[Recording]) -> int:
+    """Ticks of a block of these sessions."""
+    block = max(round(block_s * sessions[0].rate_hz), LEAST_TICKS)
+    return min(block, max(1, min(session.samples for session in sessions) // 2))
+
+
+def operating_numbers(channels: Sequence[Channel], sessions: Sequence[Recording], block: int) -> int:
+    """Return how many numbers an operating point of these sessions has."""
+    names = [channel.name for channel in channels]
+    rows = np.concatenate([rows_of(session, names) for session in _scaling(sessions)]).astype(np.float64)
+    return 1 + sum(len(places) for places in _operating_channels(channels, rows, block))
+
+
+def _scaling(sessions: Sequence[Recording]) -> list[Recording]:
+    """Sessions that scales and operating points are taken from, evenly chosen."""
+    places = np.unique(np.linspace(0, len(sessions) - 1, min(len(sessions), SCALED_SESSIONS)).astype(int))
+    return [sessions[i] for i in places]
 
 
 def drivers_of(channels: Sequence[Channel], session: Recording, judged: Sequence[str]) -> NDArray[np.int64]:

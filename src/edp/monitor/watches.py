@@ -96,6 +96,36 @@ class Watch:
         return white.astype(np.float64)
 
 
+def check_rows(spec: WatchSpec, lengths: Sequence[int], blocks_per_s: float) -> int:
+    """Return over how many blocks a view averages; refuse sessions that are too short for its covariance.
+
+    Args:
+        spec: options of the view.
+        lengths: watched blocks of each healthy session.
+        blocks_per_s: rate of the blocks.
+
+    Raises:
+        DataError: too few rows.
+    """
+    usual = int(np.median(lengths)) if lengths else 0
+    # A quarter of a session at most: of longer averages there would be too few.
+    blocks = max(1, min(round(spec.memory_s * blocks_per_s), usual // 4))
+    rows = sum(_averages(length, blocks) for length in lengths)
+    if spec.view != "own" and rows < LEAST_ROWS:
+        raise DataError(
+            f"{rows} averages over {blocks} blocks are too few for a covariance; {LEAST_ROWS} at least must hold: "
+            "bring more hours"
+        )
+    return blocks
+
+
+def _averages(length: int, blocks: int) -> int:
+    """Return how many means `_averaged` makes of so many rows."""
+    if blocks == 1 or length <= 0:
+        return max(length, 0)
+    return max(0, length - blocks) // max(1, blocks // 2) + 1
+
+
 def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, settle: int) -> Watch:
     """A view from conditioned rows of healthy sessions, shape (blocks, summaries) each; not clipped for ``own``.
 
@@ -104,15 +134,8 @@ def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, s
     """
     if spec.view == "own":
         return _own(spec, sessions, settle)
-    usual = int(np.median([len(session) - settle for session in sessions])) if sessions else 0
-    # A quarter of a session at most: of longer averages there would be too few.
-    blocks = max(1, min(round(spec.memory_s * blocks_per_s), usual // 4))
+    blocks = check_rows(spec, [len(session) - settle for session in sessions], blocks_per_s)
     rows = np.concatenate([_averaged(np.nan_to_num(session[settle:]), blocks) for session in sessions])
-    if len(rows) < LEAST_ROWS:
-        raise DataError(
-            f"{len(rows)} averages over {blocks} blocks are too few for a covariance; {LEAST_ROWS} at least must hold: "
-            "bring more hours"
-        )
     mean = rows.mean(axis=0)
     centred = rows - mean
     covariance = centred.T @ centred / len(rows)

@@ -67,15 +67,12 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path) -> None:
-        check_kind(path, "run", "study", "fleet", what="a run")
+        check_claimable(path)
         self.path = make_folder(path)
         try:
             self._lock = hold(self.path / ".lock")
         except BusyError as error:
-            holder = str(error).rpartition("process ")[2]
-            raise BusyError(
-                f"run folder '{self.path}' is in use by process {holder}; wait for it or choose another folder"
-            ) from None
+            raise _busy(self.path, str(error).rpartition("process ")[2]) from None
         remove_unfinished(self.path)
 
     def __enter__(self) -> RunFolder:
@@ -150,6 +147,25 @@ def unfinished_text(folder: str | Path) -> str:
     state = "it was stopped" if holder is None else f"process {holder} is at work"
     todo = "give the command that began it again to continue" if holder is None else "wait until it ends"
     return f"'{path}' holds a run that is not finished ({state}); {todo}"
+
+
+def check_claimable(path: str | Path) -> None:
+    """Refuse a folder that `RunFolder` would refuse; call it before logs are read or anything is computed.
+
+    Nothing is made or changed: a command that is refused later leaves no folder.
+
+    Raises:
+        BusyError: another process holds it.
+        StorageError: it is a folder of another kind, such as a store.
+    """
+    check_kind(path, "run", "study", "fleet", what="a run")
+    holder = held_by(Path(path) / ".lock")
+    if holder is not None:
+        raise _busy(Path(path), holder)
+
+
+def _busy(path: Path, holder: str) -> BusyError:
+    return BusyError(f"run folder '{path}' is in use by process {holder}; wait for it or choose another folder")
 
 
 def check_free(path: str | Path, what: str) -> None:

@@ -39,7 +39,7 @@ from edp.report.run.choice import FLOOR, note_test_result
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.headers import FILES, digests_of
 from edp.storage.paths import is_folder_at, is_there
-from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
+from edp.storage.runs import KeyedRun, RunFolder, check_claimable, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
@@ -122,6 +122,7 @@ def train(
         Diverged: the loss was not finite any more, now or in an earlier sitting; a bundle holds the best weights
             before that, where an epoch was finished.
     """
+    check_claimable(out)
     # The judge changes no weights: the same run may be judged in several ways.
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
     if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from edp.config.monitor import load_monitor_experiment
 from edp.errors import BundleError, ConfigError, DataError
 from edp.monitor.monitor_file import HEADER, load_monitor, save_monitor
+from edp.monitor.watches import _averaged, _averages
 from edp.recording import Recording
 from edp.storage.seals import HASH, content_digest
 from edp.testing.monitor import rig_sessions
@@ -129,6 +131,29 @@ def test_too_few_hours_name_the_rate_that_they_support(healthy):
     experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": advised})
     rest = _divided(healthy, experiment)[2]
     assert 0.0 < advised < 0.85 * sum(session.duration_s for session in rest) / 3600.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("chain.block_s=15",), "too few for an operating point"),
+        (("chain.block_s=1.1", "chain.folds=2", "train_share=0.8"), "too few for a covariance"),
+    ],
+)
+def test_too_few_blocks_are_refused_before_a_residual_is_fitted(healthy, monkeypatch, changes, message):
+    def called(job):
+        pytest.fail("a residual is fitted before the refusal")
+
+    monkeypatch.setattr(sys.modules["edp.workflows.monitor.fit_monitor"], "_fit_source", called)
+    experiment = load_monitor_experiment(None, changes, {"hours_per_false_alarm": 0.02})
+    with pytest.raises(DataError, match=message):
+        fit_to_recordings(healthy[:8], experiment)
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 3, 7])
+def test_averages_are_counted_as_they_are_made(blocks):
+    for length in range(40):
+        assert _averages(length, blocks) == len(_averaged(np.zeros((length, 2)), blocks))
 
 
 def test_a_healthy_log_with_a_fault_is_named(healthy, fitted):

@@ -9,7 +9,7 @@ from edp.networks.twin import (  # noqa: F401  registers the formulations
     residual,
     static_map,
 )
-from edp.networks.twin.base import TWINS, Twin, TwinSpec, TwinState, even_starts
+from edp.networks.twin.base import TWINS, Twin, TwinSpec, TwinState, even_starts, starts_within
 from edp.networks.twin.grey import ground_drag  # noqa: F401  registers the grounds
 from edp.networks.twin.intervals import FreeRunIntervals, calibrate
 from edp.networks.twin.plant import IntegerTwinPlant, TwinPlant
@@ -27,4 +27,5 @@ __all__ = [
     "calibrate",
     "even_starts",
     "fit_scales",
+    "starts_within",
 ]

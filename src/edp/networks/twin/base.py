@@ -242,11 +242,7 @@ class Twin(ABC):
         return np.asarray((self._beyond(start) <= BEYOND).all(axis=1))
 
     def _beyond(self, start: Array) -> Array:
-        """How far strokes lie beyond the end stops, as a share of the range ``(batch, stroke)``."""
-        count, strokes = len(self.channels.velocities), len(self.channels.strokes)
-        ends = slice(count, count + strokes)
-        low, high = self.scales.low[ends], self.scales.high[ends]
-        return np.asarray(np.maximum(low - start[:, ends], start[:, ends] - high) / (high - low), dtype=np.float32)
+        return _beyond(self.channels, self.scales, start)
 
 
 class TwinRunner:
@@ -319,8 +315,27 @@ def solved_columns(channels: TwinChannels) -> list[int]:
     return [i for i in range(len(channels.answers)) if not velocities <= i < velocities + strokes]
 
 
+def _beyond(channels: TwinChannels, scales: TwinScales, start: Array) -> Array:
+    """How far strokes lie beyond the end stops, as a share of the range ``(batch, stroke)``."""
+    count, strokes = len(channels.velocities), len(channels.strokes)
+    ends = slice(count, count + strokes)
+    low, high = scales.low[ends], scales.high[ends]
+    return np.asarray(np.maximum(low - start[:, ends], start[:, ends] - high) / (high - low), dtype=np.float32)
+
+
 def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) -> list[tuple[Series, int]]:
     """Evenly spread starts of runs of `length` ticks, at most `each` in a stretch; none beyond an end stop.
+
+    Raises:
+        DataError: all of them lie beyond.
+    """
+    return starts_within(twin.channels, twin.scales, series, length, each)
+
+
+def starts_within(
+    channels: TwinChannels, scales: TwinScales, series: Sequence[Series], length: int, each: int
+) -> list[tuple[Series, int]]:
+    """Return `even_starts` of a twin that is not trained yet: its channels and scales tell them.
 
     Raises:
         DataError: all of them lie beyond.
@@ -332,7 +347,7 @@ def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) ->
         if part.samples >= length
         for at in np.unique(np.linspace(0, part.samples - length, each).astype(np.int64))
     ]
-    usable = [(part, at) for part, at in runs if twin.within_stops(part.targets[at : at + 1])[0]]
+    usable = [(part, at) for part, at in runs if (_beyond(channels, scales, part.targets[at : at + 1]) <= BEYOND).all()]
     if not usable:
         raise DataError(
             f"all {len(runs)} starts lie beyond an end stop of the twin, and its end stops are the ends of the strokes "

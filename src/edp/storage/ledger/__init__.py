@@ -15,7 +15,7 @@ from edp.storage.ledger.record import (
     digest_of,
 )
 from edp.storage.ledger.states import WithState, leave_state, left_state, read_state
-from edp.storage.ledger.store import Damage, Ledger, Opening, read_records
+from edp.storage.ledger.store import Damage, Ledger, Opening, check_uncoordinated, read_records
 
 __all__ = [
     "FINAL",
@@ -28,6 +28,7 @@ __all__ = [
     "TrainingStatus",
     "WithState",
     "canonical",
+    "check_uncoordinated",
     "claim",
     "code_version",
     "digest_of",

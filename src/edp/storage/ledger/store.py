@@ -14,7 +14,7 @@ from edp.errors import BusyError, ConfigError, StorageError
 from edp.storage.ledger.claims import free_dead_claims, whole
 from edp.storage.ledger.record import FINAL, RECORD_BYTES, SCHEMA, Record, TrainingStatus, body_of, canonical, digest_of
 from edp.storage.ledger.states import SUFFIX, left_state, read_state
-from edp.storage.locks import check_held, hold
+from edp.storage.locks import check_held, held_by, hold
 from edp.storage.paths import entries_of, is_entry_at, is_file_at, is_there
 from edp.storage.reading import object_with, read_bytes, read_object
 from edp.storage.writing import make_folder, remove_unfinished, storage_error, write_bytes, write_json
@@ -94,6 +94,21 @@ def _opening(file: Path) -> Opening:
     return Opening(str(content["test_set"]), tuple(judged), str(content["why"]), str(content["time"]))
 
 
+def check_uncoordinated(folder: str | Path) -> None:
+    """Refuse a ledger that another process coordinates; call it before logs are read. Nothing is made or changed.
+
+    Raises:
+        BusyError: another process holds it.
+    """
+    holder = held_by(Path(folder) / ".lock")
+    if holder is not None:
+        raise _busy(Path(folder), holder)
+
+
+def _busy(path: Path, holder: str) -> BusyError:
+    return BusyError(f"'{path}' is coordinated by process {holder}; wait for it, stop it, or choose another folder")
+
+
 class Ledger:
     """A ledger that this process, the coordinator, writes; a second one is refused.
 
@@ -117,10 +132,7 @@ class Ledger:
         try:
             self._lock = hold(self.path / ".lock")
         except BusyError as error:
-            holder = str(error).rpartition("process ")[2]
-            raise BusyError(
-                f"'{self.path}' is coordinated by process {holder}; wait for it, stop it, or choose another folder"
-            ) from None
+            raise _busy(self.path, str(error).rpartition("process ")[2]) from None
         try:
             for part in ("records", "arrived", "states"):
                 remove_unfinished(make_folder(self.path / part))

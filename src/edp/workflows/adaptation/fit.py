@@ -20,7 +20,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import Kind
 from edp.storage import write_bytes, write_json
 from edp.storage.paths import is_file_at, is_there
-from edp.storage.runs import RunFolder
+from edp.storage.runs import RunFolder, check_claimable
 from edp.training import save_bundle
 from edp.workflows.adaptation.replay import replay
 from edp.workflows.deployment import footprint_of
@@ -45,6 +45,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
         EdpError: not a run folder, a network whose predictions are not measured later, or a folder that holds another
             run.
     """
+    check_claimable(out)
     folder = Path(run)
     bundle, _, provenance, data = trained_run(folder)
     # A trained run in the folder would be lost: its bundle has the same name.

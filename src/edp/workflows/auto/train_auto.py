@@ -20,7 +20,7 @@ from edp.report.run.choice import FILE, FLOOR, read_choice
 from edp.signals import Kind
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.paths import is_file_at, is_there
-from edp.storage.runs import run_key
+from edp.storage.runs import check_claimable, run_key
 from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.workflows.auto.candidates import LEAST_SPAN, Amount
@@ -80,6 +80,7 @@ def train_auto(
     Raises:
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
     """
+    check_claimable(out)
     once = _ReadOnce(source)
     foundation = read_foundation(settings.auto.foundation)
     if foundation is not None:

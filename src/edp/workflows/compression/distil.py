@@ -19,7 +19,7 @@ from edp.networks.predictor import Predictor
 from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, integer
 from edp.settings.tree import SettingsTree
 from edp.storage.paths import is_file_at
-from edp.storage.runs import read_provenance
+from edp.storage.runs import check_claimable, read_provenance
 from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.spec import TrainingSpec
@@ -95,6 +95,7 @@ def distil(
         EdpError: not a run, a student that is no smaller, teachers that contradict one another, other data or settings
             in `out`.
     """
+    check_claimable(out)
     spec = request.spec
     teacher, experiment, own = read_run(run, request.changes)
     order = CompressionRequest(

@@ -11,7 +11,7 @@ from edp.networks.integer import integer_predictor
 from edp.networks.running import mean_error
 from edp.storage import check_writable, write_bytes, write_json
 from edp.storage.paths import is_file_at, is_there
-from edp.storage.runs import RunFolder
+from edp.storage.runs import RunFolder, check_claimable
 from edp.training import save_bundle
 from edp.workflows.train_evaluate import trained_run
 
@@ -33,6 +33,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         EdpError: not a run folder, a network without an integer form or already in integer form, or a folder that
             holds another run or cannot be written, which is seen before anything is computed.
     """
+    check_claimable(out)
     folder = Path(run)
     bundle, _, provenance, data = trained_run(folder)
     if bundle.predictor.number_format != "float32":
@@ -40,13 +41,13 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     if is_there(Path(out) / "run.json"):
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
     check_writable(out)
-    integer_network = integer_predictor(bundle.predictor, data.train, ticks)
-    # Both errors on the validation part, so that the loss by rounding is not mixed with other data.
-    errors = {
-        name: mean_error(one, data.validation)
-        for name, one in (("float", bundle.predictor), ("integer", integer_network))
-    }
     with RunFolder(out) as target:
+        integer_network = integer_predictor(bundle.predictor, data.train, ticks)
+        # Both errors on the validation part, so that the loss by rounding is not mixed with other data.
+        errors = {
+            name: mean_error(one, data.validation)
+            for name, one in (("float", bundle.predictor), ("integer", integer_network))
+        }
         for name in ("config.toml", "history.jsonl", "footprint.json"):
             if is_file_at(folder / name):
                 write_bytes(target.file(name), (folder / name).read_bytes())

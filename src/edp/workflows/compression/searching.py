@@ -20,7 +20,7 @@ from edp.signals import KINDS
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.ledger import Ledger
 from edp.storage.paths import is_file_at
-from edp.storage.runs import RunFolder, run_key
+from edp.storage.runs import RunFolder, check_claimable, run_key
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.strategy import DirectFit, TrainingStrategy
@@ -185,6 +185,7 @@ def search(
         EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a test set that was
             opened for another choice.
     """
+    check_claimable(out)
     spec = request.spec
     teacher, experiment, own = read_run(run, request.changes)
     plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.recipes)

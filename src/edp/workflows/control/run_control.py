@@ -21,7 +21,7 @@ from edp.logs import write_recording
 from edp.report import ControlFacts, write_control_page
 from edp.report.animation.page import scene_of
 from edp.storage import make_folder, write_json
-from edp.storage.runs import RunFolder, check_free, command_line, run_key
+from edp.storage.runs import RunFolder, check_claimable, check_free, command_line, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.control.kept import keep_controller
 
@@ -63,6 +63,7 @@ def control_loops(
         EdpError: settings, models, guard or folder cannot be used.
     """
     chosen = sources or ControlSources()
+    check_claimable(out)
     check_free(out, "edp control")
     # Before the folder is claimed: a reference or plant that is refused must not keep the corrected command out.
     bench = ControlBench(experiment, chosen)

@@ -14,7 +14,7 @@ from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer
 from edp.storage import write_bytes, write_json
-from edp.storage.runs import RunFolder, check_free, run_key
+from edp.storage.runs import RunFolder, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.search.space import Real
 from edp.workflows.search.study import SamplerSpec, Study
@@ -87,6 +87,7 @@ def tune_gains(
         raise ConfigError(
             f"seed = {experiment.seed}: references from {TUNING_SEED} on are for tuning; choose lower ones"
         )
+    check_claimable(out)
     check_free(out, "edp tune")
     key = run_key(CONTROL_SETTINGS.plain(experiment), repr((tuned_on, judged_on, chosen)))
     # Both before the first trial, and before the folder is claimed: what is refused is refused at once.

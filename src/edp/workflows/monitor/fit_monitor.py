@@ -17,7 +17,7 @@ from edp.config.monitor import MonitorExperiment, monitor_toml
 from edp.errors import BundleError, ConfigError, DataError, LostError, closest
 from edp.logs.source import DataSource
 from edp.monitor.detectable import effort_line, found_sizes, healthy_range, measure_found_sizes, promise_lines
-from edp.monitor.fitting import FittedChain, doubtful_sessions, fit_chain
+from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import save_monitor
@@ -173,6 +173,7 @@ def fit_to_recordings(
     sessions = _enough_sessions(recordings)
     train, validation, rest = _divided(sessions, experiment)
     _check_hours(sessions, rest, experiment)
+    check_healthy_sessions(experiment.chain, channels, rest)
     material = FitMaterial(
         train=train,
         validation=validation,

@@ -18,6 +18,7 @@ from edp.evaluation.context import Contexts, context_errors
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.storage import write_json
+from edp.storage.runs import check_claimable
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.pretraining.methods import PRETRAININGS
@@ -79,6 +80,7 @@ def pretrain(
         EdpError: recordings without machine, too few machines, or settings that do not go with the method.
         Diverged: the loss was not finite any more.
     """
+    check_claimable(out)
     if not isinstance(experiment.split, ByMachine):
         # Other splits leave recordings of a machine on both sides, and the network would know the machines that judge
         # it.

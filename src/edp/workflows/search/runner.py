@@ -21,7 +21,7 @@ from edp.recording import Recording
 from edp.settings.bounds import MOST_THREADS, above, check_bounds, integer
 from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
-from edp.storage.ledger import Ledger, Record
+from edp.storage.ledger import Ledger, Record, check_uncoordinated
 from edp.storage.portable import cores
 from edp.workflows.executors import Executor, LocalPool, RayPool
 from edp.workflows.search.context import Decision, SearchContext, is_enough, set_apart
@@ -155,6 +155,7 @@ def run_search(
     resources, callbacks = resources or Resources(), callbacks or SearchCallbacks()
     if until is not None:
         _ = PHASES[until]
+    check_uncoordinated(Path(folder) / "ledger")
     # Before anything is made on disk: what is refused leaves no folder.
     recordings = source.read()
     parts = None if is_enough(len(recordings), plan.spec) else divide_logs(source, recordings, _gap(plan))

@@ -21,6 +21,7 @@ from edp.networks.predictor import describe
 from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes, write_json
 from edp.storage.headers import FILES, digests_of
+from edp.storage.runs import check_claimable
 from edp.training import Diverged, TrainingProgress
 from edp.training.bundle import weights_digest
 from edp.workflows.transfer.case import TransferCase, tuned
@@ -116,6 +117,7 @@ def finetune(
         EdpError: logs that do not go with the source, settings that cannot be, or another run in `out`.
         Diverged: the training of the method that is kept diverged.
     """
+    check_claimable(out)
     callbacks = callbacks or FinetuneCallbacks()
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)

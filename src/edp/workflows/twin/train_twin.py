@@ -15,21 +15,24 @@ from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.data.oil import oil_celsius
 from edp.data.prepared import Prepared
+from edp.data.twin_channels import TwinChannels
 from edp.evaluation.beyond import RANGES, command_ranges
-from edp.evaluation.free_run import calibrated
+from edp.evaluation.free_run import calibrated, check_runs
 from edp.evaluation.step_response import step_responses
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
+from edp.networks.twin.grey.wiring import FARTHEST_TURN
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.recording import Recording
 from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
+from edp.signals import Kind
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes, write_json
-from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
+from edp.storage.runs import KeyedRun, RunFolder, check_claimable, command_line, environment, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FittedTwin, FreeRunProgress
 from edp.training.twin_bundle import OIL_C, STROKES, TwinBundle, load_twin, save_twin
@@ -87,6 +90,7 @@ def train_twin(
     Raises:
         EdpError: the recordings, settings or folder cannot be used; what was on disk stays.
     """
+    check_claimable(out)
     tell = on_step or (lambda text: None)
     if experiment.ground:
         grounded, finished = ground_twin(source, experiment, out, start, tell)
@@ -101,6 +105,8 @@ def train_twin(
     if base is not None:
         base.check(channels, data.train)
         begun = {"from": base.digest}
+    else:
+        _check_judged(channels, data, experiment)
     # Runs of versions that knew no ground are the same ones.
     settings = {name: value for name, value in TWIN_SETTINGS.plain(experiment).items() if name != "ground"}
     key = run_key({"twin": settings} | begun | _linkage(experiment), data.digest)
@@ -132,6 +138,27 @@ def train_twin(
         run.write_status("finished")
         run.remove_parts()
     return TrainedTwin(bundle, scores, False)
+
+
+def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) -> None:
+    """Refuse parts on which the new twin could not be judged, before it is trained.
+
+    Raises:
+        DataError: see `check_runs`.
+    """
+    judge, prefix = experiment.judge, experiment.twin.prefix_ticks
+    # An automatic twin is fitted to both parts in the end, and calibrated on folds of them.
+    auto = isinstance(experiment.twin, AutoTwin)
+    scales = fit_scales(channels, [*data.train, *data.validation] if auto else data.train)
+    # The end stops of a motor are free, see `turning_scales`.
+    turns = [channel.kind is not Kind.POSITION for channel in channels.strokes]
+    columns = len(channels.velocities) + np.flatnonzero(turns)
+    low, high = scales.low.copy(), scales.high.copy()
+    low[columns], high[columns] = -FARTHEST_TURN, FARTHEST_TURN
+    scales = replace(scales, low=low, high=high)
+    check_runs(channels, scales, prefix, data.test, judge.seconds, judge.starts)
+    if not auto:
+        check_runs(channels, scales, prefix, data.validation, judge.seconds, judge.calibration_starts)
 
 
 def _linkage(experiment: TwinExperiment) -> dict[str, Any]:

@@ -1,0 +1,77 @@
+"""What a twin could not be judged on is refused before anything is trained."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.config.twin import load_twin_experiment
+from edp.errors import DataError
+from edp.logs import write_recording
+from edp.logs.source import DataSource
+from edp.testing.twins import sample_actuators
+from edp.workflows.twin import choose_twin, fit_twin, train_twin
+
+ASTRAY = 1e3
+"""Metres by which strokes of a part are moved."""
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    for seed in range(5):
+        write_recording(sample_actuators(seed=seed), folder / f"log_{seed}.parquet")
+    return DataSource.of(folder)
+
+
+@pytest.fixture
+def trains_nothing(monkeypatch):
+    def called(*args, **options):
+        pytest.fail("a twin is trained before the refusal")
+
+    monkeypatch.setattr(fit_twin.TwinFit, "fitted", called)
+    monkeypatch.setattr(choose_twin.TwinChoice, "best", called)
+
+
+def with_part(monkeypatch, part, change):
+    """Let `train_twin` see another part of the data."""
+    module = sys.modules["edp.workflows.twin.train_twin"]
+    prepared = module.prepared_twin
+
+    def changed(recordings, experiment):
+        channels, data = prepared(recordings, experiment)
+        return channels, replace(data, **{part: [change(series, channels) for series in getattr(data, part)]})
+
+    monkeypatch.setattr(module, "prepared_twin", changed)
+
+
+def moved(series, channels):
+    shift = np.zeros(series.targets.shape[1], np.float32)
+    shift[len(channels.velocities) : len(channels.velocities) + len(channels.strokes)] = ASTRAY
+    return replace(series, targets=series.targets + shift)
+
+
+def cut(series, channels):
+    return replace(series, inputs=series.inputs[:20], targets=series.targets[:20])
+
+
+@pytest.mark.parametrize(
+    ("kind", "part", "change", "message"),
+    [
+        ("recurrent", "test", moved, "starts lie beyond an end stop"),
+        ("recurrent", "validation", moved, "starts lie beyond an end stop"),
+        ("auto", "test", moved, "starts lie beyond an end stop"),
+        ("greybox", "test", moved, "starts lie beyond an end stop"),
+        ("recurrent", "test", cut, "the longest recording has 20 ticks"),
+        ("auto", "test", cut, "the longest recording has 20 ticks"),
+    ],
+)
+def test_parts_without_a_start_are_refused_at_once(
+    logs, trains_nothing, monkeypatch, tmp_path, kind, part, change, message
+):
+    with_part(monkeypatch, part, change)
+    out = tmp_path / "run"
+    with pytest.raises(DataError, match=message):
+        train_twin(logs, load_twin_experiment(None, (f"twin.kind={kind}",)), out)
+    assert not out.exists(), "a refused command keeps the corrected one out of the folder"
