@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from edp.errors import StorageError
+from edp.report.run.facts import read_history
 from edp.storage import read_json, write_bytes, write_json
 from edp.storage.headers import FILES, check_files, digests_of
+from edp.storage.runs import RunFolder
 from edp.storage.seals import HASH, files_without_seal
 
 SOURCE = Path(__file__).parents[2] / "src" / "edp"
@@ -44,6 +46,7 @@ READERS = {
     "workflows/parity/forms/ros2.py": "answers of a program that was started",
     "workflows/parity/forms/casadi.py": "answers of a program that was started",
     "report/common/interactive.py": "text of a figure of this process",
+    "report/notebook/display.py": "text of a figure of this process",
     "report/run/facts.py": "arrays whose hash scores.json states",
     "report/twin/facts.py": "arrays whose hash free_run.json states",
     "report/transfer/facts.py": "arrays whose hash transfer.json states",
@@ -120,6 +123,33 @@ def test_a_file_without_a_hash_is_read_and_told(tmp_path):
     assert read_json(tmp_path / "old.json") == CONTENT
     assert len(files_without_seal()) == 1
     assert files_without_seal() == []
+
+
+EPOCHS = [{"epoch": 1, "loss": 0.5, "best": True}, {"epoch": 2, "loss": float("nan"), "best": False}]
+
+
+@pytest.fixture
+def history(tmp_path):
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_history(EPOCHS)
+    return tmp_path / "run" / "history.jsonl"
+
+
+def test_every_flipped_bit_of_a_history_is_refused_with_its_line(history):
+    assert str(read_history(history)) == str(tuple(EPOCHS))
+    whole = history.read_bytes()
+    for place in range(len(whole)):
+        history.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        if whole[place : place + 1] == b"\n":
+            assert str(read_history(history)) == str(tuple(EPOCHS))  # another kind of line end
+            continue
+        with pytest.raises(StorageError, match=r"history\.jsonl' line \d was changed"):
+            read_history(history)
+
+
+def test_a_history_of_an_earlier_version_is_read(history):
+    history.write_text("".join(json.dumps(row) + "\n" for row in EPOCHS))
+    assert str(read_history(history)) == str(tuple(EPOCHS))
 
 
 def test_arrays_beside_a_result_are_bound_to_it(tmp_path):
