@@ -88,8 +88,8 @@ def check_sealed_line(line: str, where: str, error: type[Exception]) -> None:
     Raises:
         Exception: `error`; the line has no hash, or its text does not match it.
     """
-    found = _HASH_OF_LINE.search(line)
-    if found is None or found[1] != digest_of_bytes((line[: found.start()] + "}").encode()):
+    hash_match = _HASH_OF_LINE.search(line)
+    if hash_match is None or hash_match[1] != digest_of_bytes((line[: hash_match.start()] + "}").encode()):
         raise error(
             f"{where} was changed since EDP wrote it: its text does not match its hash ({HASH}); restore the file from "
             "a copy, or give the command that wrote it again"
