@@ -207,7 +207,7 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     assert (made["minutes"], made["seed"], made["recordings"]) == (0.4, 4, 2)
     assert len(list((tmp_path / "data").glob("*.csv"))) == 2
     assert made["limit"]["horizons"] == [1, 10]
-    assert json.loads((tmp_path / "data" / "limit.json").read_text()) == made["limit"]
+    assert read_json(tmp_path / "data" / "limit.json") == made["limit"]
     shown = edp(*command, *asked).out
     assert "10 (100 ms)" in shown
     assert "commands known" in shown
