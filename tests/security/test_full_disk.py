@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from edp.errors import StorageError
+from edp.export import TARGETS
 from edp.logs import FORMATS, LogFormat
 from edp.storage import replacing, replacing_folder
 from edp.storage.writing import system_failure
@@ -58,6 +60,28 @@ def test_every_format_of_logs_tells_of_a_full_disk_and_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.processes
+def test_every_command_that_writes_names_the_file_and_leaves_no_part(tmp_path):
+    worker = Path(__file__).with_name("full_disk_commands.py")
+    surroundings = os.environ | {"COLUMNS": "2000", "TERM": "dumb"}
+    done = subprocess.run(
+        [sys.executable, str(worker), str(tmp_path)], capture_output=True, text=True, check=False, env=surroundings
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert len(told) >= 2 * len(TARGETS) + 7
+    for one in told:
+        command, said = one["command"], one["said"]
+        assert one["code"] not in (0, None), f"{command}: {said}"
+        assert "Traceback" not in said, f"{command}: {said}"
+        assert said.count("error: ") == 1, f"{command}: {said}"
+        named = re.search(r"error: cannot write '([^']+)': File too large; free space", said)
+        assert named, f"{command}: {said}"
+        assert not Path(named[1]).exists(), f"{command}: {named[1]} is half written"
+        assert [file for file in one["left"] if file.endswith(".tmp")] == [], command
+        assert [file for file in one["left"] if Path(file).name not in MAY_STAY] == [], command
+
+
 @pytest.mark.parametrize("writer", [replacing, replacing_folder])
 @pytest.mark.parametrize(
     "raised",
@@ -79,6 +103,8 @@ def test_an_error_of_the_program_stays(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+MAY_STAY = (".lock", "export.unfinished")
+"""Files that say that a folder holds nothing whole yet."""
 SOURCE = Path(__file__).parents[2] / "src" / "edp"
 WRITERS = {"write_table", "to_parquet", "savemat", "savefig", "imsave", "save_file", "write_image", "to_csv", "savez"}
 IN_MEMORY = {
@@ -89,6 +115,15 @@ IN_MEMORY = {
     "workflows/parity/forms/matlab.py": "into a temporary folder of its own, which is removed",
 }
 """Files that call writers of libraries: where the bytes go."""
+METHODS = {"write_text", "write_bytes"}
+"""Of paths: their errors name no file, where the disk is full."""
+BESIDE = {
+    "storage/writing.py": "within replacing",
+    "storage/archives.py": "unpacks",
+    "cli/doctor.py": "looks at what it wrote",
+    "testing/logs.py": "for tests",
+}
+"""Files that call `METHODS`, and why."""
 
 
 def named(call):
@@ -104,3 +139,14 @@ def test_writers_of_libraries_write_through_the_storage():
                 found.add(str(path.relative_to(SOURCE)).replace(os.sep, "/"))
     assert found <= set(IN_MEMORY), found - set(IN_MEMORY)
     assert set(IN_MEMORY) <= found, set(IN_MEMORY) - found
+
+
+def test_files_are_written_by_the_storage():
+    found = set()
+    for path in SOURCE.rglob("*.py"):
+        calls = [
+            node.func for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)
+        ]
+        if any(isinstance(call, ast.Attribute) and call.attr in METHODS for call in calls):
+            found.add(path.relative_to(SOURCE).as_posix())
+    assert sorted(found ^ BESIDE.keys()) == [], "call edp.storage.write_bytes, or say here why not"

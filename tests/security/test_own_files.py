@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from edp.errors import StorageError
+from edp.report.run.facts import read_history
 from edp.storage import read_json, write_bytes, write_json
 from edp.storage.headers import FILES, check_files, digests_of
+from edp.storage.runs import RunFolder
 from edp.storage.seals import HASH, files_without_seal
 
 SOURCE = Path(__file__).parents[2] / "src" / "edp"
@@ -44,6 +48,7 @@ READERS = {
     "workflows/parity/forms/ros2.py": "answers of a program that was started",
     "workflows/parity/forms/casadi.py": "answers of a program that was started",
     "report/common/interactive.py": "text of a figure of this process",
+    "report/notebook/display.py": "text of a figure of this process",
     "report/run/facts.py": "arrays whose hash scores.json states",
     "report/twin/facts.py": "arrays whose hash free_run.json states",
     "report/transfer/facts.py": "arrays whose hash transfer.json states",
@@ -122,6 +127,33 @@ def test_a_file_without_a_hash_is_read_and_told(tmp_path):
     assert files_without_seal() == []
 
 
+EPOCHS = [{"epoch": 1, "loss": 0.5, "best": True}, {"epoch": 2, "loss": float("nan"), "best": False}]
+
+
+@pytest.fixture
+def history(tmp_path):
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_history(EPOCHS)
+    return tmp_path / "run" / "history.jsonl"
+
+
+def test_every_flipped_bit_of_a_history_is_refused_with_its_line(history):
+    assert str(read_history(history)) == str(tuple(EPOCHS))
+    whole = history.read_bytes()
+    for place in range(len(whole)):
+        history.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        if whole[place : place + 1] == b"\n":
+            assert str(read_history(history)) == str(tuple(EPOCHS))  # another kind of line end
+            continue
+        with pytest.raises(StorageError, match=r"history\.jsonl' line \d was changed"):
+            read_history(history)
+
+
+def test_a_history_of_an_earlier_version_is_read(history):
+    history.write_text("".join(json.dumps(row) + "\n" for row in EPOCHS))
+    assert str(read_history(history)) == str(tuple(EPOCHS))
+
+
 def test_arrays_beside_a_result_are_bound_to_it(tmp_path):
     write_bytes(tmp_path / "arrays.bin", b"12345678")
     content = {FILES: digests_of(tmp_path, "arrays.bin")}
@@ -130,3 +162,70 @@ def test_arrays_beside_a_result_are_bound_to_it(tmp_path):
     with pytest.raises(StorageError, match="changed since it was written with the result beside it; again"):
         check_files(content, tmp_path, "again")
     check_files({}, tmp_path, "again")  # of an earlier version
+
+
+TWIN = ("--set", "twin.kind=arx", "--set", "judge={seconds=2,starts=2,at_s=[1,2]}")
+READ_BY = {
+    "trained/bundle/bundle.json": ("evaluate", "trained"),
+    "trained/footprint.json": ("report", "trained"),
+    "trained/scores.json": ("report", "trained"),
+    "trained/history.jsonl": ("report", "trained"),
+    "trained/provenance.json": ("report", "trained"),
+    "trained/run.json": ("train",),
+    "trained/status.json": ("train",),
+    "twin/twin/twin.json": ("evaluate", "twin"),
+    "twin/free_run.json": ("report", "twin"),
+    "twin/step_response.json": ("report", "twin"),
+    "twin/run.json": ("twin",),
+    "twin/status.json": ("twin",),
+    "store/store.json": ("inspect", "store"),
+    "simulated/data_set.json": ("simulate",),
+}
+"""A command that reads each kind of file again."""
+CHANGED = re.compile("was changed since EDP wrote it|does not match its hash")
+NOT_READ = {
+    "onnx/predictor.json": "for programs without EDP; export.sha256 beside it holds its hash",
+    "twin/history.jsonl": "empty: this twin is solved at once, without epochs",
+}
+"""Files that no command reads again, and why."""
+
+
+def test_every_kind_of_file_that_a_command_leaves_is_refused_once_changed(edp, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    small = import_module("full_disk_commands")
+    logs = small.write_logs(tmp_path / "logs")
+    again = {
+        "train": ("train", logs, *small.SMALL, "--out", tmp_path / "trained"),
+        "twin": ("twin", logs, *TWIN, "--out", tmp_path / "twin"),
+        "simulate": ("simulate", tmp_path / "simulated", "--minutes", 0.1, "--recordings", 1, "--workers", 1),
+    }
+    for command in (
+        *again.values(),
+        ("evaluate", tmp_path / "trained", "--baselines", "persistence"),
+        ("footprint", tmp_path / "trained"),
+        ("store", "build", logs, "--workers", 1, "--out", tmp_path / "store"),
+        ("export", tmp_path / "trained", "--to", "onnx", "--out", tmp_path / "onnx"),
+    ):
+        ended = edp(*command)
+        assert ended.code in (0, 6), ended.said  # 6: a judgement of so small a network
+    files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json*") if path.is_file()}
+    assert sorted(files) == sorted({*READ_BY, *NOT_READ}), "name its reader, or say why nothing reads it"
+    problems = []
+    for name, (verb, *places) in READ_BY.items():
+        file = tmp_path / name
+        whole = file.read_text()
+        first, *rest = whole.splitlines(keepends=True) if file.suffix == ".jsonl" else [whole]
+        content = json.loads(first)
+        same_keys = (tree for tree in changes(content) if tree != content and tree.keys() == content.keys())
+        # Another schema or kind is refused as such, before the hash is looked at.
+        changed = next(
+            tree for tree in same_keys if all(tree.get(key) == content.get(key) for key in ("schema", "kind"))
+        )
+        file.write_text("".join([json.dumps(changed) + "\n", *rest]))
+        ended = edp(verb, *(tmp_path / place for place in places)) if places else edp(*again[verb])
+        if ended.code == 0 or ended.said.count("error: ") != 1 or not CHANGED.search(ended.said):
+            problems.append(f"{name}: {ended.code} {ended.said[-300:]}")
+        elif str(file.parent) not in ended.said:
+            problems.append(f"{name} is not named: {ended.said[-300:]}")
+        file.write_text(whole)
+    assert not problems, "\n".join(problems)

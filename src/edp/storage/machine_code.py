@@ -8,6 +8,7 @@ files keep the cache.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -84,7 +85,22 @@ class Compiler:
         finally:
             # Restored at once: other users of Numba in this process keep their own cache folder.
             config.CACHE_DIR = before
+        _keep_if_possible(fast)
         return fast  # type: ignore[no-any-return]
+
+
+def _keep_if_possible(fast: Any) -> None:
+    """Let a function that Numba compiled run also where its machine code cannot be kept, such as on a full disk."""
+    cache = getattr(fast, "_cache", None)  # absent where NUMBA_DISABLE_JIT leaves the function as it is
+    if cache is None:
+        return
+    save = cache.save_overload
+
+    def save_if_possible(signature: Any, data: Any) -> None:
+        with contextlib.suppress(OSError):
+            save(signature, data)
+
+    cache.save_overload = save_if_possible
 
 
 def files_with(folder: Path, line: str) -> tuple[Path, ...]:

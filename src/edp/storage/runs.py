@@ -22,6 +22,7 @@ from edp.storage.folders import check_kind
 from edp.storage.locks import check_held, held_by, hold
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
 from edp.storage.reading import object_with, read_object
+from edp.storage.seals import sealed_line
 from edp.storage.writing import make_folder, remove_unfinished, write_bytes, write_json
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
@@ -125,9 +126,9 @@ class RunFolder:
         shutil.rmtree(self.path / PARTS, ignore_errors=True)
 
     def write_history(self, rows: list[dict[str, Any]]) -> None:
-        """Write all epochs so far, a JSON line each."""
+        """Write all epochs so far, a line of JSON with its hash each."""
         check_held(self.file(".lock"), self._lock)
-        write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
+        write_bytes(self.file("history.jsonl"), "".join(map(sealed_line, rows)).encode())
 
 
 def unfinished_text(folder: str | Path) -> str:

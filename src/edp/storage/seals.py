@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
 HASH = "blake2b"
 """Key of the hash over the rest of the object."""
+_HASH_OF_LINE = re.compile(rf'(?:, )?"{HASH}": "([0-9a-f]{{32}})"}}\Z')
+"""The hash at the end of a line of JSON."""
 MAX_UNSEALED = 100
 _unsealed: dict[str, None] = {}
 
@@ -61,6 +64,36 @@ def unsealed(content: Any, where: str, error: type[Exception]) -> Any:
             "copy, or give the command that wrote it again"
         )
     return {key: value for key, value in content.items() if key != HASH}
+
+
+def sealed_line(row: Mapping[str, Any]) -> str:
+    """Return an object as a line of JSON that ends with the hash of the text before it; the object may hold NaN."""
+    digest = digest_of_bytes(json.dumps(dict(row)).encode())
+    return json.dumps({**row, HASH: digest}) + "\n"
+
+
+def is_sealed_line(line: str) -> bool:
+    """Tell whether a line of JSON holds a hash."""
+    return f'"{HASH}":' in line
+
+
+def check_sealed_line(line: str, where: str, error: type[Exception]) -> None:
+    """Check the hash of a line that `sealed_line` wrote.
+
+    Args:
+        line: without its end.
+        where: what to call the line in messages.
+        error: kind of error to raise.
+
+    Raises:
+        Exception: `error`; the line has no hash, or its text does not match it.
+    """
+    hash_match = _HASH_OF_LINE.search(line)
+    if hash_match is None or hash_match[1] != digest_of_bytes((line[: hash_match.start()] + "}").encode()):
+        raise error(
+            f"{where} was changed since EDP wrote it: its text does not match its hash ({HASH}); restore the file from "
+            "a copy, or give the command that wrote it again"
+        )
 
 
 def files_without_seal() -> list[str]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edp.errors import ExportError
+from edp.storage import write_bytes
 
 # Products and sums stay apart (`-ffp-contract=off`): equal bits on every processor. No debug paths in the library.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-g0", "-fno-sanitize=all")
@@ -78,7 +79,7 @@ def libraries(sources: Sources, platforms: Sequence[str]) -> dict[int, dict[str,
         folder = Path(temporary)
         for file, text in sources.files.items():
             # Line ends of C sources are those of Unix, whatever the exporting system writes.
-            (folder / file).write_text(text, encoding="utf-8", newline="\n")
+            write_bytes(folder / file, text.encode())
         for platform in map(PLATFORMS.__getitem__, platforms):
             flags = ("-target", platform.target, *FLAGS, *platform.flags, "-shared", "-s")
             library = f"{sources.name}{platform.ending}"

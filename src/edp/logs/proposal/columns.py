@@ -18,6 +18,7 @@ from edp.logs.formats.base import EXPERIMENTS, Column, RawLog, RawSignal
 from edp.logs.formats.csv import NAME_BY_PLACE
 from edp.logs.timebase import Clock, judge
 from edp.signals import Kind, SignalMap
+from edp.storage import write_bytes
 from edp.storage.paths import is_file_at, status_of
 
 TEXT_BYTES = 16_000_000
@@ -154,7 +155,7 @@ def _bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
         raise DataError(f"'{path}': no row ends within the first {most:,} bytes; it is no table")
     with tempfile.TemporaryDirectory(prefix="edp_") as folder:
         part = Path(folder) / f"beginning{path.suffix.lower()}"
-        part.write_bytes(head[:end])
+        write_bytes(part, head[:end])
         yield part, f"the first {end / 1e6:.0f} of {size / 1e6:,.0f} MB"
 
 

@@ -23,6 +23,7 @@ from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.runs import unfinished_text
+from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
 
 NETWORK = "network"
 TRUTH = "truth"
@@ -188,23 +189,30 @@ def read_settings(path: Path) -> str:
 
 
 def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
-    """Epochs of a history file; a last line that a kill cut off is left out.
+    """Return the epochs of a history file; a last line that a kill cut off is left out.
+
+    Where one line has a hash, each must have it; files of earlier versions have none.
 
     Raises:
-        StorageError: another line than the last is not a JSON object.
+        StorageError: a line was changed, or is not a JSON object.
     """
-    lines = [(row, line) for row, line in enumerate(read_text(path, JSON_BYTES).splitlines(), 1) if line.strip()]
+    text = read_text(path, JSON_BYTES)
+    lines = [(row, line) for row, line in enumerate(text.splitlines(), 1) if line.strip()]
+    sealed = any(is_sealed_line(line) for _, line in lines)
     epochs: list[Mapping[str, Any]] = []
-    for line_number, (row, line) in enumerate(lines, 1):
+    for row, line in lines:
+        where = f"'{path}' line {row}"
+        if sealed:
+            check_sealed_line(line, where, StorageError)
         try:
-            epoch = parse_json(line, f"'{path}' line {row}", finite=False)
+            epoch = parse_json(line, where, finite=False)
         except StorageError:
-            if line_number == len(lines):
+            if row == lines[-1][0] and not text.endswith("\n"):
                 break
             raise
         if not isinstance(epoch, dict):
-            raise StorageError(f"'{path}' line {row} holds {line[:40]!r}; each line must be one JSON object")
-        epochs.append(epoch)
+            raise StorageError(f"{where} holds {line[:40]!r}; each line must be one JSON object")
+        epochs.append({name: value for name, value in epoch.items() if name != HASH})
     return tuple(epochs)
 
 

@@ -213,7 +213,7 @@ def _perform_there(job: Job, threads: int, start: _StateFile | None) -> tuple[by
         where = dict(job.where)
         if start is not None:
             file = Path(folder, start.name)
-            file.write_bytes(start.content)
+            write_bytes(file, start.content)
             where[START] = str(file)
         pool.submit(replace(job, folder=folder, where=where))
         try:

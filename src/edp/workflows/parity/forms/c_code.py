@@ -16,6 +16,7 @@ from edp.export.golden import Rows, stream
 from edp.ir.w8a16 import calibrate
 from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import IntegerTwinPlant, TwinPlant
+from edp.storage import write_bytes
 from edp.storage.paths import entries_of
 from edp.training.bundle import Bundle
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
@@ -64,7 +65,7 @@ def streamed(bundle: Bundle, inputs: Rows, folder: Path) -> tuple[Rows, float]:
     compiler = need("cc", "gcc libc6-dev")
     CTarget().write(bundle, NAME, folder)
     filled = DRIVER.substitute(name=NAME, NAME=NAME.upper(), ticks=len(inputs), rounds=ROUNDS)
-    (folder / "driver.c").write_text(filled)
+    write_bytes(folder / "driver.c", filled.encode())
     runtime = sorted(path.name for path in entries_of(folder, "edp_*.c"))
     called([compiler, *FLAGS, "driver.c", f"{NAME}.c", *runtime, "-lm", "-o", "driver"], folder)
     output = called([folder / "driver"], folder, np.ascontiguousarray(inputs, dtype=np.float32).tobytes())

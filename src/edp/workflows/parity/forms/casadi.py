@@ -14,6 +14,7 @@ import numpy as np
 from edp.errors import ExportError
 from edp.export.casadi import CasadiTarget
 from edp.export.description import has_equations
+from edp.storage import write_bytes
 from edp.workflows.parity.base import FORMS, NAME, Missing, ParityCase, Ran, called, need
 
 PROGRAM = '''
@@ -42,7 +43,7 @@ def _run(case: ParityCase, folder: Path, how: str, compiler: str = "") -> Sequen
     if importlib.util.find_spec("casadi") is None:
         raise Missing("needs the Python package casadi")
     CasadiTarget().write(case.bundle, NAME, folder)
-    (folder / "run.py").write_text(PROGRAM)
+    write_bytes(folder / "run.py", PROGRAM.encode())
     np.save(folder / "inputs.npy", case.inputs)
     # Isolated (`-I`): the exported files must run without EDP on the path.
     output = called([sys.executable, "-I", "run.py", folder, how, "inputs.npy", "found.npy", compiler], folder)

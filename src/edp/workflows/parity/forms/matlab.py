@@ -16,6 +16,7 @@ from edp.export.description import float_graph
 from edp.export.escape import matlab_string
 from edp.export.golden import Rows
 from edp.export.simulink import SimulinkTarget
+from edp.storage import write_bytes
 from edp.storage.paths import entries_of
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
 from edp.workflows.parity.forms.c_code import FLAGS
@@ -72,7 +73,7 @@ def _octave(case: ParityCase, folder: Path, run: str, timed: str) -> tuple[Rows,
     SimulinkTarget(window=False).write(case.bundle, NAME, folder)
     scipy.io.savemat(folder / "rows.mat", {"rows": case.inputs})
     text = PROGRAM.substitute(folder=matlab_string(folder), run=run, timed=timed, rounds=ROUNDS)
-    (folder / "parity_program.m").write_text(text)
+    write_bytes(folder / "parity_program.m", text.encode())
     # Without the user's start-up file, which may change paths and number formats.
     called([program, "--norc", "--quiet", "parity_program.m"], folder)
     octave_file = scipy.io.loadmat(folder / "found.mat")
@@ -122,7 +123,7 @@ class CCaller:
         sizes_of = {"ticks": len(case.inputs), "inputs": graph.inputs, "numbers": sum(sizes), "rounds": ROUNDS}
         results = ", ".join(f"&out[tick][{offset}]" for offset in places[:-1])
         text = DRIVER.substitute(sizes_of, name=NAME, NAME=NAME.upper(), results=results)
-        (folder / "driver.c").write_text(text)
+        write_bytes(folder / "driver.c", text.encode())
         sources = ["driver.c", f"{NAME}_call.c", *entries_of(folder / "core", "*.c")]
         called([compiler, *FLAGS, "-I", "core", *sources, "-lm", "-o", "driver"], folder)
         output = called([folder / "driver"], folder, np.ascontiguousarray(case.inputs, dtype=np.float32).tobytes())

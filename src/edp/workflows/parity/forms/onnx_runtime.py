@@ -13,6 +13,7 @@ import numpy as np
 
 from edp.errors import ExportError
 from edp.export.onnx import OnnxTarget
+from edp.storage import write_bytes
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, Missing, ParityCase, Ran, called
 
 # Forty windows: PyTorch computes each from reset, fifty times the work of a stream.
@@ -51,7 +52,7 @@ def _runs(case: ParityCase, folder: Path, kind: str, inputs: np.ndarray, rest: d
         if importlib.util.find_spec(package) is None:
             raise Missing(f"needs the Python package {package}")
     OnnxTarget().write(case.bundle, NAME, folder)
-    (folder / "run.py").write_text(PROGRAM)
+    write_bytes(folder / "run.py", PROGRAM.encode())
     np.save(folder / "inputs.npy", inputs)
     runs = []
     for python in (sys.executable, *case.interpreters):

@@ -12,6 +12,7 @@ import numpy as np
 
 from edp.export.escape import python_literal
 from edp.export.ros2 import Ros2Target
+from edp.storage import write_bytes
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
 
 PROGRAM = '''
@@ -42,7 +43,7 @@ class Ros2Core:
         """See `edp.workflows.parity.base.Form`."""
         compiler = need("cc", "gcc libc6-dev")
         Ros2Target().write(case.bundle, NAME, folder)
-        (folder / "run.py").write_text(PROGRAM)
+        write_bytes(folder / "run.py", PROGRAM.encode())
         called([sys.executable, "-c", f"from {NAME}_ros.core import build; build({python_literal(compiler)})"], folder)
         output = json.loads(
             called([sys.executable, "run.py", ROUNDS], folder, json.dumps(case.inputs.tolist()).encode())
