@@ -69,9 +69,12 @@ SHOWN_CAUSE = 300
 
 
 def brief(error: BaseException | str, most: int = SHOWN_CAUSE) -> str:
-    """What a library says about a file, on one line of bounded length; its kind where it says nothing."""
+    """Return the message of an error on one line of bounded length; its type where there is no message.
+
+    The end of a long message is kept: the path of a file often comes first, and the reason last.
+    """
     message = " ".join(str(error).split()) or type(error).__name__
-    return message if len(message) <= most else f"{message[:most]}..."
+    return message if len(message) <= most else f"{message[: most // 3]} ... {message[-2 * most // 3 :]}"
 
 
 def count_of(count: float | str | None, noun: str) -> str:

@@ -21,6 +21,7 @@ DIFFERENCES = {
     "evaluation/step_response.py": "changes after a step of a command",
     "evaluation/ruler.py": "errors, and values that only differences are taken of",
     "evaluation/free_run_parts.py": "errors",
+    "monitor/detectable.py": "shifts of a channel",
     "evaluation/context.py": "errors",
     "evaluation/channel_importance.py": "errors",
     "training/bagging/perceptrons.py": "errors",

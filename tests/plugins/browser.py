@@ -49,6 +49,7 @@ class Browser:
         script = f'exec "$0" "$@" 3<&{from_us} 4>&{to_us}'
         self._process = subprocess.Popen(
             ["bash", "-c", script, executable, *FLAGS, f"--user-data-dir={folder}", "about:blank"],
+            env=os.environ | {"TMPDIR": str(folder)},
             pass_fds=(from_us, to_us),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -312,7 +313,8 @@ def chromium() -> str | None:
 @contextmanager
 def opened(executable: str) -> Iterator[Browser]:
     """A headless Chromium with a profile of its own."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+    # Chromium makes a socket in its profile, whose path has 107 bytes at most.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True, dir="/tmp") as profile:
         one = Browser(executable, Path(profile))
         try:
             yield one

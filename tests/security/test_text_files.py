@@ -136,7 +136,7 @@ def test_a_hostile_settings_file_is_one_message(tmp_path, kind, attack):
     file = written(tmp_path / name, TOML[attack])
     with pytest.raises(EdpError, match=r"a\.toml.*(is not valid TOML|cannot be read)") as caught:
         read(file)
-    assert len(str(caught.value)) < 500
+    assert len(str(caught.value).replace(str(tmp_path), "")) < 500
 
 
 @pytest.mark.parametrize("attack", JSON)
@@ -148,7 +148,7 @@ def test_a_hostile_json_file_is_one_message(tmp_path, kind, attack):
         written(tmp_path / "config.toml", "")
     with pytest.raises(EdpError, match=r"json.*(is not valid JSON|cannot be read)") as caught:
         read(file)
-    assert len(str(caught.value)) < 500
+    assert len(str(caught.value).replace(str(tmp_path), "")) < 500
 
 
 @pytest.mark.parametrize("content", ["null", "[]", "7", '"text"'])

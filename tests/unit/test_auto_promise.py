@@ -88,8 +88,8 @@ def test_what_became_of_a_promise_is_said(tmp_path):
     assert promise_line(read_choice(tmp_path)) == ""
     note_test_result(tmp_path, scores(1.1), scores(2.0)["models"]["network"])
     assert promise_line(read_choice(tmp_path)) == (
-        "The promised error held on 1 of 1 outputs and horizons (within its 90 % interval); relative to the linear "
-        "model's it was promised as 0.50 and is 0.55."
+        "The promised error held on 1 of 1 pair of output and horizon (within its 90 % interval); relative to the "
+        "linear model's it was promised as 0.50 and is 0.55."
     )
     note_test_result(tmp_path, scores(1.3), None)
     line = promise_line(read_choice(tmp_path))

@@ -20,7 +20,7 @@ QUICK = ("statistics", "store", "onnx", "recordings")
 """Pages whose blocks take seconds; those of the others run with the slow tests."""
 ELSEWHERE = ("README", "python")
 """Pages that tests/examples/test_python_page.py runs."""
-PROGRAMS = ("cmake", "export", "for", "pip", "ray", "source")
+PROGRAMS = (".", "cmake", "export", "for", "pip", "ray", "source")
 """Programs of others, and words of the shell, that a page may use; what they make of the rest is theirs."""
 LANGUAGES = {"python", "sh", "toml", "json", "c", "matlab", "text", ""}
 _NOT_RUN = re.compile(r"<!-- not run: (.{20,}) -->\s*$")

@@ -12,6 +12,7 @@ from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import Channel, Kind
+from edp.storage import read_json
 from edp.workflows.feature_selection.trials import (
     PairedDifference,
     TrialSpec,
@@ -118,7 +119,7 @@ def test_what_could_not_be_tried_is_told(trials):
 
 
 def test_trials_are_kept(trials, source, experiment, folder):
-    assert json.loads((folder / "trials.json").read_text()) == json.loads(json.dumps(trials.to_json()))
+    assert read_json(folder / "trials.json") == json.loads(json.dumps(trials.to_json()))
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.jsonl")}
     assert len(before) == 8
     again = try_feature_sets(source, experiment, SETS, folder, TrialSpec(random=1, seeds=(0, 1), barred=("u", "p")))

@@ -63,8 +63,8 @@ def test_a_log_is_played_to_its_end_saved_and_recorded(edp, log, tmp_path):
         (("nowhere", "--sim", "M22"), "nowhere"),
         (("--loop", "grade", "--plant", "nowhere"), "nowhere"),
         (("--loop", "grade", "--plant", "some.fmu"), "there is no file"),
-        (("--sim", "M22", "--plant", "runs/twin"), "--plant is of --loop"),
-        (("--loop", "grade", "--excitation", "dig"), "--excitation is of --sim"),
+        (("--sim", "M22", "--plant", "runs/twin"), "--plant does not apply to --sim; it belongs to --loop"),
+        (("--loop", "grade", "--excitation", "dig"), "--excitation does not apply to --loop; it belongs to --sim"),
         (("--sim", "M22", "--monitor", "nowhere"), "nowhere"),
     ],
 )

@@ -295,7 +295,7 @@ def test_the_page_of_a_twin_and_that_of_one_run(edp, logs, trained, tmp_path):
     page = file.read_text()
     for text in (
         "free runs",
-        "trokes off by",
+        "less error than the twin",
         "By recording, the worst first",
         "at rest (idling)",
         "actuators_",

@@ -15,6 +15,7 @@ from edp.errors import BundleError, ConfigError, DataError, StorageError
 from edp.networks.decomposition import decompose
 from edp.networks.predictor import build_model
 from edp.report import build_report
+from edp.report.common.wording import number
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.adaptation import adapt, loss_with
@@ -89,7 +90,7 @@ def test_the_report_shows_the_machines_that_were_never_seen(made, tmp_path):
         shown = re.search(rf"<td>{name}</td><td>([\d.]+)</td>", page)
         assert float(shown[1]) == pytest.approx(mae, rel=5e-3), name
     for row in found["unseen"]["contexts"]:
-        assert f"<td>{row['mae']:.3f}</td>" in page
+        assert f"<td>{number(row['mae'])}</td>" in page
     (copied / "foundation.json").write_text('{"label": "Joint"}')
     with pytest.raises(StorageError, match="edp pretrain"):
         build_report(copied)

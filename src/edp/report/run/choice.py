@@ -241,7 +241,8 @@ def promise_line(content: Mapping[str, Any]) -> str:
     if not interval or not tested:
         return ""
     inside, count = _within(tested, interval)
-    line = f"The promised error held on {inside} of {count_of(count, 'output')} and horizons (within its 90 % interval)"
+    cases = count_of(count, "pair")
+    line = f"The promised error held on {inside} of {cases} of output and horizon (within its 90 % interval)"
     pairs = [
         (promised, skill["test"][k][name])
         for k, row in skill.get("promise", {}).items()
