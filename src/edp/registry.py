@@ -28,7 +28,7 @@ _MAX_ORIGINS = 100
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a part of a plug-in was registered.
+    """Origin of a plug-in part: module, package and version.
 
     Attributes:
         what: what the registry holds, for example ``block``.
@@ -132,7 +132,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 class _Plugins:
-    """What is known of plug-ins in this process."""
+    """Plug-ins that this process has loaded."""
 
     def __init__(self) -> None:
         self.registries: weakref.WeakSet[Registry[Any]] = weakref.WeakSet()
@@ -171,7 +171,7 @@ class _Plugins:
             self.failures.append(f"{where} cannot be loaded and is left out: {kind}{brief(error)}")
 
     def origin(self, registry: Registry[Any], part: str) -> Origin | None:
-        """Return where a part comes from; None for a part of EDP."""
+        """Return the origin of a part; None for a part of EDP."""
         module = registry.module_of(part)
         if module is None:
             return None
@@ -182,7 +182,7 @@ class _Plugins:
         return Origin(registry.what, part, module, *self.packages[top])
 
     def hint(self, what: str, part: str, typo: bool) -> str:
-        """Return what a message on an unknown part says about plug-ins; nothing where it is a slip of the pen."""
+        """Return the plug-in advice for an unknown part; an empty text if a known name is close."""
         origin = self.recorded.get((what, part))
         if origin is not None:
             return f"; {origin.advice()}"

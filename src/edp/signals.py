@@ -178,7 +178,7 @@ letters are not among them: ``p_A`` is a chamber, ``x_m`` may be a measured one.
 
 
 def display_offset(unit: str) -> float:
-    """Return what is added to a value (SI value * factor) of a unit that pages show: -273.15 for degrees Celsius."""
+    """Return the offset of a display unit, added to SI value * factor: -273.15 for degrees Celsius."""
     of_logs = UNITS.get(unit)
     return -of_logs.offset / of_logs.factor if of_logs is not None and of_logs.offset else 0.0
 

@@ -207,10 +207,10 @@ class Words(ProgressColumn):
 
 
 class BoundedProgress(Progress):
-    """Progress display whose tasks never exceed their total, whatever is reported."""
+    """Progress display that bounds each task by its total."""
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
-        """Update a task; what is done is cut at the total."""
+        """Update a task; completed work is bounded by the total."""
         task = self._tasks[task_id]
         total = changes["total"] if changes.get("total") is not None else task.total
         advance = changes.pop("advance", None)
@@ -245,7 +245,7 @@ def left_text(seconds: float) -> str:
 
 
 def count_text(done: int, planned: int, sign: str = " of ") -> str:
-    """Return how many of a plan are done; a count that exceeds its plan says so.
+    """Return the progress of a plan as text, such as "3 of 8" or "9, more than the 8 planned".
 
     Args:
         done: number done, or of the one at work.
@@ -417,7 +417,7 @@ def refuse_empty(words: Sequence[str]) -> None:
 
 
 def _say_system(error: OSError) -> int:
-    """Say what the system refused, where no part of EDP has said it better, and return the exit code."""
+    """Print the message of an operating-system error and return the exit code."""
     if isinstance(error, BrokenPipeError):
         # As of a program that SIGPIPE ends: who reads the output, such as `head`, wants no more of it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Rules for options of all commands: bounds of numbers, and options that apply only beside another one."""
+"""Validation of command-line options: bounds of numeric options and dependencies between options."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ EXCLUDED: Mapping[tuple[str, str], tuple[str, ...]] = {
 
 
 def within(bound: Bound) -> Callable[[typer.CallbackParam, Any], Any]:
-    """Return the callback of an option that refuses numbers outside a bound; entries of a list one by one.
+    """Return a Typer callback that raises ConfigError for numbers outside a bound, also within lists.
 
     Raises:
         ConfigError: when called, with the option, the value and the bound.
@@ -62,7 +62,7 @@ def within(bound: Bound) -> Callable[[typer.CallbackParam, Any], Any]:
 
 
 def check_belonging(context: typer.Context) -> None:
-    """Refuse options of a command that have no effect without, or beside, another option.
+    """Raise ConfigError for options that have no effect with the other options given.
 
     Args:
         context: the parsed command line of one command.
@@ -101,6 +101,6 @@ def _word(parameter: Any) -> str:
 
 
 def _is_given(context: typer.Context, name: Any) -> bool:
-    """Whether a parameter stands on the command line with a value that is not its default."""
+    """Return whether the command line sets a parameter to a value other than its default."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE" and bool(context.params.get(name))

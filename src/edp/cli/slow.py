@@ -1,4 +1,4 @@
-"""What the command line says about the reading of logs: what takes long, and a missing layer of the sandbox."""
+"""Command-line messages about reading logs: slow logs and missing sandbox layers."""
 
 from __future__ import annotations
 

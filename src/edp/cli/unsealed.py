@@ -7,7 +7,7 @@ from edp.storage.seals import files_without_seal
 
 
 def tell_of_unsealed_files() -> None:
-    """Say once which files of EDP were read that have no hash, so that nothing shows whether they were changed."""
+    """Print one note that lists the files without a hash that this command has read."""
     files = files_without_seal()
     if files:
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""

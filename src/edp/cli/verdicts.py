@@ -1,4 +1,4 @@
-"""How a command that judges a model begins and ends: first line, JSON and exit code of one verdict."""
+"""First line, JSON and exit code of commands that compare a model with a reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def show_verdict(verdict: ErrorVerdict | None) -> None:
-    """Print the first line of a command that judges."""
+    """Print the verdict as the first line of a command."""
     if verdict is not None:
         out.print(verdict.sentence(), style="bold red" if verdict.exit_code else "bold")
 

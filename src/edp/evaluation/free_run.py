@@ -169,7 +169,7 @@ def free_runs(twin: Twin, series: Sequence[Series], seconds: float, starts: int)
 def check_runs(
     channels: TwinChannels, scales: TwinScales, prefix: int, series: Sequence[Series], seconds: float, starts: int
 ) -> None:
-    """Refuse stretches in which `free_runs` would find no start, before the twin is trained.
+    """Raise an error if `free_runs` would find no start in these recordings, before the twin is trained.
 
     Args:
         channels: of the twin to be.
@@ -186,7 +186,7 @@ def check_runs(
 
 
 def _run_ticks(channels: TwinChannels, prefix: int, series: Sequence[Series], seconds: float) -> int:
-    """Measured ticks of a free run with its prefix; refuse where no stretch is long enough."""
+    """Return the length of a free run with its prefix in samples; raise DataError if every recording is shorter."""
     rate, longest = channels.rate_hz, max((part.samples for part in series), default=0)
     ticks = min(round(seconds * rate), longest - prefix - 1)
     if ticks < 1:

@@ -43,7 +43,7 @@ FEWEST = 3
 
 
 class ErrorOutcome(StrEnum):
-    """What a comparison shows."""
+    """Outcome of a comparison with a reference."""
 
     BETTER = "better"
     OPEN = "not distinguishable"
@@ -51,7 +51,7 @@ class ErrorOutcome(StrEnum):
 
 
 def outcome_of(change: float, high: float | None) -> ErrorOutcome:
-    """Return what a relative change of the error against a reference shows.
+    """Return the outcome for a relative change of the error and its interval.
 
     Args:
         change: error over that of the reference, less one.
@@ -89,21 +89,21 @@ class ErrorVerdict:
 
     @property
     def change(self) -> float:
-        """Error of the model over that of the reference, less one."""
+        """Relative change of the error against the reference."""
         return 1.0 / (1.0 - self.less) - 1.0 if self.less < 1.0 else math.inf
 
     @property
     def outcome(self) -> ErrorOutcome:
-        """What the comparison shows."""
+        """Outcome of this comparison."""
         return outcome_of(self.change, None if self.interval is None else self.interval[1])
 
     @property
     def exit_code(self) -> int:
-        """With which a command ends that judged this."""
+        """Exit code of a command with this verdict."""
         return BEATEN if self.outcome is ErrorOutcome.WORSE else 0
 
     def sentence(self) -> str:
-        """Return the first line of what a person reads, in the terminal and on the page."""
+        """Return the sentence that opens the terminal output and the page."""
         if self.outcome is ErrorOutcome.WORSE:
             where = f" (on {', '.join(self.outputs)})" if self.outputs else ""
             return (
@@ -259,7 +259,7 @@ def twin_beaten_by(models: Mapping[str, Any]) -> ErrorVerdict | None:
 
 
 def twin_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
-    """Return the verdict on a twin against the floor with the least error on free runs; None without a floor.
+    """Return the comparison of a twin with its best baseline in free-run simulation; None without a baseline.
 
     Compared is the geometric mean, over actuators, of the ratios of the velocities' errors and of the strokes' at each
     time: a network that only follows for a second, or drifts for a minute, is seen by both.

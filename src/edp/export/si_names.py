@@ -69,7 +69,7 @@ def _si_name(name: str, kind: Kind) -> str:
 
 
 def _unit_at_end(name: str) -> tuple[str, str, str] | None:
-    """Return what is before a unit that ends a name, what parts the two, and the unit; None without a unit."""
+    """Split a name into stem, separator and trailing unit; return None for a name without a unit."""
     for tail in sorted(UNIT_TAILS, key=len, reverse=True):
         if name.endswith("_" + tail) and len(name) > len(tail) + 1:
             return name[: -len(tail) - 1], "_", UNIT_TAILS[tail]

@@ -15,7 +15,7 @@ MAX_HOST = 253
 
 @dataclass(frozen=True)
 class BindAddress:
-    """An address of this computer to listen on.
+    """Network address that a server of this computer binds.
 
     Attributes:
         host: as the user gave it.
@@ -29,7 +29,7 @@ class BindAddress:
 
     @property
     def is_everywhere(self) -> bool:
-        """Whether the address stands for all network interfaces of this computer."""
+        """Whether the address covers all network interfaces of this computer."""
         return ipaddress.ip_address(self.numeric).is_unspecified
 
     @property
@@ -43,7 +43,7 @@ class BindAddress:
 
 
 def resolve_bind(host: str, option: str) -> BindAddress:
-    """Return the address that a host stands for.
+    """Resolve a host name to an address of this computer.
 
     Args:
         host: IP address or name.

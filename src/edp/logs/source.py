@@ -109,7 +109,7 @@ class DataSource:
 
     @property
     def label(self) -> str:
-        """Where the recordings come from, for results and messages."""
+        """Description of the source for results and messages."""
         return str(self.path) if not self.more else f"{self.path} and {len(self.more)} more"
 
     @property

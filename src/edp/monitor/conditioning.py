@@ -88,7 +88,7 @@ class Conditioning:
 
 
 def check_blocks(blocks: int, points: int) -> None:
-    """Refuse fewer blocks than an operating point of so many numbers needs.
+    """Raise DataError if there are fewer blocks than the operating point has parameters.
 
     Raises:
         DataError: too few blocks.

@@ -40,7 +40,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True)
 class _Injection:
-    """How a change is injected.
+    """Type of an injected change.
 
     Attributes:
         factors: sizes that are tried: standard deviations of a shift, shares of a scale, seconds of a delay.
@@ -118,7 +118,7 @@ class FoundSize:
 
 @dataclass(frozen=True)
 class FoundSizes:
-    """What was measured, and whether the effort ended before all was.
+    """Detectable changes, and whether the trials ended early.
 
     Attributes:
         sizes: a row per change and channel, shifts first.
@@ -133,7 +133,7 @@ class FoundSizes:
     allowed_s: float
 
     def effort(self) -> dict[str, float]:
-        """Return what the provenance of a monitor keeps of the effort, for `effort_line`."""
+        """Return the effort as a dictionary for the provenance of a monitor."""
         return {
             "measured": len(self.sizes),
             "planned": self.planned,
@@ -143,7 +143,7 @@ class FoundSizes:
 
 
 class _Effort:
-    """Processor time of the trials against what they may take."""
+    """Processor-time budget of the trials."""
 
     def __init__(self, allowed_s: float) -> None:
         self.allowed_s, self._began = allowed_s, time.process_time()
@@ -160,7 +160,7 @@ class _Effort:
 def measure_found_sizes(
     monitor: Monitor, segments: Sequence[Recording], minutes: float, fit_s: float, note: Callable[[str], None]
 ) -> FoundSizes:
-    """Inject changes into healthy segments that set no threshold, and return what is found.
+    """Inject changes into held-out healthy segments and return the smallest changes that are detected.
 
     A change counts as found where the monitor raises an alarm after the onset that it does not raise on the same
     segment unchanged. Sizes are searched by bisection. The trials end once they took `EFFORT_SHARE` of the processor
@@ -278,7 +278,7 @@ def found_sizes(provenance: Mapping[str, Any]) -> list[FoundSize]:
 
 
 def promise_lines(sizes: Sequence[FoundSize]) -> list[str]:
-    """Return sentences on what a monitor finds, the best and the worst channels first."""
+    """Return sentences about the detectable changes, with the best and the worst channels first."""
     if not sizes:
         return ["what it finds was not measured: no healthy segment outside of the limits is free of alarms"]
     minutes = f"with {sizes[0].minutes:.3g} healthy minutes"
@@ -290,7 +290,7 @@ def promise_lines(sizes: Sequence[FoundSize]) -> list[str]:
 
 
 def effort_line(provenance: Mapping[str, Any]) -> str:
-    """Return what was not measured because the trials would have taken too long; empty where all was.
+    """Return a sentence about trials left out for lack of time; an empty text if all were run.
 
     Raises:
         StorageError: the entry is damaged.
@@ -350,13 +350,13 @@ def healthy_range(fitted: FittedChain) -> dict[str, Any]:
 
 
 def _means(rows: Any) -> Any:
-    """Mean of each column over its finite values; zero for none."""
+    """Return the mean of the finite values of each column; zero for a column without finite values."""
     there = np.isfinite(rows)
     return np.where(there, rows, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
 
 
 def outside_line(monitor: Monitor, rows: Any) -> str:
-    """Return which residual lies outside of its healthy range over a recording; empty where none does.
+    """Return the name of a residual outside its healthy range; an empty text if all are inside.
 
     Args:
         monitor: that watched.

@@ -193,7 +193,7 @@ def _settle_blocks(spec: ChainSpec, sessions: Sequence[Recording], block: int) -
 
 
 def _left_out(fold: int, sessions: int, folds: int) -> range:
-    """Places of the sessions that a fold is not fitted to."""
+    """Indices of the sessions that the fold leaves out."""
     return range(0) if fold == NO_FOLD else range(fold, sessions, folds)
 
 

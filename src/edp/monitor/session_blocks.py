@@ -71,7 +71,7 @@ def block_ticks(block_s: float, sessions: Sequence[Recording]) -> int:
 
 
 def operating_numbers(channels: Sequence[Channel], sessions: Sequence[Recording], block: int) -> int:
-    """Return how many numbers an operating point of these sessions has."""
+    """Return the dimension of the operating point of these sessions."""
     names = [channel.name for channel in channels]
     rows = np.concatenate([rows_of(session, names) for session in _scaling(sessions)]).astype(np.float64)
     return 1 + sum(len(places) for places in _operating_channels(channels, rows, block))

@@ -120,7 +120,7 @@ def check_rows(spec: WatchSpec, lengths: Sequence[int], blocks_per_s: float) -> 
 
 
 def _averages(length: int, blocks: int) -> int:
-    """Return how many means `_averaged` makes of so many rows."""
+    """Return the number of averages that `_averaged` computes from a number of rows."""
     if blocks == 1 or length <= 0:
         return max(length, 0)
     return max(0, length - blocks) // max(1, blocks // 2) + 1

@@ -46,7 +46,7 @@ _NO_NEW_PRIVILEGES = 38
 
 @dataclass
 class _State:
-    """What a reader knows of the process that opens files for it; None where there is none."""
+    """Process that opens files for this reader; None without one."""
 
     channel: socket.socket | None = None
 
@@ -55,7 +55,7 @@ _state = _State()
 
 
 def divide(pipes: Sequence[int]) -> None:
-    """Divide this process where the kernel has no Landlock and lets another process open files; else do nothing.
+    """Split this process into a reader and a file opener if Landlock is missing and the kernel supports it.
 
     Returns in the child only. Called in a process with a single thread.
 
@@ -120,7 +120,7 @@ def restrict(readable: Iterable[Path]) -> None:
 
 
 def _listen() -> int:
-    """Return the handle on which `open` and `openat` of this process are announced from now on."""
+    """Return the handle that announces every later `open` and `openat` of this process."""
     machine = platform.machine()
     program = [(0x20, 0, 0, 0), (0x15, 2, 0, _OPEN[machine] & 0xFFFFFFFF), (0x15, 1, 0, _OPENAT[machine])]
     program += [(0x06, 0, 0, _ALLOW), (0x06, 0, 0, _ASK)]

@@ -1,4 +1,4 @@
-"""Layers of the sandbox: what each one stops, where it exists, and what happens where one is missing.
+"""Sandbox layers: their purpose, the systems that have them, and the reaction to a missing layer.
 
 The reader states its layers before it opens the log, so what it says cannot come from a hostile file. A missing layer
 is announced once in each process. With the environment variable `EDP_SANDBOX` set to ``require``, or after
@@ -63,7 +63,7 @@ class SandboxWarning(UserWarning):
 
 @dataclass
 class _State:
-    """What this process knows and requires.
+    """State of the layers in this process.
 
     Attributes:
         required: logs are refused where a layer is missing.
@@ -92,7 +92,7 @@ def announce_by(announce: Callable[[str], None] | None) -> None:
 
 
 def seen_layers() -> Mapping[str, str] | None:
-    """Return why each layer is missing (empty where it holds), as the last reader said; None before the first log."""
+    """Return the reason for each missing layer (empty for a layer in force); None before the first log."""
     return _state.seen
 
 
@@ -112,7 +112,7 @@ def are_layers_required() -> bool:
 
 
 def note_layers(path: Path, stated: object) -> None:
-    """Take note of what a reader says about its layers, and announce what is missing.
+    """Record the layers that a reader reports, and warn of missing ones.
 
     Args:
         path: the log.
@@ -146,7 +146,7 @@ def note_layers(path: Path, stated: object) -> None:
 
 
 def missing_text(missing: list[SandboxLayer]) -> str:
-    """Return which layers are missing, why, and what they would stop."""
+    """Return a sentence about the missing layers, the reasons, and their purpose."""
     seen = _state.seen or {}
     parts = [f"the layer '{layer.name}' of the sandbox is missing ({seen[layer.name]})" for layer in missing]
     system = f"{platform.system()} {platform.release()}"

@@ -77,7 +77,7 @@ class Bound:
         return f"{kind}{self.low:,.12g} {first} {name} {second} {self.high:,.12g}"
 
     def note(self, value: Any) -> str:
-        """Return what a message adds for a number that is above zero and counts as zero; else an empty text."""
+        """Return the explanation for a positive number that counts as zero; otherwise an empty text."""
         entries = value if isinstance(value, tuple | list) else (value,)
         tiny = any(isinstance(entry, Real) and 0.0 < entry < LEAST_POSITIVE for entry in entries)  # type: ignore[operator]
         return f" (numbers below {LEAST_POSITIVE:g} count as zero)" if self.above and self.low == 0.0 and tiny else ""

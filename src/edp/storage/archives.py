@@ -1,4 +1,4 @@
-"""ZIP archives of strangers: nothing unpacks to more than it announces, and no archive is listed beyond its bounds.
+"""Reader of untrusted ZIP archives: bounds the number of entries and the size of the unpacked data.
 
 All of EDP reads and writes ZIP archives here. `zipfile` reads a directory of any length, unpacks by methods that take
 any amount of memory, and lets entries share their bytes.
@@ -43,7 +43,7 @@ def printable(text: str) -> str:
 
 @dataclass(frozen=True)
 class ArchiveLimits:
-    """What an archive may hold.
+    """Bounds of an archive.
 
     Attributes:
         file_bytes: size of the archive itself.
@@ -78,7 +78,7 @@ class ArchiveEntry:
 
 
 class _Damaged(Exception):
-    """The archive is not one, or not a sound one; the text says why."""
+    """Error in an archive: not a ZIP file, damaged, or outside its bounds."""
 
 
 class ZipReader:
@@ -300,7 +300,7 @@ def _opened(path: Path) -> IO[bytes]:
 
 
 def _wide(extra: bytes, size: int, packed: int, at: int) -> tuple[int, int, int]:
-    """Return sizes and place of an entry, from its ZIP64 field where they stand there."""
+    """Return sizes and offset of an entry, taken from its ZIP64 field if present."""
     from_field = [size == _FULL32, packed == _FULL32, at == _FULL32]
     if not any(from_field):
         return size, packed, at

@@ -1,4 +1,4 @@
-"""What a folder of EDP is, so that no command writes into a folder of another kind."""
+"""Kinds of EDP folders, and the check before a command writes into a folder."""
 
 from __future__ import annotations
 

@@ -27,12 +27,12 @@ def read_header(file: str | Path, keys: Iterable[str] = ()) -> dict[str, Any]:
 
 
 def digests_of(folder: str | Path, *names: str) -> dict[str, str]:
-    """Return what a JSON file states under `FILES` of the files beside it: the hash of each, by name."""
+    """Return the hashes of accompanying files, by name, for the key `FILES` of a JSON file."""
     return {name: digest_of_bytes(read_bytes(Path(folder, name), ARRAYS_BYTES)) for name in names}
 
 
 def check_files(content: Mapping[str, Any], folder: str | Path, advice: str) -> None:
-    """Refuse files beside a JSON file that are not the ones it was written with.
+    """Raise an error if an accompanying file does not match its hash in the JSON file.
 
     Args:
         content: of the JSON file; one of an earlier version states no hashes.

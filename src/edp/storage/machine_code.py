@@ -90,7 +90,7 @@ class Compiler:
 
 
 def _keep_if_possible(fast: Any) -> None:
-    """Let a function that Numba compiled run also where its machine code cannot be kept, such as on a full disk."""
+    """Run a Numba function without the cache if its machine code cannot be stored, such as on a full disk."""
     cache = getattr(fast, "_cache", None)  # absent where NUMBA_DISABLE_JIT leaves the function as it is
     if cache is None:
         return

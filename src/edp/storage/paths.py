@@ -1,4 +1,4 @@
-"""Looking at paths: whether a file or folder is there, and what a folder holds.
+"""Checks of paths: existence, type, size and entries of files and folders.
 
 A user's path cannot always be looked at: no permission, too long a name, a loop of links, a NUL character, a network
 drive that is gone. `pathlib` raises some of these errors and hides others, differently in each version of Python. Here
@@ -23,7 +23,7 @@ _LONGEST = 200
 
 
 def status_at(path: str | Path, follow: bool = True) -> os.stat_result | None:
-    """Return the status of what is at a path; None if nothing is there.
+    """Return the file status of a path; None if the path does not exist.
 
     Args:
         path: of a file, a folder or anything else.
@@ -43,7 +43,7 @@ def status_at(path: str | Path, follow: bool = True) -> os.stat_result | None:
 
 
 def status_of(path: str | Path) -> os.stat_result:
-    """Return the status of what is at a path, after symbolic links are followed.
+    """Return the file status of a path after following symbolic links.
 
     Raises:
         StorageError: nothing is there, or the path cannot be looked at.
@@ -103,7 +103,7 @@ def is_link_at(path: str | Path) -> bool:
 
 
 def size_at(path: str | Path) -> int:
-    """Return the bytes of the regular file at a path; -1 if a link or anything else is there, or nothing.
+    """Return the size of a regular file in bytes; -1 for a link, a folder or a missing path.
 
     Raises:
         StorageError: the path cannot be looked at.
@@ -175,7 +175,7 @@ def full_path(path: str | Path) -> Path:
 
 
 def cannot_look(path: str | Path, error: OSError | ValueError, looked: str = "looked at") -> StorageError:
-    """Return the message of a path that cannot be looked at."""
+    """Return the error for a path that cannot be inspected."""
     reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
     advice = {
         errno.EACCES: "ask its owner for the right to read it, or give another path",

@@ -126,13 +126,13 @@ class RunFolder:
         shutil.rmtree(self.path / PARTS, ignore_errors=True)
 
     def write_history(self, rows: list[dict[str, Any]]) -> None:
-        """Write all epochs so far, a line of JSON with its hash each."""
+        """Write one line of JSON with a hash for each epoch."""
         check_held(self.file(".lock"), self._lock)
         write_bytes(self.file("history.jsonl"), "".join(map(sealed_line, rows)).encode())
 
 
 def unfinished_text(folder: str | Path) -> str:
-    """Return what to say about a run whose result is not there yet; empty where no unfinished run is in the folder.
+    """Return the message about an unfinished run; an empty text if the folder has no unfinished run.
 
     Every command that opens a run and misses the result says this.
 

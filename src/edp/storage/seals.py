@@ -20,7 +20,7 @@ _unsealed: dict[str, None] = {}
 
 
 def content_digest(content: Mapping[str, Any]) -> str:
-    """Return the hash of an object without its hash; what is in it and in which order lists stand is covered."""
+    """Return the hash over all keys and values of an object except its own hash."""
     # One round through JSON: the hash is over what a reader will see, names of all kinds as text.
     return _digest_of_parsed(json.loads(json.dumps(dict(content), allow_nan=False)))
 

@@ -1,4 +1,4 @@
-"""Unpacking that stops at the size that a file announces, whatever its packed bytes lead to.
+"""Decompression bounded by the announced size of the data.
 
 All packed data of strangers go through this module or, where a library of a log's format unpacks by itself, through the
 sandbox with its bound on memory; `tests/security/test_archives.py` holds the rest of EDP to that.
@@ -52,7 +52,7 @@ def unpack_to(packing: str, data: bytes | memoryview, limit: int) -> bytes:
 
 
 def unpack_start(data: bytes, count: int) -> bytes:
-    """Return the first `count` bytes that a zlib stream unpacks to; fewer where it is cut off, none where damaged."""
+    """Return the first `count` decompressed bytes of a zlib stream; fewer if the stream is truncated or damaged."""
     try:
         return zlib.decompressobj().decompress(data, count)
     except zlib.error:

@@ -194,7 +194,7 @@ def with_plugins(header: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_hash(header: Mapping[str, Any], file: Path) -> None:
-    """Refuse a header that its hash does not fit, and one with parts of plug-ins that are not registered here.
+    """Raise BundleError if the hash does not match the header or a plug-in part is not registered.
 
     Raises:
         BundleError: one of both; the message names the package of a part.

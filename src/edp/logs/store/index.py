@@ -135,7 +135,7 @@ def rows_path(folder: Path, key: str) -> Path:
 
 
 def stamped(folder: Path, file: RowsFile) -> RowsFile:
-    """Return a file whose samples were compared with their hashes, with its size and times as they are now."""
+    """Return the entry of a verified file with its current size and time stamps."""
     status = status_of(rows_path(folder, file.key))
     return replace(file, bytes=status.st_size, written_ns=status.st_mtime_ns, changed_ns=status.st_ctime_ns)
 

@@ -123,7 +123,7 @@ def _check_changed(folder: Path, index: StoreIndex, files: dict[str, FloatArray]
 
 
 def _token(folder: Path, file: RowsFile, index: StoreIndex) -> str:
-    """Return what a comparison is valid for: the file as it is, and what the index says of its recordings."""
+    """Return the key of a verification: state of the file and hashes of its recordings."""
     status = _status(folder, file)
     state = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
     stated = [(entry, index.lists[entry.channels]) for entry in index.recordings if entry.rows == file.key]

@@ -316,7 +316,7 @@ def solved_columns(channels: TwinChannels) -> list[int]:
 
 
 def _beyond(channels: TwinChannels, scales: TwinScales, start: Array) -> Array:
-    """How far strokes lie beyond the end stops, as a share of the range ``(batch, stroke)``."""
+    """Return the distance of strokes beyond the end stops, as a fraction of the range ``(batch, stroke)``."""
     count, strokes = len(channels.velocities), len(channels.strokes)
     ends = slice(count, count + strokes)
     low, high = scales.low[ends], scales.high[ends]
@@ -335,7 +335,7 @@ def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) ->
 def starts_within(
     channels: TwinChannels, scales: TwinScales, series: Sequence[Series], length: int, each: int
 ) -> list[tuple[Series, int]]:
-    """Return `even_starts` of a twin that is not trained yet: its channels and scales tell them.
+    """Return `even_starts` for the channels and scales of a twin that is not trained yet.
 
     Raises:
         DataError: all of them lie beyond.

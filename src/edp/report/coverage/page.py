@@ -150,7 +150,7 @@ def together_table(coverage: Coverage) -> TextTable | None:
 
 
 def events_table(coverage: Coverage) -> TextTable | None:
-    """Return the events that the recordings tell of; None where their channels tell of none."""
+    """Return the events in the recordings; None if the channels cannot show events."""
     rows = tuple(
         (_first_up(event.name), count_text(event.count), percent(event.share), event.note or "recorded")
         for event in coverage.events

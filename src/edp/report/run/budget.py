@@ -1,4 +1,4 @@
-"""The controller that somebody stated for a run, and what the run's network takes of it."""
+"""Resource limits of the controller stated for a run, and their use by its network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of what a source gives to a session: values, counts, and how often the same message is shown."""
+"""Bounds of live values and counts, and the repetition limit of messages."""
 
 from __future__ import annotations
 

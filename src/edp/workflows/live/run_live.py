@@ -155,7 +155,7 @@ class LiveRun:
         return self.pace.stopped
 
     def take(self, row: Row, missed: int = 0, trusted: bool = True, more: bool = False) -> None:
-        """Take a row of the source: wait until it is due, ask the models and store it, with those due with it.
+        """Process a row of the source: wait until it is due, run the models, and store row and predictions.
 
         Raises:
             DataError: the row has another shape, or is not of numbers.

@@ -1,4 +1,4 @@
-"""A live session with its page: the source in a thread of its own, the server of the page in this one."""
+"""Live session with its page: the source runs in a separate thread, the web server in this one."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class FittedMonitor:
 
     @property
     def finds(self) -> list[str]:
-        """Sentences on what the monitor finds with these logs."""
+        """Sentences about the changes that the monitor detects with these logs."""
         provenance = self.monitor.provenance
         stopped = effort_line(provenance)
         return [*promise_lines(found_sizes(provenance)), *([stopped] if stopped else [])]

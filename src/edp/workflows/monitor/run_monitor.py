@@ -64,7 +64,7 @@ class MonitorRun:
 
     @property
     def silence(self) -> list[str]:
-        """Sentences on what the absence of alarms does not exclude."""
+        """Sentences about changes that may be present without an alarm."""
         lines = [f"'{name}': no alarm, but {reason}" for name, reason in self.outside.items()]
         unseen = unseen_line(found_sizes(self.monitor.provenance))
         return [*lines, *([unseen] if unseen and not self.alarms else [])]

@@ -190,7 +190,7 @@ class SearchContext:
 
 
 def is_enough(sessions: int, spec: SearchSpec) -> bool:
-    """Return whether so many sessions fill test sets and folds; True where test sessions are named."""
+    """Return whether there are enough sessions for test sets and folds; True if test sessions are named."""
     if spec.test or spec.second:
         return True
     test = max(1, round(spec.test_share * sessions))

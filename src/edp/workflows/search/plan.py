@@ -91,7 +91,7 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
 
 
 def _with_task(search: Table, table: Table, experiment: Experiment) -> Table:
-    """Take the feature set and the horizon of a task that the user gave, where ``[search]`` names none."""
+    """Use the feature set and the horizon of the task if ``[search]`` does not set them."""
     completed, task = {**search}, table.get("task")
     if "features" not in search and isinstance(task, Mapping) and "features" in task:
         features = task["features"]

@@ -141,7 +141,7 @@ def train_twin(
 
 
 def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) -> None:
-    """Refuse parts on which the new twin could not be judged, before it is trained.
+    """Raise an error if the new twin could not be evaluated on these recordings, before it is trained.
 
     Raises:
         DataError: see `check_runs`.

@@ -27,7 +27,7 @@ SAME_TIME = 1e-3
 
 @dataclass(frozen=True)
 class Step:
-    """What the time of a row says.
+    """Class of a time stamp.
 
     Attributes:
         missed: rows that are missing before this one.
@@ -101,7 +101,7 @@ class RowClock:
 
 
 class Arrivals:
-    """Hands rows to a session as they arrive, and tells it of gaps, silence and another rate.
+    """Forwarding of arriving rows to a session, with notes about gaps, silence and a changed rate.
 
     Args:
         sink: session.

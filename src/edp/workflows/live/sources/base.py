@@ -59,7 +59,7 @@ class Sink(Protocol):
         ...
 
     def leave_out(self, reason: str) -> None:
-        """Count a row that cannot be used, and tell why; the first ones are told, then one in a thousand."""
+        """Count an unusable row and report the reason for the first rows, then for one in a thousand."""
         ...
 
     def note(self, kind: str, text: str, group: str = "") -> None:
