@@ -131,30 +131,10 @@ def _temporary(target: Path) -> tuple[int, str]:
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it is synced and renamed over `path`, else removed.
-
-    Raises:
-        StorageError: the disk is full, the folder is read-only, a folder is in the way, or the rename failed.
-    """
-    target = Path(path)
-    make_folder(target.parent)
-    temporary: Path | None = None
-    handle = -1
+def _naming(target: Path) -> Iterator[None]:
+    """Turn failures of the system, also inside libraries, into one StorageError that names the target."""
     try:
-        _remove_left(target.parent)
-        handle, name = _temporary(target)
-        temporary = Path(name)
-        hold_handle(handle)
-        yield temporary
-        with temporary.open("rb+") as stream:
-            # Before the rename: after a loss of power the new name must not show an empty file.
-            os.fsync(stream.fileno())
-        if os.name == "nt":
-            os.close(handle)  # Windows renames no open file
-            handle = -1
-        temporary.replace(target)
-        temporary = None
+        yield
     except IsADirectoryError as error:
         raise StorageError(f"cannot write '{target}': a folder of this name is in the way; remove or rename it") from (
             error
@@ -166,6 +146,35 @@ def replacing(path: str | Path) -> Iterator[Path]:
         if failure is None:
             raise
         raise storage_error(target, failure, "write") from error
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; on success it is synced and renamed over `path`, else removed.
+
+    Raises:
+        StorageError: the disk is full, the folder is read-only, a folder is in the way, or the rename failed.
+    """
+    target = Path(path)
+    make_folder(target.parent)
+    temporary: Path | None = None
+    handle = -1
+    try:
+        with _naming(target):
+            _remove_left(target.parent)
+            handle, name = _temporary(target)
+            temporary = Path(name)
+            # Lost when the writer closes its own handle; what follows takes less than `LEFT_AFTER_S`.
+            hold_handle(handle)
+            yield temporary
+            with temporary.open("rb+") as stream:
+                # Before the rename: after a loss of power the new name must not show an empty file.
+                os.fsync(stream.fileno())
+            if os.name == "nt":
+                os.close(handle)  # Windows renames no open file
+                handle = -1
+            temporary.replace(target)
+            temporary = None
     finally:
         if handle >= 0:
             os.close(handle)
@@ -189,22 +198,16 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     temporary = target.parent / f".{target.name[:80]}.{secrets.token_hex(6)}.tmp"
     handle = -1
     try:
-        _remove_left(target.parent)
-        temporary.mkdir()
-        if os.name != "nt":
-            handle = os.open(temporary, os.O_RDONLY | QUIETLY)
-            hold_handle(handle)
-        yield temporary
-        if os.name == "nt" and is_folder_at(target):
-            target.rmdir()  # Windows renames onto nothing that is there
-        temporary.rename(target)
-    except EdpError:
-        raise
-    except Exception as error:
-        failure = system_failure(error)
-        if failure is None:
-            raise
-        raise storage_error(target, failure, "write") from error
+        with _naming(target):
+            _remove_left(target.parent)
+            temporary.mkdir()
+            if os.name != "nt":
+                handle = os.open(temporary, os.O_RDONLY | QUIETLY)
+                hold_handle(handle)
+            yield temporary
+            if os.name == "nt" and is_folder_at(target):
+                target.rmdir()  # Windows renames onto nothing that is there
+            temporary.rename(target)
     finally:
         if handle >= 0:
             os.close(handle)
