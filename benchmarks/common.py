@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.storage import make_folder, read_json, write_json
-from edp.storage.runs import command_line, environment
+from edp.storage.provenance import command_line, environment
 
 RESULTS = Path(__file__).parent / "results"
 TIMES, COUNTS = (

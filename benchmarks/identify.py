@@ -25,7 +25,7 @@ from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes
-from edp.storage.runs import environment
+from edp.storage.provenance import environment
 from edp.workflows.identify import Identified, identify
 from edp.workflows.identify.bodies import Poses, base_parameters, load_by_base
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS

@@ -18,7 +18,7 @@ from statistics import median
 from common import finish, parser, table, verdict
 from edp.config.experiment import load_experiment
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, digest_of
-from edp.storage.runs import environment
+from edp.storage.provenance import environment
 from edp.workflows.executors.base import Job, complete
 from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.jobs import job_of

@@ -41,7 +41,8 @@ from edp.networks.twin.lumped.parts import MassElement, TankElement
 from edp.recording import Recording
 from edp.settings.tree import read_toml
 from edp.signals import Channel, Kind
-from edp.storage.runs import KeyedRun, RunFolder, environment
+from edp.storage.provenance import environment
+from edp.storage.runs import KeyedRun, Run
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from published_leagues import verdicts_of
@@ -193,7 +194,7 @@ class Judged:
         ]
         data: Any = StretchFold(parts[:1], parts[1:])
         scales = fit_scales(self.channels, parts[:1])
-        with tempfile.TemporaryDirectory() as folder, RunFolder(folder) as run:
+        with tempfile.TemporaryDirectory() as folder, Run(folder) as run:
             fit = TwinFit(self.channels, scales, data, experiment, None, lambda text: None)
             result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
         facts = {"chosen": next(one.label for one in tried if one.chosen), "candidates": [one.row() for one in tried]}

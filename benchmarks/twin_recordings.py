@@ -37,7 +37,7 @@ from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, fit_scales
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, Run
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.fit_twin import TwinFit
 from edp.workflows.twin.prepare_twin import prepared_twin
@@ -99,7 +99,7 @@ def measure(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) 
     began = time.process_time()
     scales, seed = fit_scales(channels, data.train), experiment.training.seed
     judge = replace(experiment.judge, seconds=30.0, starts=8, at_s=(1.0, 5.0, 10.0, 30.0))
-    with tempfile.TemporaryDirectory() as folder, RunFolder(folder) as run:
+    with tempfile.TemporaryDirectory() as folder, Run(folder) as run:
         fit = TwinFit(channels, scales, data, experiment, None, lambda text: None)
         result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
     twins = {"twin": result.fitted.twin}

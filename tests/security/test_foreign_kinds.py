@@ -8,13 +8,13 @@ from edp.errors import ConfigError, StorageError
 from edp.evaluation.judge import JudgeSpec
 from edp.export.folder import write_export
 from edp.storage.folders import MARKS, check_kind, kind_of
-from edp.storage.runs import RunFolder
+from edp.storage.runs import Run
 from edp.workflows.auto.settings import Portfolio
 from edp.workflows.fleet.registry import add_to_registry
 from edp.workflows.monitor import fit_monitor
 
 WRITERS = {
-    "run": RunFolder,
+    "run": Run,
     "registry": lambda folder: add_to_registry(folder, folder, "name"),
     "export": lambda folder: write_export(folder, {"a.h": b""}),
     "monitor": lambda folder: fit_monitor([], None, None, folder),

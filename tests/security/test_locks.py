@@ -9,7 +9,7 @@ import pytest
 from edp.errors import BusyError, StorageError
 from edp.storage import check_held, check_writable, held_by, hold, release, replacing, write_bytes
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, claim
-from edp.storage.runs import RunFolder
+from edp.storage.runs import Run
 
 PRECIOUS = "the only copy"
 
@@ -18,7 +18,7 @@ def claim_of(folder):
     return claim(folder, "key")
 
 
-HOLDERS = {"run": (RunFolder, ".lock"), "ledger": (Ledger, ".lock"), "claim": (claim_of, "claims/key.lock")}
+HOLDERS = {"run": (Run, ".lock"), "ledger": (Ledger, ".lock"), "claim": (claim_of, "claims/key.lock")}
 
 
 @pytest.fixture
@@ -66,28 +66,28 @@ def test_what_is_no_file_is_one_message(folder, kind, make):
 def test_a_file_of_the_user_keeps_its_content(folder):
     (folder / ".lock").write_text(PRECIOUS)
     with pytest.raises(StorageError, match="holds something else"):
-        RunFolder(folder)
+        Run(folder)
     assert (folder / ".lock").read_text() == PRECIOUS
 
 
 def test_locks_of_killed_holders_and_of_lost_power_are_taken(folder):
     for left in ("", "\0" * 60, "17 on some-host since 2026-01-31 23:59:59"):
         (folder / ".lock").write_text(left)
-        with RunFolder(folder):
+        with Run(folder):
             assert held_by(folder / ".lock").startswith(f"{os.getpid()} on ")
 
 
 def test_a_second_holder_is_told_who_holds(folder):
-    with RunFolder(folder), pytest.raises(BusyError, match=f"in use by process {os.getpid()} on"):
-        RunFolder(folder)
+    with Run(folder), pytest.raises(BusyError, match=f"in use by process {os.getpid()} on"):
+        Run(folder)
 
 
 def test_a_holder_whose_lock_was_removed_stops(folder):
-    with RunFolder(folder) as first:
+    with Run(folder) as first:
         (folder / ".lock").unlink()
         with pytest.raises(StorageError, match="removed or replaced"):
             first.write_status("running")
-        with RunFolder(folder) as second:
+        with Run(folder) as second:
             second.write_status("finished")
             with pytest.raises(StorageError, match="removed or replaced"):
                 first.write_history([])
@@ -133,7 +133,7 @@ def test_the_next_holder_removes_what_a_kill_left(folder):
         (folder / f"{temporary.name[:-10]}abcdef.tmp").write_bytes(b"half")
     (folder / ("a" * 100)).unlink()
     (folder / ".mine.tmp").mkdir()
-    with RunFolder(folder):
+    with Run(folder):
         assert sorted(os.listdir(folder)) == [".lock", ".mine.tmp", "claims"]
 
 

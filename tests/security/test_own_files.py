@@ -15,7 +15,7 @@ from edp.errors import StorageError
 from edp.report.run.facts import read_history
 from edp.storage import read_json, write_bytes, write_json
 from edp.storage.headers import FILES, check_files, digests_of
-from edp.storage.runs import RunFolder
+from edp.storage.runs import Run
 from edp.storage.seals import HASH, files_without_seal
 
 SOURCE = Path(__file__).parents[2] / "src" / "edp"
@@ -132,7 +132,7 @@ EPOCHS = [{"epoch": 1, "loss": 0.5, "best": True}, {"epoch": 2, "loss": float("n
 
 @pytest.fixture
 def history(tmp_path):
-    with RunFolder(tmp_path / "run") as folder:
+    with Run(tmp_path / "run") as folder:
         folder.write_history(EPOCHS)
     return tmp_path / "run" / "history.jsonl"
 

@@ -22,7 +22,8 @@ from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics.soil import load_material
 from edp.sim.scenario_file import read_scenario_file
 from edp.storage.ledger import Ledger, read_records
-from edp.storage.runs import RunFolder, read_provenance
+from edp.storage.provenance import read_provenance
+from edp.storage.runs import Run
 from edp.storage.study_file import read_study
 from edp.training import load_bundle
 from edp.workflows.search.plan import load_plan
@@ -69,12 +70,12 @@ def bundle(file):
 
 
 def run_of(file):
-    with RunFolder(file.parent) as run:
+    with Run(file.parent) as run:
         run.claim("key", "")
 
 
 def status_of(file):
-    with RunFolder(file.parent) as run:
+    with Run(file.parent) as run:
         run.status()
 
 

@@ -22,7 +22,7 @@ from edp.networks.predictor import ModelSpec, build_model
 from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, Run
 from edp.training.averages import NoAverage
 from edp.training.fit import fit
 from edp.training.objective import Objective
@@ -155,7 +155,7 @@ def test_a_lesson_that_was_stopped_goes_on_to_the_same_bits(tiny, tiny_training,
         if event.row and event.epoch == 2:
             raise Stop
 
-    with RunFolder(tmp_path / "run") as run:
+    with Run(tmp_path / "run") as run:
         run.claim("key", "")
         with pytest.raises(Stop):
             fit(tiny, small, spec, KeyedRun(run, "key"), stop, strategy)

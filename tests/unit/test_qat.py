@@ -17,7 +17,7 @@ from edp.ir.w8a16.quantise import weights_of
 from edp.networks.matrices import matrices_of
 from edp.networks.predictor import build_model
 from edp.networks.running import stream_predictions
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, Run
 from edp.training import fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler
 from edp.training.validation import validation_scores
@@ -109,7 +109,7 @@ def test_a_stop_changes_nothing(tiny, tiny_model, brief, start, tmp_path):
         if event.row is not None:
             raise Pulled
 
-    with RunFolder(tmp_path / "run") as run:
+    with Run(tmp_path / "run") as run:
         with pytest.raises(Pulled):
             fit(tiny, tiny_model, brief, KeyedRun(run, "key"), pull, strategy=strategy())
         resumed = fit(tiny, tiny_model, brief, KeyedRun(run, "key"), strategy=strategy())

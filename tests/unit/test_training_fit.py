@@ -14,7 +14,7 @@ from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights, MeanSquared
 from edp.networks.outputs import OUTPUTS
 from edp.networks.predictor import build_model
 from edp.networks.running import stream_predictions
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, Run
 from edp.training.averages import NoAverage, Stochastic
 from edp.training.fit import Diverged, TrainingError, TrainingSpec, fit, validation_scores
 from edp.training.objective import Objective
@@ -174,7 +174,7 @@ def test_an_infinite_input_diverges_in_the_epoch_that_meets_it(tmp_path, tiny, t
     # The scaler is that of the clean data, as if the value had come later; the epoch's batches meet it in any order.
     clean = tiny.scaler()
     monkeypatch.setattr(type(tiny), "scaler", lambda self: clean)
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         with pytest.raises(Diverged, match=r"no epoch was finished before, so nothing is kept") as caught:
             fit(poisoned(tiny, slice(300, 302)), tiny_model, tiny_training, KeyedRun(folder, "k"))
         assert caught.value.fitted is None
@@ -192,7 +192,7 @@ def test_a_training_that_diverges_later_hands_over_the_best_weights_and_keeps_it
         return real(self, *parts) * (math.inf if len(calls) == 70 else 1.0)
 
     monkeypatch.setattr(Objective, "evaluate", evaluate)
-    with RunFolder(tmp_path) as folder, pytest.raises(Diverged) as caught:
+    with Run(tmp_path) as folder, pytest.raises(Diverged) as caught:
         fit(tiny, tiny_model, tiny_training, KeyedRun(folder, "k"))
     end, history = caught.value, fitted[0].history[:2]
     assert (end.facts["epoch"], end.facts["update"]) == (3, 70)

@@ -15,7 +15,7 @@ from edp.networks.cells import CELLS
 from edp.networks.initial import INITIAL_STATES
 from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights
 from edp.networks.outputs import OUTPUTS
-from edp.storage.runs import KeyedRun, RunFolder, run_key
+from edp.storage.runs import KeyedRun, Run, run_key
 from edp.training.averages import AVERAGES
 from edp.training.checkpoint import FILE
 from edp.training.eager import EagerAdamW, EagerSgd
@@ -63,9 +63,9 @@ def uninterrupted(tiny, tiny_model, tiny_training):
 @pytest.mark.parametrize("stops", [(2,), (1, 3, 4)])
 def test_a_stopped_training_goes_on_to_the_same_bits(stops, tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
     for epoch in stops:
-        with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+        with Run(tmp_path) as folder, pytest.raises(Stop):
             fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY), stop_after(epoch))
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         resumed = fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
     assert resumed.resumed_at == stops[-1]
     assert_same(resumed, uninterrupted)
@@ -107,9 +107,9 @@ def test_optimizers_schedules_with_memory_and_fixed_by_passes_go_on_too(
     spec = dataclasses.replace(
         tiny_training, optimizer=OPTIMIZERS[optimizer](), schedule=Plateau(patience=0, threshold=0.5), epochs=4
     )
-    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+    with Run(tmp_path) as folder, pytest.raises(Stop):
         fit(tiny, model, spec, KeyedRun(folder, KEY), stop_after(2))
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         assert_same(fit(tiny, model, spec, KeyedRun(folder, KEY)), fit(tiny, model, spec))
 
 
@@ -123,9 +123,9 @@ RECURRENT = {
 def test_recurrent_layers_learn_and_go_on_to_the_same_bits(name, tmp_path, tiny, tiny_model, tiny_training):
     model = dataclasses.replace(tiny_model, backbone=dataclasses.replace(tiny_model.backbone, **RECURRENT[name]))
     spec = dataclasses.replace(tiny_training, epochs=3, updates=3 * UPDATES)  # that it learns is seen, too
-    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+    with Run(tmp_path) as folder, pytest.raises(Stop):
         fit(tiny, model, spec, KeyedRun(folder, KEY), stop_after(1))
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         resumed, whole = fit(tiny, model, spec, KeyedRun(folder, KEY)), fit(tiny, model, spec)
     assert_same(resumed, whole)
     losses = [row["train_loss"] for row in whole.history]
@@ -159,9 +159,9 @@ def plain(tiny, tiny_model, tiny_training):
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_way_to_train_goes_on_to_the_same_bits(kind, tmp_path, tiny, tiny_model, tiny_training, plain):
     spec = dataclasses.replace(tiny_training, epochs=3, updates=10, **KINDS[kind])
-    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+    with Run(tmp_path) as folder, pytest.raises(Stop):
         fit(tiny, tiny_model, spec, KeyedRun(folder, KEY), stop_after(2))
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         resumed = fit(tiny, tiny_model, spec, KeyedRun(folder, KEY))
     assert resumed.resumed_at == 2
     whole = fit(tiny, tiny_model, spec)
@@ -177,7 +177,7 @@ def test_calibration_is_repeated_to_the_same_bits(output, tmp_path, tiny, tiny_m
     spec = dataclasses.replace(tiny_training, epochs=2, updates=10, loss=loss)
     found = []
     for _ in range(2):
-        with RunFolder(tmp_path) as folder:
+        with Run(tmp_path) as folder:
             found.append(fit(tiny, model, spec, KeyedRun(folder, KEY)).predictor.output.stretch)
     assert torch.equal(*found)
     assert not torch.equal(found[0], torch.ones_like(found[0]))
@@ -185,7 +185,7 @@ def test_calibration_is_repeated_to_the_same_bits(output, tmp_path, tiny, tiny_m
 
 def test_a_finished_training_is_not_done_again(tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
     for _ in range(2):
-        with RunFolder(tmp_path) as folder:
+        with Run(tmp_path) as folder:
             again = fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
     assert again.resumed_at == tiny_training.epochs
     assert_same(again, uninterrupted)
@@ -194,7 +194,7 @@ def test_a_finished_training_is_not_done_again(tmp_path, tiny, tiny_model, tiny_
 KILLED = """
 import dataclasses, os, runpy, signal, sys
 tiny = runpy.run_path(sys.argv[1])
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, Run
 from edp.training.fit import fit
 fsync, writes = os.fsync, []
 def die(handle):
@@ -208,7 +208,7 @@ def die(handle):
     fsync(handle)
 os.fsync = die
 spec = dataclasses.replace(tiny["TRAINING"], updates=int(sys.argv[3]))
-fit(tiny["prepared"](), tiny["MODEL"], spec, KeyedRun(RunFolder(sys.argv[2]), "k" * 32))
+fit(tiny["prepared"](), tiny["MODEL"], spec, KeyedRun(Run(sys.argv[2]), "k" * 32))
 """
 
 
@@ -219,7 +219,7 @@ def test_a_process_killed_while_it_writes_a_checkpoint_goes_on_to_the_same_bits(
     command = [sys.executable, "-c", KILLED, helper, tmp_path, str(UPDATES)]
     done = subprocess.run(command, check=False, capture_output=True)
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         resumed = fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
     assert resumed.resumed_at == 2
     assert_same(resumed, uninterrupted)
@@ -227,7 +227,7 @@ def test_a_process_killed_while_it_writes_a_checkpoint_goes_on_to_the_same_bits(
 
 @pytest.fixture
 def half_done(tmp_path, tiny, tiny_model, tiny_training):
-    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+    with Run(tmp_path) as folder, pytest.raises(Stop):
         fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY), stop_after(1))
     return tmp_path
 
@@ -237,36 +237,36 @@ def test_a_truncated_checkpoint_is_refused(kept, half_done, tiny, tiny_model, ti
     file = half_done / FILE
     data = file.read_bytes()
     file.write_bytes(data[: kept if isinstance(kept, int) else int(kept * len(data))])
-    with RunFolder(half_done) as folder, pytest.raises(StorageError, match=r"is damaged .* remove it to train"):
+    with Run(half_done) as folder, pytest.raises(StorageError, match=r"is damaged .* remove it to train"):
         fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
 
 
 def test_a_checkpoint_of_another_run_is_refused(half_done, tiny, tiny_model, tiny_training):
-    with RunFolder(half_done) as folder, pytest.raises(StorageError, match="belongs to another run"):
+    with Run(half_done) as folder, pytest.raises(StorageError, match="belongs to another run"):
         fit(tiny, tiny_model, tiny_training, KeyedRun(folder, "other"))
 
 
 def test_a_locked_run_folder_names_its_holder(tmp_path):
-    with RunFolder(tmp_path), pytest.raises(StorageError, match=r"in use by process \d+"):
-        RunFolder(tmp_path)
-    with RunFolder(tmp_path):
+    with Run(tmp_path), pytest.raises(StorageError, match=r"in use by process \d+"):
+        Run(tmp_path)
+    with Run(tmp_path):
         """The lock is free again."""
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot create folder"):
-        RunFolder(tmp_path / "file" / "run")
+        Run(tmp_path / "file" / "run")
 
 
 def test_a_lock_that_cannot_be_opened_is_a_storage_error(tmp_path):
     (tmp_path / ".lock").mkdir()
     with pytest.raises(StorageError, match=r"lock.*is not a lock file"):
-        RunFolder(tmp_path)
+        Run(tmp_path)
 
 
 def test_a_folder_is_bound_to_one_run(tmp_path):
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         assert not folder.claim("a", "text = 1\n")
         assert folder.claim("a", "text = 1\n")
         with pytest.raises(StorageError, match="holds another run"):
@@ -289,7 +289,7 @@ def test_a_stopped_refit_goes_on_to_the_same_bits(refit, stop, tmp_path, tiny, t
         if (event.refit, event.update) == (stop[0], event.updates) and event.epoch == stop[1]:
             raise Stop
 
-    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+    with Run(tmp_path) as folder, pytest.raises(Stop):
         fit(tiny, tiny_model, spec, KeyedRun(folder, KEY), on_event)
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         assert_same(fit(tiny, tiny_model, spec, KeyedRun(folder, KEY)), fit(tiny, tiny_model, spec))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -146,6 +147,12 @@ class DataSource:
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
         more = tuple(Path(path) for path in plain.get("more", ()))
         return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"), more)
+
+    def origin(self, recordings: Sequence[Recording]) -> dict[str, Any]:
+        """Return the origin of recordings that were read from this source, for the provenance of a result."""
+        digests = "".join(recording.digest for recording in recordings)
+        digest = hashlib.blake2b(digests.encode(), digest_size=16).hexdigest()
+        return {"source": self.label, "reader": self.to_plain(), "digest": digest}
 
     def logs(self) -> list[Log]:
         """The logs of the source, unread, each with the map that belongs to it; a store has none."""

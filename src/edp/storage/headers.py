@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
+from edp.storage.paths import is_file_at
 from edp.storage.reading import JSON_BYTES, object_with, parse_json, read_bytes, read_text
+from edp.storage.run_kinds import RUN_KINDS
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 ARRAYS_BYTES = 2**30
@@ -47,6 +49,21 @@ def check_files(content: Mapping[str, Any], folder: str | Path, advice: str) -> 
         file = Path(folder, Path(str(name)).name)  # never a path out of the folder
         if digest_of_bytes(read_bytes(file, ARRAYS_BYTES)) != digest:
             raise StorageError(f"'{file}' was changed since it was written with the result beside it; {advice}")
+
+
+def model_digest(path: str | Path) -> str:
+    """Return a hash of a model on disk, which changes with its content: of its header, or of the file itself.
+
+    Args:
+        path: a run folder, the folder of a network, twin or monitor, or a file such as an FMU.
+
+    Raises:
+        StorageError: there is no model, or the file cannot be read.
+    """
+    models = [kind.model for kind in RUN_KINDS.values() if kind.model]
+    headers = [Path(path, name) for model in models for name in (model, Path(model).name)]
+    file = next((header for header in headers if is_file_at(header)), Path(path))
+    return digest_of_bytes(read_bytes(file, ARRAYS_BYTES))
 
 
 def is_whole(file: Path) -> bool:

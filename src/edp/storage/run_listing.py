@@ -15,7 +15,10 @@ from edp.errors import StorageError
 from edp.storage.headers import is_whole
 from edp.storage.locks import held_by
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_of
+from edp.storage.provenance import PROVENANCE
 from edp.storage.reading import parse_json, read_text, read_toml
+from edp.storage.run_kinds import BUNDLE, CONTROLLER, RUN_KINDS, TWIN, RunKind
+from edp.storage.runs import ENDED, FINISHED, IDENTITY, STATUS
 from edp.storage.seals import unsealed
 
 MOST_FOLDERS = 20_000
@@ -26,27 +29,7 @@ _BYTES = 8 * 2**20
 """Of a file of a run; scores of hundreds of recordings take one."""
 _LONGEST = 200
 """Characters of a text that is listed."""
-_STUDY = "study.json"
-_MARKS: Mapping[str, str] = {
-    "twin/twin.json": "twin",
-    "controller/controller.json": "control",
-    "tuning.json": "tuning",
-    _STUDY: "search",
-    "auto.json": "auto",
-    "foundation.json": "pretraining",
-    "adaptation.json": "adaptation",
-    "compression.json": "compression",
-    "alarms.jsonl": "monitor run",
-}
-"""What only one kind of run has, in the order in which it decides."""
-_HEADERS = ("bundle/bundle.json", "twin/twin.json", "controller/controller.json")
-"""Of what a run made, with its arrays beside it."""
-_WHOLE = ("search", "control", "compression", "monitor run")
-"""Kinds of runs whose mark is written at their end, so that it makes them finished."""
-_NETWORKS = ("network", "auto", "pretraining", "adaptation")
-"""Kinds of runs that are finished by a bundle."""
-_RUN = ("run.json", "status.json", "provenance.json", _STUDY, "auto.json")
-"""One of these makes a folder a run."""
+MODELS = (BUNDLE, TWIN, CONTROLLER)
 
 
 @dataclass(frozen=True)
@@ -55,7 +38,7 @@ class ListedRun:
 
     Attributes:
         folder: where it is.
-        kind: ``network`` or what `_MARKS` says; ``-`` for a folder that cannot be read.
+        kind: name of its kind, see `edp.storage.run_kinds`; ``-`` for a folder that cannot be read.
         state: ``finished``, ``running``, ``stopped``, ``diverged``, or ``damaged`` where a file cannot be read, its
             settings are no TOML, or what it made is not there or not as it was written; ``cannot be read: REASON``
             for a folder that this process has no right to look into.
@@ -89,7 +72,7 @@ def list_runs(folder: str | Path) -> tuple[list[ListedRun], bool]:
             whole = False
             break
         try:
-            if any(is_file_at(path / name) for name in _RUN):
+            if _is_run(path):
                 runs.append(_run(path))
             elif not os.access(path, os.R_OK | os.X_OK):
                 runs.append(_unreadable(path, os.strerror(errno.EACCES)))
@@ -105,7 +88,7 @@ def _folders(top: Path) -> Iterator[Path]:
         path, depth = waiting.pop()
         yield path
         try:
-            if depth == DEEPEST or is_file_at(path / "run.json"):
+            if depth == DEEPEST or is_file_at(path / IDENTITY):
                 continue
             below = [e for e in entries_of(path) if e.name[:1] != "." and is_folder_at(e) and not is_link_at(e)]
         except StorageError:  # listed as a folder that cannot be read
@@ -123,15 +106,17 @@ def _unreadable(path: Path, reason: str) -> ListedRun:
     return ListedRun(path, "-", f"cannot be read: {reason.lower()}"[:_LONGEST], "", "", "")
 
 
+def _is_run(path: Path) -> bool:
+    started = (IDENTITY, STATUS, PROVENANCE)
+    return any(is_file_at(path / name) for name in (*started, *(kind.result for kind in RUN_KINDS.values())))
+
+
 def _run(path: Path) -> ListedRun:
-    kind = next((kind for mark, kind in _MARKS.items() if is_file_at(path / mark)), "network")
     damaged: list[str] = []
-    status, provenance, scores = (_part(path / f"{name}.json", damaged) for name in ("status", "provenance", "scores"))
-    # Before its result is there, a run has only what its status says.
-    kind = str(status.get("kind", kind)) if kind == "network" and status.get("kind") in _MARKS.values() else kind
-    state = str(status.get("status", ""))
-    if state not in ("finished", "diverged"):
-        state = "running" if held_by(path / ".lock") else "finished" if kind in _WHOLE else "stopped"
+    identity, status, provenance, scores = (
+        _part(path / name, damaged) for name in (IDENTITY, STATUS, PROVENANCE, "scores.json")
+    )
+    kind = _kind(path, identity, status)
     data = provenance.get("data")
     source = str(data.get("source", "")) if isinstance(data, dict) else ""
     when = str(status.get("time") or provenance.get("created") or _touched(path))
@@ -140,22 +125,49 @@ def _run(path: Path) -> ListedRun:
         score = _score(scores)
     except (KeyError, TypeError, ValueError, AttributeError):
         damaged.append("scores.json")
-    damaged += _damaged_parts(path, kind if state == "finished" else "")
-    return ListedRun(path, kind, "damaged" if damaged else state, when[:_LONGEST], source[:_LONGEST], score[:_LONGEST])
+    state = _state(path, kind, status)
+    damaged += _damaged_parts(path, kind if state == FINISHED else None)
+    return ListedRun(
+        path, kind.name, "damaged" if damaged else state, when[:_LONGEST], source[:_LONGEST], score[:_LONGEST]
+    )
 
 
-def _damaged_parts(path: Path, finished: str) -> list[str]:
-    """Settings and results of a run that are damaged; of a finished one of that kind, also a result that is missing."""
+def _kind(path: Path, identity: Mapping[str, Any], status: Mapping[str, Any]) -> RunKind:
+    """Return the kind that a run states; one of an earlier version states none and is recognised by its result."""
+    stated = RUN_KINDS.get(str(identity.get("kind") or status.get("kind")))
+    results = (kind for kind in RUN_KINDS.values() if is_file_at(path / kind.result))
+    return stated or next(results, RUN_KINDS["network"])
+
+
+def _state(path: Path, kind: RunKind, status: Mapping[str, Any]) -> str:
+    """Return the state of a run; a state that is not recorded follows from the result, which is written at the end."""
+    if held_by(path / kind.lock):
+        return "running"
+    recorded = status.get("status") or _study_state(path, kind)
+    if not recorded:
+        return FINISHED if is_file_at(path / kind.result) else "stopped"
+    return recorded if recorded in ENDED else "stopped"
+
+
+def _study_state(path: Path, kind: RunKind) -> str:
+    if kind.name != "search":
+        return ""
+    # The file of a study is read within bounds; `edp search report` checks all of it.
+    return str(_part(path / kind.result, []).get("state", ""))
+
+
+def _damaged_parts(path: Path, finished: RunKind | None) -> list[str]:
+    """Return the settings and models of a run that are damaged, and the model that a finished run lacks."""
     damaged = []
     try:
         if is_file_at(path / "config.toml"):
             read_toml(path / "config.toml")
     except StorageError:
         damaged.append("config.toml")
-    for name in _HEADERS:
+    for name in MODELS:
         file = path / name
         try:
-            missing = name == _HEADERS[0] and finished in _NETWORKS
+            missing = finished is not None and name == finished.model
             damaged += [name] if (not is_whole(file) if is_file_at(file) else missing) else []
         except (StorageError, ValueError):
             damaged.append(name)

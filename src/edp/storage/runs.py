@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import platform
 import shutil
-import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,32 +18,19 @@ from edp.errors import BusyError, StorageError
 from edp.storage.folders import check_kind
 from edp.storage.locks import check_held, held_by, hold
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
-from edp.storage.reading import object_with, read_object
+from edp.storage.reading import read_object
+from edp.storage.run_kinds import RUN_KINDS, RunKind
 from edp.storage.seals import sealed_line
 from edp.storage.writing import make_folder, remove_unfinished, write_bytes, write_json
 
-RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
-"""Libraries whose versions can change a result."""
 IDENTITY, STATUS = "run.json", "status.json"
-ENDED = ("finished", "diverged")
+FINISHED = "finished"
+ENDED = (FINISHED, "diverged")
 """States in which a run stays."""
 LEFT = (".lock", "config.toml")
 """What a run that was killed before it was bound to its folder leaves there."""
 PARTS = "parts"
 """Folder of a run in which its single trainings stand, where it has several."""
-
-
-def environment(threads: int) -> dict[str, str]:
-    """Versions and machine facts that can change a result; flat strings."""
-    facts = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
-    for name in RECORDED:
-        try:
-            facts[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            # Also a fact: without a library another way may be taken.
-            facts[name] = "absent"
-    # The number of threads changes the order of sums, and so their last bits.
-    return facts | {"threads": str(threads)}
 
 
 def run_key(config: Mapping[str, Any], data_digest: str) -> str:
@@ -56,27 +40,64 @@ def run_key(config: Mapping[str, Any], data_digest: str) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-class RunFolder:
+class Run:
     """A folder that holds one run; locked while a process writes to it.
 
     Args:
         path: the folder; made when absent.
+        kind: name of the kind of run, see `edp.storage.run_kinds`.
+
+    Attributes:
+        path: the folder.
+        kind: name of the kind of run.
+        key: content address of the run, see `run_key`; empty before `claim`.
+        is_finished: whether the run was finished before it was opened by `create`.
 
     Raises:
         BusyError: another process holds it.
         StorageError: the folder cannot be made, or is one of another kind, such as a store.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, kind: str = "network") -> None:
         check_claimable(path)
-        self.path = make_folder(path)
+        self.path, self.kind, self.key, self.is_finished = make_folder(path), RUN_KINDS[kind].name, "", False
         try:
             self._lock = hold(self.path / ".lock")
         except BusyError as error:
             raise _busy(self.path, str(error).rpartition("process ")[2]) from None
         remove_unfinished(self.path)
 
-    def __enter__(self) -> RunFolder:
+    @classmethod
+    @contextmanager
+    def create(cls, path: str | Path | Run, kind: str, key: str, settings: str = "") -> Iterator[Run]:
+        """Open the folder of a new or stopped run for writing, and record the state of the run.
+
+        The state is ``running`` inside the block and ``finished`` after it. A block that raises leaves ``running``,
+        which readers show as stopped as soon as no process holds the folder; `write_status` in the block replaces it.
+        The state of a run that ended before does not become ``running``.
+
+        Args:
+            path: the folder, made when absent; or a run that the caller has opened. The caller then closes the run and
+                records its end, and its kind is the one of the run.
+            kind: name of the kind of run, see `edp.storage.run_kinds`.
+            key: see `run_key`.
+            settings: of the run, as TOML; empty for a run without settings.
+
+        Raises:
+            BusyError: another process holds the folder.
+            StorageError: the folder holds another run, or something else.
+        """
+        with nullcontext(path) if isinstance(path, Run) else cls(path, kind) as run:
+            run.claim(key, settings)
+            status = run.status().get("status")
+            run.is_finished = status == FINISHED
+            if status not in ENDED:
+                run.write_status("running")
+            yield run
+            if run is not path:
+                run.finish()
+
+    def __enter__(self) -> Run:
         """The folder itself; leaving the block frees the lock."""
         return self
 
@@ -87,16 +108,16 @@ class RunFolder:
         self._lock.close()
 
     def file(self, name: str) -> Path:
-        """Path of a file in the folder."""
+        """Return the path of a file in the folder."""
         return self.path / name
 
-    def claim(self, key: str, config_text: str) -> bool:
-        """Bind the folder to a run; True when the same run was begun here before and can go on.
+    def claim(self, key: str, settings: str) -> bool:
+        """Bind the folder to a run; return True if the same run was begun here before and can continue.
 
         Raises:
             StorageError: the folder holds a run with other settings, data or code version.
         """
-        identity = self.file(IDENTITY)
+        identity, self.key = self.file(IDENTITY), key
         if is_there(identity):
             stored_identity = read_object(identity, ("key",))
             if stored_identity["key"] != key:
@@ -106,19 +127,30 @@ class RunFolder:
                 )
             return True
         # Settings before the identity: a kill between the two leaves a folder that is not bound yet.
-        write_bytes(self.file("config.toml"), config_text.encode())
-        write_json(identity, {"schema": 1, "key": key, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")})
+        if settings:
+            self.write_settings(settings)
+        created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+        write_json(identity, {"schema": 1, "key": key, "kind": self.kind, "created": created})
         return False
 
+    def write_settings(self, settings: str) -> None:
+        """Write the settings of the run, TOML."""
+        write_bytes(self.file("config.toml"), settings.encode())
+
     def write_status(self, status: str, **facts: Any) -> None:
-        """Say where the run stands: ``running``, ``finished`` or ``diverged``, with facts that fit into JSON."""
+        """Record the state of the run: ``running``, ``finished`` or ``diverged``, with facts that fit into JSON."""
         check_held(self.file(".lock"), self._lock)
         write_json(self.file(STATUS), {"status": status, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
 
+    def finish(self) -> None:
+        """Record the end of the run, and delete what only an unfinished run reads."""
+        if not self.is_finished:
+            self.write_status(FINISHED)
+        self.remove_parts()
+
     def status(self) -> dict[str, Any]:
-        """Where the run stands; empty where nothing was written yet."""
-        status_file = self.file(STATUS)
-        return read_object(status_file, ("status", "time")) if is_there(status_file) else {}
+        """Return the recorded state of the run with its facts; empty before the first one."""
+        return _status_of(self.path)
 
     def remove_parts(self) -> None:
         """Delete the folders of its single trainings, which only an unfinished run reads."""
@@ -131,6 +163,20 @@ class RunFolder:
         write_bytes(self.file("history.jsonl"), "".join(map(sealed_line, rows)).encode())
 
 
+def state_of(folder: str | Path) -> str:
+    """Return the recorded state of a run: ``running``, ``finished`` or ``diverged``; empty if none is recorded.
+
+    Raises:
+        StorageError: the record is damaged.
+    """
+    return str(_status_of(folder).get("status", ""))
+
+
+def _status_of(folder: str | Path) -> dict[str, Any]:
+    file = Path(folder) / STATUS
+    return read_object(file, ("status", "time")) if is_there(file) else {}
+
+
 def unfinished_text(folder: str | Path) -> str:
     """Return the message about an unfinished run; an empty text if the folder has no unfinished run.
 
@@ -141,8 +187,7 @@ def unfinished_text(folder: str | Path) -> str:
     """
     path = Path(folder)
     started = is_file_at(path / IDENTITY) or all(is_file_at(path / name) for name in LEFT)
-    status = read_object(path / STATUS, ("status",)) if is_file_at(path / STATUS) else {}
-    if not started or status.get("status") in ENDED:
+    if not started or state_of(path) in ENDED:
         return ""
     holder = held_by(path / ".lock")
     state = "it was stopped" if holder is None else f"process {holder} is at work"
@@ -150,15 +195,48 @@ def unfinished_text(folder: str | Path) -> str:
     return f"'{path}' holds a run that is not finished ({state}); {todo}"
 
 
-def check_claimable(path: str | Path) -> None:
-    """Refuse a folder that `RunFolder` would refuse; call it before logs are read or anything is computed.
+def missing_text(folder: str | Path, kind: str, what: str = "") -> str:
+    """Return the message about a folder without the result of a kind of run: unfinished, of another kind, or no run.
 
-    Nothing is made or changed: a command that is refused later leaves no folder.
+    Args:
+        folder: that a command was given.
+        kind: name of the kind of run that the command reads, see `edp.storage.run_kinds`.
+        what: noun phrase for what is read; by default the run of its command.
+
+    Raises:
+        StorageError: the folder cannot be looked into, or its identity or status is damaged.
+    """
+    asked, found = RUN_KINDS[kind], run_kind(folder)
+    held = f"it has no {Path(asked.result).name}"
+    if found is not None and found != asked:
+        held += f" and holds a run of {found.command}"
+    other = f"'{folder}' is not {what or f'a run of {asked.command}'}: {held}; give a folder that {asked.command} wrote"
+    return unfinished_text(folder) or other
+
+
+def run_kind(folder: str | Path) -> RunKind | None:
+    """Return the kind of the run in a folder; None for a folder without a run.
+
+    Raises:
+        StorageError: the folder cannot be looked into, or the identity of the run is damaged.
+    """
+    path = Path(folder)
+    identity = read_object(path / IDENTITY) if is_file_at(path / IDENTITY) else {}
+    stated = RUN_KINDS.get(str(identity.get("kind")))
+    return stated or next((kind for kind in RUN_KINDS.values() if is_file_at(path / kind.result)), None)
+
+
+def check_claimable(path: str | Path | Run) -> None:
+    """Refuse a folder that `Run` would refuse; call it before logs are read or anything is computed.
+
+    Nothing is made or changed: a command that is refused later leaves no folder. A run that is open already passes.
 
     Raises:
         BusyError: another process holds it.
         StorageError: it is a folder of another kind, such as a store.
     """
+    if isinstance(path, Run):
+        return
     check_kind(path, "run", "study", "fleet", what="a run")
     holder = held_by(Path(path) / ".lock")
     if holder is not None:
@@ -201,7 +279,7 @@ class KeyedRun:
         key: of the training, see `run_key`.
     """
 
-    folder: RunFolder
+    folder: Run
     key: str
 
 
@@ -213,33 +291,5 @@ def part_of(run: KeyedRun | None, name: str) -> Iterator[KeyedRun | None]:
     if run is None or not name:
         yield run
         return
-    with RunFolder(run.folder.path / PARTS / name) as folder:
+    with Run(run.folder.path / PARTS / name) as folder:
         yield KeyedRun(folder, run.key)
-
-
-def read_provenance(folder: str | Path) -> dict[str, Any]:
-    """Where a run comes from, with all that the commands on a trained run need of it.
-
-    Raises:
-        StorageError: not a run folder, or its provenance is damaged.
-    """
-    file = Path(folder) / "provenance.json"
-    if not is_file_at(file):
-        raise StorageError(
-            unfinished_text(folder)
-            or f"'{folder}' is not a run folder: it has no {file.name}; give the folder of edp train"
-        )
-    provenance = read_object(file, ("data", "seconds"))
-    data = object_with(provenance["data"], ("source", "reader", "digest"), f"'{file}', data,")
-    reader = object_with(data["reader"], ("path",), f"'{file}', data.reader,")
-    texts = {"data.reader.path": reader["path"], "data.digest": data["digest"], "data.source": data["source"]}
-    wrong = [name for name, value in texts.items() if not isinstance(value, str)]
-    wrong += [] if isinstance(provenance["seconds"], int | float) else ["seconds"]
-    if wrong:
-        raise StorageError(f"'{file}' is damaged: {', '.join(wrong)} is of another kind; restore it or train again")
-    return provenance
-
-
-def command_line() -> str:
-    """The command as a user would type it."""
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

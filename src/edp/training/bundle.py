@@ -33,7 +33,7 @@ from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, write_bytes, write_json
 from edp.storage.headers import ARRAYS_BYTES, read_header
 from edp.storage.paths import entries_of, is_entry_at
-from edp.storage.runs import unfinished_text
+from edp.storage.runs import missing_text
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
 
 SCHEMA = 8
@@ -250,8 +250,7 @@ def _bundle_folder(folder: str | Path) -> Path:
     if is_entry_at(path / "twin" / "twin.json"):
         raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
     if not is_entry_at(path / HEADER):
-        missing = f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote"
-        raise BundleError(unfinished_text(path) or missing)
+        raise BundleError(missing_text(path, "network", "a bundle"))
     return path
 
 

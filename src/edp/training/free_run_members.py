@@ -14,7 +14,7 @@ from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, memb
 from edp.networks.twin.static_map import StaticTwin
 from edp.storage import read_object, write_json
 from edp.storage.paths import is_file_at
-from edp.storage.runs import PARTS, KeyedRun, RunFolder
+from edp.storage.runs import PARTS, KeyedRun, Run
 from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
 
 NOTE = "progress.json"
@@ -53,7 +53,7 @@ def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], No
     what = (job.twin, job.train, job.validation, job.training, on_event)
     if job.folder is None:
         return fit_free_runs(*what, trained=job.trained)
-    with RunFolder(job.folder[0]) as folder:
+    with Run(job.folder[0]) as folder:
         return fit_free_runs(*what, KeyedRun(folder, job.folder[1]), job.trained)
 
 

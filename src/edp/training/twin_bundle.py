@@ -23,7 +23,7 @@ from edp.storage import make_folder, object_with, write_json
 from edp.storage.headers import read_header
 from edp.storage.memory import check_setting
 from edp.storage.paths import entries_of, is_entry_at
-from edp.storage.runs import unfinished_text
+from edp.storage.runs import missing_text
 from edp.storage.seals import HASH
 from edp.training.bundle import Bundle, as_damage, check_hash, read_arrays, with_plugins, write_arrays
 
@@ -152,8 +152,7 @@ def load_twin(folder: str | Path) -> TwinBundle:
     """
     path = _twin_folder(folder)
     if not is_entry_at(path / HEADER):
-        missing = f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote"
-        raise BundleError(unfinished_text(path) or missing)
+        raise BundleError(missing_text(path, "twin", "a twin"))
     with as_damage(path):
         header = read_header(path / HEADER, ("schema",))
         schema = header["schema"]

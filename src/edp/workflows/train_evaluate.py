@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from safetensors.numpy import save
 
-from edp import __version__
 from edp.config.experiment import Experiment, experiment_toml, load_experiment, plain_tree
 from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
@@ -39,11 +37,13 @@ from edp.report.run.choice import FLOOR, note_test_result
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.headers import FILES, digests_of
 from edp.storage.paths import is_folder_at, is_there
-from edp.storage.runs import KeyedRun, RunFolder, check_claimable, command_line, environment, read_provenance, run_key
+from edp.storage.provenance import read_provenance
+from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
 from edp.training.fit import fit
+from edp.training.provenance import training_provenance
 from edp.training.spec import check_fitted_parts, check_training, thread_count
 from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.judged_data import judged_data
@@ -102,7 +102,7 @@ class StrategyFactory:
 def train(
     source: DataSource,
     experiment: Experiment,
-    out: str | Path,
+    out: str | Path | Run,
     on_event: Callable[[TrainingProgress], None] | None = None,
     strategy_factory: StrategyFactory | None = None,
     data: Prepared | None = None,
@@ -112,7 +112,7 @@ def train(
     Args:
         source: where the recordings are.
         experiment: the settings.
-        out: run folder.
+        out: run folder; or a run that the caller has opened, and of which this training is a part.
         on_event: called with progress.
         strategy_factory: teachers, weights to begin with.
         data: what `prepare_data` gave for this source and experiment, where it is there already.
@@ -135,10 +135,8 @@ def train(
     data = data or prepare_data(source, experiment, frozen)
     check_scored(data, experiment.judge)
     key = run_key(settings | taught, data.digest)
-    with RunFolder(out) as run:
-        run.claim(key, experiment_toml(experiment))
+    with Run.create(out, "network", key, experiment_toml(experiment)) as run:
         _refuse_diverged(run)
-        run.write_status("running")
         try:
             strategy = None if strategy_factory is None else strategy_factory.strategy(data)
             fitted = fit(data, experiment.model, experiment.training, KeyedRun(run, key), on_event, strategy)
@@ -149,37 +147,28 @@ def train(
                 _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
             run.write_status("diverged", message=str(end), **end.facts)
             raise
-        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, frozen) | taught, data)
-        run.write_status("finished")
-    return bundle
+        return _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, frozen) | taught, data)
 
 
 def keep_fitted(
-    out: Path, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: dict[str, Any]
+    run: Run, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: dict[str, Any]
 ) -> Bundle:
-    """Write the run folder of a training that was run elsewhere, as `train` would have.
+    """Write what `train` writes into an open run, for a training that took place elsewhere.
 
     Args:
-        out: run folder.
+        run: the run.
         source: where the recordings are.
         experiment: the settings.
         data: what `prepare_data` gave for both.
         fitted: what the training gave.
         facts: further plain values of the provenance.
-
-    Raises:
-        StorageError: the folder holds another run.
     """
-    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
-    with RunFolder(out) as run:
-        run.claim(run_key(settings, data.digest), experiment_toml(experiment))
-        run.write_history(fitted.history)
-        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, {}) | facts, data)
-        run.write_status("finished")
-    return bundle
+    run.write_settings(experiment_toml(experiment))
+    run.write_history(fitted.history)
+    return _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, {}) | facts, data)
 
 
-def _keep(run: RunFolder, fitted: Fitted, provenance: dict[str, Any], data: Prepared) -> Bundle:
+def _keep(run: Run, fitted: Fitted, provenance: dict[str, Any], data: Prepared) -> Bundle:
     """Write what a training leaves: provenance, footprint and the bundle."""
     write_json(run.file("provenance.json"), provenance)
     write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json())
@@ -188,7 +177,7 @@ def _keep(run: RunFolder, fitted: Fitted, provenance: dict[str, Any], data: Prep
     return bundle
 
 
-def _refuse_diverged(run: RunFolder) -> None:
+def _refuse_diverged(run: Run) -> None:
     """A run that diverged would do so again, to the same bits."""
     # Every training is deterministic: trying again would take as long and end alike.
     status = run.status()
@@ -205,33 +194,10 @@ def _refuse_diverged(run: RunFolder) -> None:
 def _provenance(
     source: DataSource, experiment: Experiment, data: Prepared, seconds: float, frozen: Mapping[str, str]
 ) -> dict[str, Any]:
-    rate = data.task.rate_hz
+    training = experiment.training
     sealed = {**frozen, **frozen_of(experiment.split)}
-
-    def part(series: Sequence[Any]) -> dict[str, Any]:
-        hours = sum(entry.samples for entry in series) / rate / 3600
-        return {"recordings": len(series), "hours": round(hours, 4), "names": [entry.name for entry in series]}
-
-    return {
-        "edp_version": __version__,
-        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        "command": command_line(),
-        "seed": experiment.training.seed,
-        "environment": environment(thread_count(experiment.training)),
-        "regime": experiment.training.chunks.regime,
-        "seconds": round(seconds, 2),
-        "device": experiment.training.device,
-        "data": {
-            "source": source.label,
-            "reader": source.to_plain(),
-            "rate_hz": rate,
-            "train": part(data.train),
-            "validation": part(data.validation),
-            "test": part(data.test),
-            "digest": data.digest,
-            **({"frozen": sealed} if sealed else {}),
-        },
-    }
+    facts = {"regime": training.chunks.regime, "device": training.device}
+    return training_provenance(source, data, training.seed, thread_count(training), seconds, sealed) | facts
 
 
 JudgedBy = Callable[[ModelBench, str], Mapping[str, JudgedModel]]

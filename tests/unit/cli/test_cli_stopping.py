@@ -5,7 +5,7 @@ import signal
 
 from safetensors.numpy import load_file
 
-from edp.storage.runs import RunFolder
+from edp.storage.runs import Run
 
 
 def weights_of(run):
@@ -64,7 +64,7 @@ def test_stopped_simulation_keeps_whole_logs_and_goes_on(edp, tmp_path, start, s
 
 
 def test_run_folder_in_use(edp, logs, tmp_path, small):
-    with RunFolder(tmp_path / "run"):
+    with Run(tmp_path / "run"):
         ended = edp("train", logs, "--out", tmp_path / "run", *small)
     assert ended.code == 75
     assert f"in use by process {os.getpid()}" in ended.err

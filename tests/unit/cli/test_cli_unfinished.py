@@ -6,7 +6,7 @@ import pytest
 from typer.main import get_command
 
 from edp.cli import app
-from edp.storage.runs import RunFolder
+from edp.storage.runs import Run
 
 ARGUMENTS = {
     "evaluate": ("{run}",),
@@ -51,8 +51,8 @@ def test_every_command_that_opens_a_run_is_called_here():
 
 @pytest.fixture
 def stopped(tmp_path):
-    with RunFolder(tmp_path / "stopped") as folder:
-        folder.claim("0" * 32, "")
+    with Run(tmp_path / "stopped") as folder:
+        folder.claim("0" * 32, "seed = 0\n")
         folder.write_status("running")
     return tmp_path / "stopped"
 
@@ -70,7 +70,7 @@ def test_a_stopped_run_is_named_as_such(edp, logs, stopped, tmp_path, command):
 
 
 def test_a_run_that_is_being_written_is_waited_for(edp, stopped):
-    with RunFolder(stopped):
+    with Run(stopped):
         assert "is at work); wait until it ends" in edp("evaluate", stopped).err
 
 

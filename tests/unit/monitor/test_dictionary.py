@@ -179,5 +179,5 @@ def test_a_damaged_line_of_the_alarm_log_is_one_message_with_its_number(changes,
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(StorageError, match=r"no run of a monitor: it has no run\.json"):
+    with pytest.raises(StorageError, match=r"is not a run of edp monitor run: it has no alarms\.jsonl"):
         read_run(tmp_path)

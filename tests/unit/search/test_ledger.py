@@ -27,7 +27,7 @@ from edp.storage.ledger import (
     leave_arrival,
     read_records,
 )
-from edp.storage.runs import environment
+from edp.storage.provenance import environment
 
 
 class Mode(StrEnum):

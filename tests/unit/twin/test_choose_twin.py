@@ -18,7 +18,7 @@ from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.lumped.parts import MassElement
 from edp.networks.twin.recurrent import Recurrent, averaged, member_seed
 from edp.networks.twin.static_map import StaticMap
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
 from edp.training import free_run_members
 from edp.training.free_run import FreeRunDiverged, FreeRunProgress, FreeRunSpec
@@ -43,7 +43,7 @@ def choice(run, training=TINY, recordings=None, **auto):
 
 @pytest.fixture
 def run(tmp_path):
-    with RunFolder(tmp_path / "run") as folder:
+    with Run(tmp_path / "run") as folder:
         yield folder
 
 
@@ -126,7 +126,7 @@ def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, mon
     assert result.spec.valve_map
     monkeypatch.setattr(choose_twin, "FAR_BEHIND", 1.7)
     errors |= {(False, 1): 0.95, (False, 3): 0.8, (False, 9): 0.7}
-    with RunFolder(run.path / "again") as other:
+    with Run(run.path / "again") as other:
         _, tried = choice(other, candidates=("recurrent",)).best()
     # Of a longer training yet, two folds without a gain are enough.
     assert [one.error for one in tried] == [0.9, 0.95, 0.95, 0.8, None]
@@ -143,7 +143,7 @@ def test_trainings_that_a_budget_has_no_time_for_are_left_out(run, monkeypatch):
     assert trained == [key for key in [*errors][:3] for _ in range(5)]
     assert [one.error for one in tried] == [0.9, 0.8, 0.85, None]
     assert tried[-1].why == "about 8 min of counted time with those before it, of minutes = 6"
-    with RunFolder(run.path / "again") as other:
+    with Run(run.path / "again") as other:
         result, tried = choice(other, candidates=("static", "recurrent"), minutes=0.5).best()
     assert result.spec == StaticMap(prefix_ticks=20)
     assert [one.label.split(",")[0] for one in tried] == ["static", "recurrent (5 x 32 units"]
@@ -234,7 +234,7 @@ def test_a_stopped_choice_goes_on_to_the_same_bits(tmp_path):
             if len(seen) == stop_at:
                 raise Stop
 
-        with RunFolder(folder) as run:
+        with Run(folder) as run:
             one = choice(run, training, candidates=("recurrent",))
             return TwinChoice(replace(one.fit, on_event=on_event), one.auto, one.run).best()
 

@@ -7,7 +7,7 @@ from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.free_run import FreeRunJudgeSpec, free_run_scores, free_runs
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.recurrent import Recurrent
-from edp.storage.runs import KeyedRun, RunFolder
+from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_series
 from edp.training.free_run import FreeRunDiverged, FreeRunSampler, FreeRunSpec, fit_free_runs, measured_ports
 from edp.training.optimizers import AdamW, Soap
@@ -70,15 +70,15 @@ def test_a_stopped_training_goes_on_to_the_same_bits(data, tmp_path, optimizer):
 
     whole = fit_free_runs(new(), train, validation, spec)
     for _ in range(2):
-        with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+        with Run(tmp_path) as folder, pytest.raises(Stop):
             fit_free_runs(new(), train, validation, spec, stop, KeyedRun(folder, "k" * 32))
-    with RunFolder(tmp_path) as folder:
+    with Run(tmp_path) as folder:
         resumed = fit_free_runs(new(), train, validation, spec, run=KeyedRun(folder, "k" * 32))
     first, second = whole.twin.arrays(), resumed.twin.arrays()
     assert all(np.array_equal(first[name], second[name]) for name in first)
     facts = [[{k: v for k, v in row.items() if k != "seconds"} for row in fit.history] for fit in (whole, resumed)]
     assert facts[0] == facts[1]
-    with RunFolder(tmp_path) as folder, pytest.raises(StorageError, match="belongs to another run"):
+    with Run(tmp_path) as folder, pytest.raises(StorageError, match="belongs to another run"):
         fit_free_runs(new(), train, validation, spec, run=KeyedRun(folder, "x" * 32))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME
-from edp.report.common.wording import MISSING, count_text, decimals_for, duration, figure, moment, number, percent
+from edp.report.common.wording import MISSING, count_text, decimals_for, duration, number, percent
 from edp.report.run.budget import budget_rows
 from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
@@ -207,40 +207,6 @@ def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
     values |= {row["number_format"]: row["parameter_bytes"] for row in values.get("estimates", [])}
     figures = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
     return [(label, f"{count_text(value)} {unit}".rstrip()) for label, value, unit in figures if value is not None]
-
-
-def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
-    """Where the run came from: command, seed, data, machine, versions."""
-    if facts.provenance is None:
-        return []
-    source = facts.provenance
-    rows: list[tuple[str, str]] = []
-
-    def add(label: str, value: object) -> None:
-        if value is not None and value != "":
-            rows.append((label, str(value)))
-
-    add("Created", moment(source.get("created")))
-    add("Command", source.get("command"))
-    add("Version", source.get("edp_version"))
-    add("Seed", source.get("seed"))
-    add("Regime", source.get("regime"))
-    add("Device", source.get("device"))
-    add("Diverged", source.get("diverged"))
-    add("Training time", duration(source["seconds"]) if "seconds" in source else None)
-    add("Parameters", count_text(source["parameters"]) if "parameters" in source else None)
-    data = source.get("data", {})
-    add("Data", data.get("source"))
-    add("Data digest", data.get("digest"))
-    add("Rate", f"{figure(facts.rate_hz)} Hz" if facts.rate_hz else None)
-    for part in ("train", "validation", "test"):
-        part_facts = data.get(part)
-        if isinstance(part_facts, Mapping):
-            hours = f", {number(part_facts['hours'], 2)} h" if part_facts.get("hours") is not None else ""
-            add(part.capitalize(), f"{count_of(part_facts.get('recordings'), 'recording')}{hours}")
-    for key, value in source.get("environment", {}).items():
-        add(key.replace("_", " ").capitalize(), value)
-    return rows
 
 
 def key_figures(facts: Facts) -> list[tuple[str, str, str]]:

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
 
 from edp.monitor.alarms import episodes
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
@@ -241,12 +240,3 @@ def confusion_sheet(facts: MonitorFacts) -> Sheet:
         Column("Further sensor that separates them"), Column("Error with it", "", share),
     )  # fmt: skip
     return Sheet("confusions", "Faults that cannot be told apart with the present sensors", heads, tuple(rows))
-
-
-def provenance_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Where a run comes from, as name and text."""
-    names = (
-        ("Monitor", "monitor"), ("Logs", "logs"), ("Written", "created"), ("Command", "command"),
-        ("EDP", "edp_version"),
-    )  # fmt: skip
-    return [(name, str(content[key])) for name, key in names if content.get(key)]

@@ -150,7 +150,8 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         )
     absent = tuple(name for name in MAKERS if not is_file_at(folder / name))
     if len(absent) == len(MAKERS):
-        raise StorageError(f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}")
+        missing = f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}"
+        raise StorageError(unfinished_text(folder) or missing)
 
     def json_part(name: str) -> Any:
         return None if name in absent else read_object(folder / name)

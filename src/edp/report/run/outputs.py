@@ -13,6 +13,7 @@ from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_object
 from edp.storage.paths import is_file_at
+from edp.storage.provenance import recording_names
 
 SHOWN = 4
 """Outputs or logs that a sentence names."""
@@ -50,7 +51,7 @@ def judged_line(scores: Mapping[str, Any], provenance: Mapping[str, Any] | None)
         return ""
     shown = listed(judged[:SHOWN]) if len(judged) <= SHOWN else f"{', '.join(judged[:SHOWN])} and others"
     line = f"Judged on {count_of(len(judged), 'test log')}: {shown}."
-    trained = (provenance or {}).get("data", {}).get("train", {}).get("names", [])
+    trained = recording_names(provenance or {}, "train")
     kinds = {kind_of_name(name) for name in judged}
     others = {kind_of_name(name) for name in trained} - kinds
     if len(judged) < FEW:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from edp.report.common import tables
 from edp.report.common.chart import Chart
+from edp.report.common.provenance import provenance_rows
 from edp.report.common.templates import asset, stylesheet, template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
@@ -88,7 +89,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "budget": budget_name(facts.footprint),
         "parts": tables.parts_table(facts),
         "footprint": tables.footprint_rows(facts),
-        "provenance": tables.provenance_rows(facts),
+        "provenance": provenance_rows(facts.provenance),
         "config": facts.config,
         "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
         "absent": facts.absent,

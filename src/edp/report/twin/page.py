@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from edp.report.common.provenance import provenance_rows
 from edp.report.common.templates import template
-from edp.report.common.wording import duration, moment, unbroken
+from edp.report.common.wording import unbroken
 from edp.report.run.page import shown
 from edp.report.twin import facts as words
 from edp.report.twin.charts import twin_charts
@@ -58,18 +58,3 @@ def render(facts: FreeRunFacts, title: str | None = None) -> str:
         **figures,
     }
     return template("twin.html.jinja").render(**context)
-
-
-def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Where the twin comes from, as name and text."""
-    data, contact = provenance.get("data"), provenance.get("ground_data")
-    seconds = provenance.get("seconds")
-    rows = [
-        ("Recordings", str(data.get("source", "")) if isinstance(data, dict) else ""),
-        ("Recordings with ground contact", str(contact.get("source", "")) if isinstance(contact, dict) else ""),
-        ("Trained in", duration(seconds) if isinstance(seconds, int | float) else ""),
-        ("Written", moment(provenance.get("created"))),
-        ("Command", str(provenance.get("command", ""))),
-        ("EDP", str(provenance.get("edp_version", ""))),
-    ]
-    return [(name, text) for name, text in rows if text]

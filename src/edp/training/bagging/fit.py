@@ -20,7 +20,7 @@ from edp.data.fold_ridge import FoldRidge, fold_ridge
 from edp.data.lags import DoubleArray
 from edp.data.prepared import Prepared
 from edp.networks.predictor import ModelSpec, Predictor, build_model
-from edp.storage.runs import RunFolder
+from edp.storage.runs import Run
 from edp.training.bagging.boosting import TreeLearner
 from edp.training.bagging.dead_band import band, dead_bands
 from edp.training.bagging.learner import FoldFit, HeadPart, Learner
@@ -98,7 +98,7 @@ def fit_in_folds(
     data: Prepared,
     model: ModelSpec,
     spec: TrainingSpec,
-    run: RunFolder | None,
+    run: Run | None,
     on_event: Event,
 ) -> Fitted:
     """As `fit_bagged`, with its history in a run folder; there is no checkpoint: a stopped training begins anew."""

@@ -3,31 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.config.experiment import experiment_toml
 from edp.data.prepared import Prepared
 from edp.data.series import Series
-from edp.errors import ConfigError, ExportError
+from edp.errors import ConfigError
 from edp.ir.rls import Adaptation, AdaptationSpec
 from edp.ir.rls.constants import FEATURE_LIMIT
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import Kind
 from edp.storage import write_bytes, write_json
-from edp.storage.paths import is_file_at, is_there
-from edp.storage.runs import RunFolder, check_claimable
+from edp.storage.paths import is_file_at
+from edp.storage.runs import Run, check_claimable, run_key
 from edp.training import save_bundle
+from edp.training.bundle import weights_digest
 from edp.workflows.adaptation.replay import replay
 from edp.workflows.deployment import footprint_of
 from edp.workflows.train_evaluate import trained_run
 
 Rows = NDArray[np.float64]
-COPIED = ("config.toml", "history.jsonl")
+HISTORY = "history.jsonl"
 
 
 def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> tuple[Adaptation, dict[str, Any]]:
@@ -35,7 +37,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
 
     Args:
         run: run folder, in single precision or integer (W8A16).
-        out: folder of the new run; one that `adapt` wrote is replaced.
+        out: folder of the new run.
         spec: options.
 
     Returns:
@@ -47,22 +49,19 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     """
     check_claimable(out)
     folder = Path(run)
-    bundle, _, provenance, data = trained_run(folder)
-    # A trained run in the folder would be lost: its bundle has the same name.
-    if is_there(Path(out) / "run.json"):
-        raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
-    adaptation = fit_adaptation(bundle.predictor, data, spec or AdaptationSpec())
-    with RunFolder(out) as target:
-        for name in COPIED:
-            if is_file_at(folder / name):
-                write_bytes(target.file(name), (folder / name).read_bytes())
+    bundle, experiment, provenance, data = trained_run(folder)
+    spec = spec or AdaptationSpec()
+    key = run_key({"adaptation": asdict(spec), "weights": weights_digest(bundle.predictor)}, data.digest)
+    with Run.create(out, "adaptation", key, experiment_toml(experiment)) as target:
+        adaptation = fit_adaptation(bundle.predictor, data, spec)
+        if is_file_at(folder / HISTORY):
+            write_bytes(target.file(HISTORY), (folder / HISTORY).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         # The footprint counts the adaptation too; the one of the source run would state too little.
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json())
         facts = replay(bundle.predictor, adaptation, data.test).to_json(data.task, data.target_kinds)
         write_json(target.file("adaptation.json"), facts)
-        target.write_status("finished")
     return adaptation, facts
 
 

@@ -8,19 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 from edp.config.experiment import plain_tree
 from edp.data.prepared import Prepared
 from edp.data.scaling import least_spread
 from edp.data.task import TargetMode
-from edp.errors import ConfigError, DataError, StorageError
+from edp.errors import ConfigError, DataError
 from edp.logs.source import DataSource
 from edp.recording import FloatArray, Recording
 from edp.report.run.choice import FILE, FLOOR, read_choice
 from edp.signals import Kind
-from edp.storage import make_folder, read_object, write_json
-from edp.storage.paths import is_file_at, is_there
-from edp.storage.runs import check_claimable, run_key
+from edp.storage import write_json
+from edp.storage.runs import FINISHED, Run, check_claimable, run_key, state_of
 from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.workflows.auto.candidates import LEAST_SPAN, Amount
@@ -28,7 +28,7 @@ from edp.workflows.auto.channels import MOST_LISTED, fit_to_channels
 from edp.workflows.auto.choice_facts import choice_facts
 from edp.workflows.auto.division import divide
 from edp.workflows.auto.foundation import Foundation, read_foundation
-from edp.workflows.auto.portfolio import Trainer, train_portfolio
+from edp.workflows.auto.portfolio import TrainedPortfolio, Trainer, train_portfolio
 from edp.workflows.auto.promise import choose
 from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.auto.size import check_size
@@ -91,13 +91,29 @@ def train_auto(
     if foundation is not None:
         foundation.check_task(data)
     key = _key(settings, data, foundation)
-    folder = make_folder(out)
-    finished = _finished(folder, key)
+    finished = _finished(Path(out), key)
     if finished is not None:
         return finished
     _check_moving(data)
     check_size(data)
-    portfolio = train_portfolio(settings, data, amount, folder, Trainer(workers, on_event, on_candidate))
+    with Run.create(out, "auto", key, tomli_w.dumps(plain_tree(settings))) as run:
+        portfolio = train_portfolio(settings, data, amount, run.path, Trainer(workers, on_event, on_candidate))
+        return _write_choice(run, source, portfolio, data, settings, [*of_channels, *of_parts, *_still_inputs(data)])
+
+
+def _write_choice(
+    run: Run,
+    source: DataSource,
+    portfolio: TrainedPortfolio,
+    data: Prepared,
+    settings: AutoSettings,
+    notes: Sequence[str],
+) -> AutoResult:
+    """Choose among the trained candidates and write the winner into the run.
+
+    Raises:
+        ConfigError: every candidate diverged.
+    """
     outcomes, amount = portfolio.outcomes, portfolio.amount
     trained = {name: one for name, one in outcomes.items() if isinstance(one, TrainedCandidate)}
     failed = {name: one for name, one in outcomes.items() if isinstance(one, str)}
@@ -105,16 +121,15 @@ def train_auto(
         raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
     choice = choose({name: one.promise for name, one in trained.items()})
     facts = choice_facts(choice, trained, failed, data, settings, amount) | {
-        "key": key,
-        "notes": [*of_channels, *of_parts, *_still_inputs(data), *portfolio.notes],
+        "key": run.key,
+        "notes": [*notes, *portfolio.notes],
     }
     winner, floor = trained[choice.name], trained.get(FLOOR)
-    # First the choice, whose key tells a folder that a kill left between the two from one of another run.
-    write_json(folder / FILE, facts)
+    write_json(run.file(FILE), facts)
     if floor is not None and winner is not floor:
         # What the skill is measured against: `edp evaluate` needs its error on the test recordings, too.
-        save_bundle(make_bundle(floor.fitted.predictor, data, {"auto": facts["sentence"]}), folder / FLOOR)
-    bundle = keep_fitted(folder, source, winner.experiment, data, winner.fitted, {"auto": facts["sentence"]})
+        save_bundle(make_bundle(floor.fitted.predictor, data, {"auto": facts["sentence"]}), run.file(FLOOR))
+    bundle = keep_fitted(run, source, winner.experiment, data, winner.fitted, {"auto": facts["sentence"]})
     return AutoResult(bundle, facts)
 
 
@@ -125,22 +140,12 @@ def _key(settings: AutoSettings, data: Prepared, foundation: Foundation | None) 
 
 
 def _finished(folder: Path, key: str) -> AutoResult | None:
-    """A result that is there already.
-
-    Raises:
-        StorageError: the folder holds another run.
-    """
+    """Return the result of a finished run with this key; None if there is none."""
+    # The key stands in the choice, too: earlier versions wrote the winner's key into the identity of the run.
     facts = read_choice(folder)
-    if facts is not None and facts["key"] == key:
-        status = folder / "status.json"
-        finished = is_file_at(status) and read_object(status).get("status") == "finished"
-        return AutoResult(load_bundle(folder), dict(facts)) if finished else None
-    if facts is not None or is_there(folder / "run.json"):
-        raise StorageError(
-            f"run folder '{folder}' holds another run (other settings, data or version); nothing was changed. Choose "
-            "another folder with --out, or remove this one"
-        )
-    return None
+    if facts is None or facts["key"] != key or state_of(folder) != FINISHED:
+        return None
+    return AutoResult(load_bundle(folder), dict(facts))
 
 
 class _ReadOnce:

@@ -13,7 +13,7 @@ from edp.errors import EdpError, LostError
 from edp.sandbox.helpers import Helpers
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.paths import is_file_at
-from edp.storage.runs import KeyedRun, RunFolder, run_key
+from edp.storage.runs import KeyedRun, Run, run_key
 from edp.training import Diverged, Fitted, TrainingProgress
 from edp.training.bagging.fit import fit_bagged
 from edp.training.blas import one_blas_thread
@@ -102,10 +102,9 @@ def _by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCan
     experiment, begun = job.experiment, {}
     if job.foundation is not None:
         begun = {"foundation": job.foundation.facts}
-    with RunFolder(job.folder) as run:  # a stop is gone on from
-        settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
-        key = run_key(settings | begun, job.data.digest)
-        run.claim(key, experiment_toml(experiment))
+    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    key = run_key(settings | begun, job.data.digest)
+    with Run.create(job.folder, "network", key, experiment_toml(experiment)) as run:
         strategy = None if job.foundation is None else job.foundation.strategy()
         fitted = fit(job.data, experiment.model, experiment.training, KeyedRun(run, key), on_event, strategy)
     promise = promise_of_validation(fitted.predictor, job.data, job.blocks, job.judged)

@@ -19,7 +19,8 @@ from edp.networks.predictor import Predictor
 from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, integer
 from edp.settings.tree import SettingsTree
 from edp.storage.paths import is_file_at
-from edp.storage.runs import check_claimable, read_provenance
+from edp.storage.provenance import read_provenance
+from edp.storage.runs import check_claimable
 from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.spec import TrainingSpec

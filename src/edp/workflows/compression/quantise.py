@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from edp.config.experiment import experiment_toml
 from edp.errors import ExportError
 from edp.export.c.sizes import constant_bytes
 from edp.networks.integer import integer_predictor
 from edp.networks.running import mean_error
-from edp.storage import check_writable, write_bytes, write_json
-from edp.storage.paths import is_file_at, is_there
-from edp.storage.runs import RunFolder, check_claimable
+from edp.storage import write_bytes, write_json
+from edp.storage.paths import is_file_at
+from edp.storage.runs import Run, check_claimable, run_key
 from edp.training import save_bundle
+from edp.training.bundle import weights_digest
 from edp.workflows.train_evaluate import trained_run
 
 
@@ -23,7 +25,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
 
     Args:
         run: run folder of a float network.
-        out: folder of the new run; one that holds such a run already is replaced.
+        out: folder of the new run.
         ticks: about how many ticks of the training part run through the whole network.
 
     Returns:
@@ -35,24 +37,21 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     """
     check_claimable(out)
     folder = Path(run)
-    bundle, _, provenance, data = trained_run(folder)
+    bundle, experiment, provenance, data = trained_run(folder)
     if bundle.predictor.number_format != "float32":
         raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
-    if is_there(Path(out) / "run.json"):
-        raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
-    check_writable(out)
-    with RunFolder(out) as target:
+    key = run_key({"quantised": ticks, "weights": weights_digest(bundle.predictor)}, data.digest)
+    with Run.create(out, "network", key, experiment_toml(experiment)) as target:
         integer_network = integer_predictor(bundle.predictor, data.train, ticks)
         # Both errors on the validation part, so that the loss by rounding is not mixed with other data.
         errors = {
             name: mean_error(one, data.validation)
             for name, one in (("float", bundle.predictor), ("integer", integer_network))
         }
-        for name in ("config.toml", "history.jsonl", "footprint.json"):
+        for name in ("history.jsonl", "footprint.json"):
             if is_file_at(folder / name):
                 write_bytes(target.file(name), (folder / name).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"number_format": integer_network.number_format})
         # Scores are those of the float network; they would be wrong for the integer one.
         save_bundle(replace(bundle, predictor=integer_network, scores={}), target.file("bundle"))
-        target.write_status("finished")
     return errors | {"bytes": float(constant_bytes(integer_network.integers, bundle.adaptation))}

@@ -20,7 +20,7 @@ from edp.signals import KINDS
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.ledger import Ledger
 from edp.storage.paths import is_file_at
-from edp.storage.runs import RunFolder, check_claimable, run_key
+from edp.storage.runs import Run, check_claimable, run_key
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.strategy import DirectFit, TrainingStrategy
@@ -198,8 +198,7 @@ def search(
     # The judge changes no weights; its settings stay out of the key.
     settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
-    with RunFolder(out) as folder:
-        folder.claim(key, experiment_toml(experiment))
+    with Run.create(out, "compression", key, experiment_toml(experiment)) as folder:
         bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), callbacks)
         # A network judged in several formats is streamed in float only once.
         bench.frozen = frozen
@@ -346,7 +345,7 @@ class _Evaluator:
 
 
 def _judge_held_out(
-    result: CompressionResult, evaluator: _Evaluator, folder: RunFolder, held_out: _HeldOutTest, again: bool
+    result: CompressionResult, evaluator: _Evaluator, folder: Run, held_out: _HeldOutTest, again: bool
 ) -> dict[str, Any]:
     """Judge teacher and chosen on the sealed test set, once; the opening is recorded before it is made."""
     pair = {"teacher": result.teacher, "chosen": result.best}

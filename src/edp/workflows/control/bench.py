@@ -19,6 +19,7 @@ from edp.control.plants import plant_of, twin_of
 from edp.control.tasks import draw_task
 from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_map
 from edp.errors import ConfigError
+from edp.storage.headers import model_digest
 from edp.storage.paths import is_folder_at
 from edp.training.bundle import load_bundle
 
@@ -39,6 +40,15 @@ class ControlSources:
     predictor: Path | None = None
     # Not a setting of the run: it decides whether there is one.
     trusted: bool = field(default=False, repr=False)
+
+    def digests(self) -> dict[str, str]:
+        """Return a hash of the content of each source, as part of the key of a run.
+
+        Raises:
+            StorageError: a file cannot be read.
+        """
+        named = {"plant": self.plant, "twin": self.twin, "predictor": self.predictor}
+        return {name: model_digest(path) for name, path in named.items() if path is not None}
 
 
 class ControlBench:

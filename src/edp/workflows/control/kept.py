@@ -34,7 +34,7 @@ from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, write_bytes, write_json
 from edp.storage.headers import read_header
 from edp.storage.paths import entries_of, is_file_at
-from edp.storage.runs import unfinished_text
+from edp.storage.runs import missing_text
 from edp.training.bundle import as_damage, check_hash, read_arrays, with_plugins, write_arrays
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 
@@ -129,11 +129,7 @@ def load_kept(run: str | Path) -> KeptController:
     path = Path(run)
     folder = path / KEPT
     if not is_file_at(folder / HEADER):
-        raise StorageError(
-            unfinished_text(path)
-            or f"'{path}' has no {KEPT}/{HEADER}: it is not a run of edp control, or one of an earlier version; run "
-            "edp control again, in a new folder"
-        )
+        raise StorageError(missing_text(path, "control", "a run of edp control, or is one of an earlier version"))
     with as_damage(folder):
         header = read_header(folder / HEADER, ("schema",))
         if header["schema"] != SCHEMA:

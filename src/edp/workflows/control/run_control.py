@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +19,10 @@ from edp.control.tasks import TASKS, ControlTask
 from edp.logs import write_recording
 from edp.report import ControlFacts, write_control_page
 from edp.report.animation.page import scene_of
+from edp.report.common.provenance import provenance_rows
 from edp.storage import make_folder, write_json
-from edp.storage.runs import RunFolder, check_claimable, check_free, command_line, run_key
+from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.control.kept import keep_controller
 
@@ -70,10 +71,9 @@ def control_loops(
     bench.check()
     if guard is not None:
         guard.reset(bench.plant)
-    key = repr(chosen) if guard is None else f"{chosen!r} {guard!r}"
-    with RunFolder(out) as run:
-        run.claim(run_key(CONTROL_SETTINGS.plain(experiment), key), control_toml(experiment))
-        run.write_status("running", kind="control")
+    models = {"sources": chosen.digests(), "guard": None if guard is None else repr(guard)}
+    key = run_key(CONTROL_SETTINGS.plain(experiment) | models, "")
+    with Run.create(out, "control", key, control_toml(experiment)) as run:
         results = bench.results(on_loop=on_loop, guard=guard)
         folder = make_folder(run.file(LOOPS))
         for result in results:
@@ -81,8 +81,15 @@ def control_loops(
         keep_controller(run.path, bench.plant, bench.models, chosen.twin, (bench.tasks[0], results[0]))
         content = _content(experiment, bench.tasks, results)
         write_json(run.file(RESULTS), content)
-        page = write_control_page(_facts(run.path.name, content, results, chosen), run.file(PAGE))
-        run.write_status("finished")
+        provenance = new_provenance() | {
+            "seed": experiment.seed,
+            "machine": content["machine"],
+            "plant": content["plant"] if chosen.plant is None else str(chosen.plant),
+            "twin": str(chosen.twin or ""),
+            "predictor": str(chosen.predictor or ""),
+        }
+        write_json(run.file(PROVENANCE), provenance)
+        page = write_control_page(_facts(run.path.name, content, results, provenance), run.file(PAGE))
     return ControlRun(content, results, page)
 
 
@@ -157,18 +164,9 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _facts(
-    title: str, content: Mapping[str, Any], results: Sequence[LoopResult], sources: ControlSources
+    title: str, content: Mapping[str, Any], results: Sequence[LoopResult], provenance: Mapping[str, Any]
 ) -> ControlFacts:
     recordings = [result.recording for result in results]
-    rows = [
-        ("Machine", str(content["machine"])),
-        ("Plant", str(content["plant"] if sources.plant is None else sources.plant)),
-        ("Twin of the controller", str(sources.twin or "")),
-        ("Predictor of the controller", str(sources.predictor or "")),
-        ("Written", time.strftime("%Y-%m-%d %H:%M")),
-        ("Command", command_line()),
-        ("EDP", __version__),
-    ]
     scene = scene_of(recordings[0], str(content["machine"]))
     solve_us = [result.solve_s * 1e6 for result in results]
-    return ControlFacts(title, content, recordings, solve_us, scene, [row for row in rows if row[1]])
+    return ControlFacts(title, content, recordings, solve_us, scene, provenance_rows(provenance))

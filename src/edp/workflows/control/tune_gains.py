@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,15 +13,16 @@ from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
 from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer
-from edp.storage import write_bytes, write_json
-from edp.storage.runs import RunFolder, check_claimable, check_free, run_key
+from edp.storage import read_object, write_bytes, write_json
+from edp.storage.paths import is_file_at
+from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.search.space import Real
 from edp.workflows.search.study import SamplerSpec, Study
 
 TUNING_SEED = 1_000_000
 """First seed of the references that gains are tuned on; those that judge begin at 0 and never come so far."""
-TUNED, RESULTS = "tuned.toml", "tuning.json"
+TUNED, RESULTS, TRIALS = "tuned.toml", "tuning.json", "trials.json"
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def tune_gains(
 
     Args:
         experiment: task, machine, the controller to begin with, and the seeds that judge.
-        out: run folder.
+        out: run folder; a stopped tuning continues after its last trial, and a finished one is read.
         tuned_on: plant and models of the tuning.
         judged_on: plant and models of the judgement.
         tuning: how.
@@ -89,30 +90,34 @@ def tune_gains(
         )
     check_claimable(out)
     check_free(out, "edp tune")
-    key = run_key(CONTROL_SETTINGS.plain(experiment), repr((tuned_on, judged_on, chosen)))
     # Both before the first trial, and before the folder is claimed: what is refused is refused at once.
     bench = ControlBench(replace(experiment, seed=TUNING_SEED, loops=chosen.loops), tuned_on)
     judge = ControlBench(experiment, judged_on)
     bench.check()
     judge.check()
-    with RunFolder(out) as run:
-        run.claim(key, control_toml(experiment))
-        run.write_status("running", kind="tuning")
+    sources = {"tuned_on": tuned_on.digests(), "judged_on": judged_on.digests()}
+    key = run_key(CONTROL_SETTINGS.plain(experiment) | sources | {"tuning": asdict(chosen)}, "")
+    with Run.create(out, "tuning", key, control_toml(experiment)) as run:
+        if run.is_finished:
+            content = read_object(run.file(RESULTS), ("gains", "controller"))
+            return Tuning(with_gains(experiment.controller, content["gains"]), content)
         study = Study(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )
         study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
         rows: list[dict[str, Any]] = []
+        earlier = _earlier_costs(run)
         best = experiment.controller
         for number in range(chosen.trials):
             if on_trial is not None:
                 on_trial(f"trial {number + 1}", number, chosen.trials)
             trial = study.ask(1)[0]
             spec = with_gains(experiment.controller, trial.values)
-            cost = bench.cost(spec)
+            cost = earlier[number] if number < len(earlier) else bench.cost(spec)
             study.tell(trial.number, [cost])
             best = spec if not rows or cost < min(row["cost_mm"] for row in rows) else best
             rows.append({"gains": dict(trial.values), "cost_mm": cost})
+            write_json(run.file(TRIALS), {"costs_mm": [row["cost_mm"] for row in rows]})
         before, after = judge.cost(experiment.controller), judge.cost(best)
         content = {
             "schema": 1,
@@ -124,8 +129,13 @@ def tune_gains(
         }
         write_json(run.file(RESULTS), content)
         write_bytes(run.file(TUNED), control_toml(replace(experiment, controller=best)).encode())
-        run.write_status("finished")
     return Tuning(best, content)
+
+
+def _earlier_costs(run: Run) -> list[float]:
+    """Return the costs (mm) of the trials that a stopped tuning made; its trials are the same in each call."""
+    file = run.file(TRIALS)
+    return [float(cost) for cost in read_object(file, ("costs_mm",))["costs_mm"]] if is_file_at(file) else []
 
 
 def with_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec:

@@ -19,7 +19,7 @@ from edp.errors import ConfigError, LostError
 from edp.storage import write_bytes
 from edp.storage.ledger import Record, TrainingStatus, code_version, left_state
 from edp.storage.paths import is_there
-from edp.storage.runs import environment
+from edp.storage.provenance import environment
 from edp.workflows.executors.base import (
     EXECUTORS,
     RETRIES,

@@ -20,7 +20,7 @@ from typing import Any
 from edp.errors import EdpError, LostError, StorageError
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, code_version, read_state
 from edp.storage.paths import is_folder_at
-from edp.storage.runs import environment
+from edp.storage.provenance import environment
 from edp.workflows.executors.base import START, Executor, Job, Workforce, complete
 
 TRIED_AGAIN = tuple(status for status in TrainingStatus if status is not TrainingStatus.DONE)

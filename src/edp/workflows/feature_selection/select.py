@@ -23,7 +23,7 @@ from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.paths import full_path
-from edp.storage.runs import command_line
+from edp.storage.provenance import command_line
 from edp.workflows.feature_selection.changes import with_changes
 from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
 

@@ -14,7 +14,7 @@ from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path
-from edp.storage.runs import read_provenance
+from edp.storage.provenance import read_provenance
 from edp.training.blas import one_blas_thread
 from edp.workflows.executors import Workforce
 from edp.workflows.executors.packing import packed, unpacked

@@ -18,10 +18,10 @@ from edp.evaluation.judge import score_predictions
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import KINDS
-from edp.storage import check_writable, make_folder, object_with, read_object, write_bytes, write_json
+from edp.storage import make_folder, object_with, read_object, write_bytes, write_json
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path, is_file_at
-from edp.storage.runs import unfinished_text
+from edp.storage.runs import Run, check_claimable, missing_text, run_key
 from edp.training.bundle import load_bundle, save_bundle, weights_digest
 from edp.training.delta import DELTA_BYTES, SUFFIX, delta_from_bytes, delta_of, read_delta, with_delta
 from edp.workflows.executors import Workforce
@@ -91,38 +91,41 @@ def finetune_fleet(
     Raises:
         EdpError: a source or store that cannot be used.
     """
+    check_claimable(out)
     base = read_source(source, recordings=False)
     digest = weights_digest(base.predictor)
     machines = machines_of(store)
-    folder = check_writable(out)
+    # Without the machines: more of them may be added to the same fleet.
+    key = run_key({"fleet": asdict(order), "base": digest}, "")
     units = [_unit(machine, digest, source, store, order) for machine in machines]
 
     def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
         if on_machine is not None:
             on_machine(str(unit.arguments["machine"]), done, len(units))
 
-    results = run_units(units, workforce, folder / UNITS, note)
-    rows = []
-    for machine, result in zip(machines, results, strict=True):
-        row = {"machine": machine.name, "minutes": round(machine.minutes, 3), **result.values}
-        if result.content is not None:
-            row["delta"] = f"{DELTAS}/{file_of(machine.name)}"
-            write_bytes(make_folder(folder / DELTAS) / file_of(machine.name), result.content)
-        rows.append(row)
-    content = {
-        "schema": SCHEMA,
-        "edp": __version__,
-        "base": digest,
-        "source": str(full_path(Path(source))),
-        "store": str(full_path(Path(store))),
-        "method": order.method,
-        "most_bytes": order.most_bytes,
-        "unit": _unit_of(base),
-        "horizon": base.bundle.task.horizons[0],
-        "rate_hz": base.bundle.task.rate_hz,
-        "machines": rows,
-    }
-    write_json(folder / FLEET, content)
+    with Run.create(out, "fleet", key) as run:
+        results = run_units(units, workforce, run.file(UNITS), note)
+        rows = []
+        for machine, result in zip(machines, results, strict=True):
+            row = {"machine": machine.name, "minutes": round(machine.minutes, 3), **result.values}
+            if result.content is not None:
+                row["delta"] = f"{DELTAS}/{file_of(machine.name)}"
+                write_bytes(make_folder(run.file(DELTAS)) / file_of(machine.name), result.content)
+            rows.append(row)
+        content = {
+            "schema": SCHEMA,
+            "edp": __version__,
+            "base": digest,
+            "source": str(full_path(Path(source))),
+            "store": str(full_path(Path(store))),
+            "method": order.method,
+            "most_bytes": order.most_bytes,
+            "unit": _unit_of(base),
+            "horizon": base.bundle.task.horizons[0],
+            "rate_hz": base.bundle.task.rate_hz,
+            "machines": rows,
+        }
+        write_json(run.file(FLEET), content)
     return content
 
 
@@ -172,8 +175,8 @@ def read_fleet(folder: str | Path) -> dict[str, Any]:
         ConfigError: of another schema.
     """
     file = Path(folder, FLEET)
-    if not is_file_at(file) and (unfinished := unfinished_text(folder)):
-        raise StorageError(unfinished)
+    if not is_file_at(file):
+        raise StorageError(missing_text(folder, "fleet", "a fleet"))
     content = object_with(read_object(file), ("schema", "base", "source", "machines"), f"'{file}'")
     if content["schema"] != SCHEMA:
         raise ConfigError(f"'{file}' has schema {content['schema']}; this version of EDP reads {SCHEMA}: update it")

@@ -30,7 +30,7 @@ from edp.storage import (
 )
 from edp.storage.folders import check_kind
 from edp.storage.paths import entries_of, is_file_at, is_folder_at
-from edp.storage.runs import read_provenance
+from edp.storage.provenance import read_provenance
 from edp.training import Bundle, load_bundle, save_bundle
 from edp.training.bundle import weights_digest
 from edp.training.delta import MOST_BYTES, read_delta

@@ -20,7 +20,7 @@ from edp.monitor.detectable import effort_line, found_sizes, healthy_range, meas
 from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
-from edp.monitor.monitor_file import save_monitor
+from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.monitor.residuals.base import FitMaterial, ResidualSource, ResidualSpec, SideBySide, note_nothing
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.residuals.groups import Group, sensed_channels
@@ -29,10 +29,11 @@ from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.recording import Recording
 from edp.sandbox.helpers import Helpers
 from edp.signals import Channel
-from edp.storage import check_writable, remove_unfinished, write_bytes
-from edp.storage.folders import check_kind
-from edp.storage.locks import holding
+from edp.storage import write_json
+from edp.storage.headers import model_digest
 from edp.storage.paths import is_there
+from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
@@ -90,7 +91,7 @@ def fit_monitor(
         runs: run folders of networks or twins of this machine; may be empty.
         source: healthy logs.
         experiment: settings.
-        out: folder of the monitor.
+        out: folder of the monitor; that of a finished fit with the same settings and logs is read.
         note: called with what begins.
         workers: processes side by side, 0 for one a core; the monitor does not depend on it, unless the dictionary has
             not the time for all of its draws: several processes make them all.
@@ -98,12 +99,16 @@ def fit_monitor(
     Raises:
         EdpError: runs or logs that cannot be used, or too few hours for the promise, or a process died.
     """
-    check_kind(out, "monitor", what="edp monitor fit")
-    check_writable(out)
-    with holding(Path(out) / ".lock", f"monitor folder '{out}'"):
-        remove_unfinished(Path(out))
-        bundles = [_network_of(run) for run in runs]
-        recordings = source.read()
+    check_claimable(out)
+    bundles = [_network_of(run) for run in runs]
+    recordings = source.read()
+    settings = monitor_toml(experiment)
+    models = [model_digest(run) for run in runs]
+    origin = source.origin(recordings)
+    key = run_key({"monitor": settings, "models": models}, origin["digest"])
+    with Run.create(out, "monitor", key, settings) as opened:
+        if opened.is_finished:
+            return _read_fitted(opened.path, experiment)
         with Helpers(workers or os.cpu_count() or 1, _died) as helpers:
 
             def side_by_side(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
@@ -112,9 +117,21 @@ def fit_monitor(
             fitted = fit_to_recordings(
                 recordings, experiment, bundles, note, side_by_side=map if helpers.workers == 1 else side_by_side
             )
-        folder = save_monitor(fitted.monitor, out)
-        write_bytes(folder / "settings.toml", monitor_toml(experiment).encode())
-        return replace(fitted, folder=folder)
+        provenance = new_provenance(origin) | {"seed": experiment.seed, "seconds": round(fitted.seconds, 2)}
+        write_json(opened.file(PROVENANCE), provenance)
+        return replace(fitted, folder=save_monitor(fitted.monitor, opened.path))
+
+
+def _read_fitted(folder: Path, experiment: MonitorExperiment) -> FittedMonitor:
+    """Return the monitor of a finished run."""
+    monitor = load_monitor(folder)
+    provenance = monitor.provenance
+    alone = _fits_one_machine(experiment, monitor.sources)
+    return FittedMonitor(monitor, tuple(provenance["doubtful"]), provenance["seconds"], folder, one_machine=alone)
+
+
+def _fits_one_machine(experiment: MonitorExperiment, sources: Sequence[ResidualSource]) -> bool:
+    return not experiment.chain.tolerance and any(isinstance(source, FlowBalances) for source in sources)
 
 
 def _in_one_thread(function: Callable[[Any], Any], job: Any) -> Any:
@@ -206,7 +223,7 @@ def fit_to_recordings(
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     provenance = dict(monitor.provenance) | measured | {"seconds": time.process_time() - began}
     monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, note, side_by_side)
-    alone = not experiment.chain.tolerance and any(isinstance(source, FlowBalances) for source in sources)
+    alone = _fits_one_machine(experiment, sources)
     return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began, None, fitted.sessions, alone)
 
 

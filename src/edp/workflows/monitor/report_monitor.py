@@ -13,12 +13,15 @@ from edp.monitor.alarms import SEVERITIES
 from edp.monitor.diagnosis.causes import Cause
 from edp.monitor.diagnosis.structure import MOST_PAIRS, confusion_of
 from edp.monitor.traces import read_traces
-from edp.report.monitor.facts import AlarmFacts, MonitorFacts, provenance_rows
+from edp.report.common.provenance import provenance_rows
+from edp.report.monitor.facts import AlarmFacts, MonitorFacts
 from edp.report.monitor.page import write_monitor_page
 from edp.storage import JSON_BYTES, object_with, parse_json, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_there
-from edp.workflows.monitor.run_monitor import ALARM_LOG, RUN
+from edp.storage.provenance import PROVENANCE
+from edp.storage.runs import IDENTITY, missing_text
+from edp.workflows.monitor.run_monitor import ALARM_LOG, RESULT
 
 PAGE = "report.html"
 LONGEST = 4096
@@ -52,13 +55,13 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     Raises:
         StorageError: it is no run of a monitor, or is damaged.
     """
-    if not is_there(folder / RUN):
-        raise StorageError(
-            f"'{folder}' is no run of a monitor: it has no {RUN}; give a folder that edp monitor run wrote"
-        )
-    content = read_object(folder / RUN, ("promise", "monitor", "classes", "confusions"))
+    # Earlier versions wrote the result into the file that states the identity of a run.
+    file = folder / (RESULT if is_there(folder / RESULT) else IDENTITY)
+    if not is_there(folder / ALARM_LOG):
+        raise StorageError(missing_text(folder, "monitor run"))
+    content = read_object(file, ("promise", "monitor", "classes", "confusions"))
     check_files(content, folder, "run the monitor again")
-    where = f"'{folder / RUN}'"
+    where = f"'{file}'"
     pairs, classes = content["confusions"], content["classes"]
     if not isinstance(pairs, list) or len(pairs) > MOST_PAIRS or type(classes) is not int or classes < 0:
         raise StorageError(f"{where} is damaged: confusions or classes; run the monitor again")
@@ -73,10 +76,15 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
         _text(content["promise"], where),
         confusions,
         classes,
-        provenance_rows({key: value for key, value in content.items() if isinstance(value, str) and key != "unseen"}),
+        provenance_rows(_provenance(folder, content)),
         _remarks(content, where),
         _text(content.get("unseen", ""), where),
     )
+
+
+def _provenance(folder: Path, content: Mapping[str, Any]) -> Mapping[str, Any]:
+    file = folder / PROVENANCE
+    return {**content, **(read_object(file) if is_there(file) else {})}
 
 
 def _remarks(content: Mapping[str, Any], where: str) -> dict[str, list[str]]:

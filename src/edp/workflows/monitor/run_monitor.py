@@ -7,13 +7,11 @@ import io
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edp import __version__
 from edp.logs.source import DataSource
 from edp.monitor.alarms import MonitorAlarm, episodes
 from edp.monitor.detectable import found_sizes, outside_line, unseen_line
@@ -22,10 +20,12 @@ from edp.monitor.monitor_file import load_monitor
 from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
 from edp.recording import Recording
 from edp.report.monitor.facts import start_time
-from edp.storage import check_writable, write_bytes, write_json
-from edp.storage.headers import FILES, digests_of
+from edp.storage import write_bytes, write_json
+from edp.storage.headers import FILES, digests_of, model_digest
+from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.runs import Run, check_claimable, run_key
 
-ALARM_LOG, RUN = "alarms.jsonl", "run.json"
+ALARM_LOG, RESULT = "alarms.jsonl", "monitor_run.json"
 START = "start"
 """Where the meta of a recording says when it began, as ISO 8601 text."""
 
@@ -100,7 +100,7 @@ def run_monitor(
     Args:
         folder: of the monitor.
         source: the logs.
-        out: folder for the alarm log as JSON lines and as CSV, and for what `edp monitor report` shows.
+        out: run folder for the alarm log as JSON lines and as CSV, and for what `edp monitor report` shows.
         on_recording: called with the name of the recording that begins, how many are done, and how many there are.
 
     Raises:
@@ -114,7 +114,7 @@ def run_monitor(
     outside: dict[str, str] = {}
     traces: list[RecordingTrace] = []
     if out is not None:
-        check_writable(out)
+        check_claimable(out)
     groups = groups_of(monitor)
     recordings = source.read()
     for done, recording in enumerate(recordings):
@@ -144,7 +144,11 @@ def run_monitor(
         RunTraces(monitor.block_s, detectors, tuple(groups), tuple(traces)), unlearned, unlike, outside,
     )  # fmt: skip
     if out is not None:
-        _write(run, Path(out), str(folder))
+        origin = source.origin(recordings)
+        key = run_key({"monitor": model_digest(folder)}, origin["digest"])
+        with Run.create(out, "monitor run", key) as opened:
+            write_json(opened.file(PROVENANCE), new_provenance(origin) | {"monitor": str(folder)})
+            _write(run, opened.path, str(folder))
     return run
 
 
@@ -189,8 +193,6 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
     facts = {
         "monitor": monitor,
         "promise": run.monitor.limit.sentence(),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "edp_version": __version__,
         "recordings": len(run.recordings),
         "silent": {name: list(channels) for name, channels in run.silent.items()},
         "unlearned": {name: list(reasons) for name, reasons in run.unlearned.items()},
@@ -200,7 +202,7 @@ def _write(run: MonitorRun, folder: Path, monitor: str) -> None:
         "classes": 0 if dictionary is None else len(dictionary.classes),
         "confusions": [] if dictionary is None else [asdict(pair) for pair in dictionary.confusions],
     }
-    write_json(folder / RUN, facts | {FILES: digests_of(folder, ALARM_LOG)})
+    write_json(folder / RESULT, facts | {FILES: digests_of(folder, ALARM_LOG)})
 
 
 def write_alarms(alarms: tuple[MonitorAlarm, ...], out: str | Path) -> tuple[Path, Path]:

@@ -18,7 +18,7 @@ from edp.evaluation.context import Contexts, context_errors
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.storage import write_json
-from edp.storage.runs import check_claimable
+from edp.storage.runs import Run, check_claimable
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.workflows.pretraining.methods import PRETRAININGS
@@ -101,12 +101,14 @@ def pretrain(
         facts |= {"meta": asdict(order.meta)} if method.episodic else {}
         chosen = strategy
         strategy_factory = StrategyFactory(facts, lambda prepared: chosen, frozen)
-    network = train(source, experiment, out, on_event, strategy_factory, data).predictor
-    if on_step is not None:
-        on_step("judging on machines that were never seen")
-    contexts = context_errors(network, data.test, data.target_kinds)
-    result = _result(order, experiment, data, contexts)
-    write_json(Path(out) / RESULT, result)
+    with Run(out, "pretraining") as run:
+        network = train(source, experiment, run, on_event, strategy_factory, data).predictor
+        if on_step is not None:
+            on_step("judging on machines that were never seen")
+        contexts = context_errors(network, data.test, data.target_kinds)
+        result = _result(order, experiment, data, contexts)
+        write_json(run.file(RESULT), result)
+        run.finish()
     return result
 
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from edp import __version__
 from edp.config.experiment import Experiment, experiment_toml
 from edp.data.frozen import ByFrozen, Session
 from edp.data.prepared import Prepared, prepare
 from edp.evaluation.footprint import footprint
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
-from edp.storage import make_folder, write_json
+from edp.storage import write_json
 from edp.storage.paths import full_path
-from edp.storage.runs import RunFolder, command_line, environment, run_key
+from edp.storage.runs import Run, run_key
 from edp.training import make_bundle, save_bundle
+from edp.training.provenance import training_provenance
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases.compression import NAME
 from edp.workflows.search.smaller import TEACHER, Recipe, network_of
@@ -102,42 +101,20 @@ def write_networks(
 
 
 def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: Prepared, facts: dict[str, Any]) -> None:
-    make_folder(folder)
     # The recipe is part of the key: another recipe of the same settings is another run.
     key = run_key({"experiment": experiment_toml(experiment), "made by": facts["search"]}, data.digest)
-    with RunFolder(folder) as run:
-        run.claim(key, experiment_toml(experiment))
+    with Run.create(folder, "network", key, experiment_toml(experiment)) as run:
         write_json(run.file("provenance.json"), facts)
         write_json(run.file("footprint.json"), footprint(network).to_json())
         save_bundle(make_bundle(network, data, facts), run.file("bundle"))
-        run.write_status("finished")
 
 
 def _provenance(source: DataSource, experiment: Experiment, data: Prepared, recipe: Recipe) -> dict[str, Any]:
-    rate = data.task.rate_hz
-
-    def part(name: str) -> dict[str, Any]:
-        series = getattr(data, name)
-        hours = sum(entry.samples for entry in series) / rate / 3600
-        return {"recordings": len(series), "hours": round(hours, 4), "names": [entry.name for entry in series]}
-
-    split = experiment.split
-    return {
-        "edp_version": __version__,
-        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        "command": command_line(),
-        "seed": experiment.training.seed,
-        "environment": environment(experiment.training.threads),
-        "regime": experiment.training.chunks.regime,
-        "seconds": 0.0,
-        "device": experiment.training.device,
+    training, split = experiment.training, experiment.split
+    frozen = split.frozen if isinstance(split, ByFrozen) else {}
+    facts = {
+        "regime": training.chunks.regime,
+        "device": training.device,
         "search": {"phase": NAME, "recipe": recipe.to_json()},
-        "data": {
-            "source": source.label,
-            "reader": source.to_plain(),
-            "rate_hz": rate,
-            **{name: part(name) for name in ("train", "validation", "test")},
-            "digest": data.digest,
-            "frozen": split.frozen if isinstance(split, ByFrozen) else {},
-        },
     }
+    return training_provenance(source, data, training.seed, training.threads, 0.0, frozen) | facts

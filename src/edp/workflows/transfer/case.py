@@ -14,6 +14,7 @@ from edp.data.series import Series
 from edp.logs.source import DataSource
 from edp.networks.losses import Smoothness
 from edp.networks.predictor import Predictor
+from edp.storage.runs import Run
 from edp.training import TrainingProgress
 from edp.training.optimizers import OptimizerSpec, Soap
 from edp.training.spec import TrainingSpec
@@ -37,7 +38,7 @@ class TransferCase:
         data: those, divided by time.
         experiment: settings of the source with the target's split.
         spec: phases, rates and regularisers.
-        folder: of the method's run.
+        folder: of the method's run, or that run, opened.
         tell: called with the name of a training and its event.
     """
 
@@ -46,7 +47,7 @@ class TransferCase:
     data: Prepared
     experiment: Experiment
     spec: FinetuneSpec
-    folder: Path
+    folder: Path | Run
     tell: Callable[[str, TrainingProgress], None]
 
     def train(
@@ -81,7 +82,8 @@ class TransferCase:
             else:
                 strategy_factory = StrategyFactory(training_facts, lambda data: make(), self.source.frozen)
         experiment = replace(self.experiment, training=training)
-        folder = self.folder / "phases" / phase if phase else self.folder
+        own = self.folder.path if isinstance(self.folder, Run) else self.folder
+        folder = own / "phases" / phase if phase else self.folder
         # The source's validation part counts too where both domains are to be kept.
         data = replace(self.data, validation=[*self.data.validation, *judged])
         return train(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,9 @@ from edp.errors import ConfigError
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.signals import KINDS
-from edp.storage import make_folder, write_bytes, write_json
+from edp.storage import write_bytes, write_json
 from edp.storage.headers import FILES, digests_of
-from edp.storage.runs import check_claimable
+from edp.storage.runs import Run, check_claimable
 from edp.training import Diverged, TrainingProgress
 from edp.training.bundle import weights_digest
 from edp.workflows.transfer.case import TransferCase, tuned
@@ -31,7 +32,7 @@ from edp.workflows.transfer.scores import distributions, errors_of, excerpts, me
 from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
 from edp.workflows.transfer.spec import FinetuneSpec
 
-RESULT, SHOWN = "transfer.json", "transfer_predictions.safetensors"
+KIND, RESULT, SHOWN = "transfer", "transfer.json", "transfer_predictions.safetensors"
 BEFORE = "direct"
 RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
 """Methods by their former names; ``edp replay`` judges a log with an adapted network and mixes no data."""
@@ -126,31 +127,30 @@ def finetune(
     notes += repair_notes
     for note in notes:
         callbacks.on_note(note)
-    folder = Path(out)
     results: dict[str, Made] = {}
-    for number, name in enumerate(names):
-        callbacks.on_method(name, number, len(names))
-        case = TransferCase(
-            begun, logs, data, experiment, order.spec, _folder_of(name, order, folder), callbacks.on_training
-        )
-        try:
-            results[name] = METHODS[name]().make(case)
-        except Diverged as end:
-            # The asked method must succeed; baselines may fail with a note.
-            if name == order.method:
-                raise
-            notes.append(f"{METHODS[name].label} is left out: {end}")
-            callbacks.on_note(notes[-1])
-    result, shown = _result(begun, data, experiment, order, results)
-    result |= {"logs": logs.label, "notes": notes}
-    write_bytes(make_folder(folder) / SHOWN, save(shown))
-    write_json(folder / RESULT, result | {FILES: digests_of(folder, SHOWN)})
+    with Run(out, KIND) as run:
+        for number, name in enumerate(names):
+            callbacks.on_method(name, number, len(names))
+            folder = run if name == order.method else _baseline_folder(run.path, name)
+            case = TransferCase(begun, logs, data, experiment, order.spec, folder, callbacks.on_training)
+            try:
+                results[name] = METHODS[name]().make(case)
+            except Diverged as end:
+                # The asked method must succeed; baselines may fail with a note.
+                if name == order.method:
+                    raise
+                notes.append(f"{METHODS[name].label} is left out: {end}")
+                callbacks.on_note(notes[-1])
+        result, shown = _result(begun, data, experiment, order, results)
+        result |= {"logs": logs.label, "notes": notes}
+        write_bytes(run.file(SHOWN), save(shown))
+        write_json(run.file(RESULT), result | {FILES: digests_of(run.path, SHOWN)})
+        run.finish()
     return result
 
 
-def _folder_of(name: str, order: FinetuneRequest, out: Path) -> Path:
-    """The run folder of a method."""
-    return out if name == order.method else out / "baselines" / name
+def _baseline_folder(out: Path, name: str) -> Path:
+    return out / "baselines" / name
 
 
 def trained_methods(source: str | Path, order: FinetuneRequest) -> list[str]:
@@ -179,8 +179,10 @@ def train_method(source: str | Path, logs: DataSource, order: FinetuneRequest, o
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
     data, _ = target_data(begun, logs, experiment, order)
-    folder = _folder_of(name, order, Path(out))
-    METHODS[name]().make(TransferCase(begun, logs, data, experiment, order.spec, folder, lambda training, event: None))
+    kept = name == order.method
+    with Run(out, KIND) if kept else nullcontext(_baseline_folder(Path(out), name)) as folder:
+        case = TransferCase(begun, logs, data, experiment, order.spec, folder, lambda training, event: None)
+        METHODS[name]().make(case)
 
 
 def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[str]]:

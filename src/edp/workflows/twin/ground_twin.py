@@ -16,7 +16,7 @@ from edp.networks.twin.grey.ground import check_grounded
 from edp.networks.twin.greybox import GreyBox
 from edp.storage import object_with, read_json, write_bytes, write_json
 from edp.storage.paths import is_file_at
-from edp.storage.runs import RunFolder, run_key
+from edp.storage.runs import Run, run_key
 from edp.training.ground_fit import fit_ground
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
 from edp.workflows.twin.continue_twin import BaseTwin
@@ -62,10 +62,9 @@ def ground_twin(
     channels, data = prepared_twin(source.read(), experiment)
     base.check(channels, data.train)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment), "from": base.digest}, data.digest)
-    with RunFolder(out) as run:
-        if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
+    with Run.create(out, "twin", key, twin_toml(experiment)) as run:
+        if run.is_finished:
             return load_twin(run.path), True
-        run.write_status("running", kind="twin")
         tell(f"fitting the ground '{experiment.ground}' to forces along the logs")
         twin = check_grounded(base.bundle.twin)
         fitted = fit_ground(experiment.ground, twin, data.train, data.validation, linkage)
@@ -80,7 +79,6 @@ def ground_twin(
             if is_file_at(base.folder / name):
                 write_bytes(run.file(name), (base.folder / name).read_bytes())
         save_twin(bundle, run.file(FOLDER))
-        run.write_status("finished")
     return bundle, False
 
 

@@ -30,6 +30,7 @@ from edp.recording import Recording
 from edp.signals import KINDS, Channel
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.headers import FILES, digests_of
+from edp.storage.provenance import recording_names
 from edp.training import load_bundle
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
@@ -215,7 +216,7 @@ def beside_predictor(
     predicted = _at_moments(predictor, pieces, ahead)
     columns = {name: predicted[:, task.targets.index(name)] for name in names}
     # A recording that trained the predictor flatters it: a reader must know.
-    trained = set(bundle.provenance.get("data", {}).get("train", {}).get("names", ()))
+    trained = recording_names(bundle.provenance, "train")
     seen = sorted({part.name for part in test if part.name in trained})
     facts = {"run": str(run), "label": describe(predictor.spec), "ticks": ticks, "trained_on": seen}
     facts |= {"seconds": ticks / twin.channels.rate_hz, "moments": len(ahead.truth)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.data.oil import oil_celsius
 from edp.data.prepared import Prepared
@@ -32,9 +30,10 @@ from edp.sandbox.helpers import Helpers
 from edp.signals import Kind
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes, write_json
-from edp.storage.runs import KeyedRun, RunFolder, check_claimable, command_line, environment, run_key
+from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
-from edp.training.free_run import FittedTwin, FreeRunProgress
+from edp.training.free_run import FreeRunProgress
+from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import OIL_C, STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
@@ -110,11 +109,11 @@ def train_twin(
     # Runs of versions that knew no ground are the same ones.
     settings = {name: value for name, value in TWIN_SETTINGS.plain(experiment).items() if name != "ground"}
     key = run_key({"twin": settings} | begun | _linkage(experiment), data.digest)
-    with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
-        if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
+    create = Run.create(out, "twin", key, twin_toml(experiment))
+    with create as run, Helpers(_helpers(workers), member_died) as helpers:
+        if run.is_finished:
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
-        run.write_status("running", kind="twin")
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell, helpers)
         result = _chosen(fit, KeyedRun(run, key), base)
         fitted = result.fitted
@@ -125,7 +124,10 @@ def train_twin(
         tell("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
         provenance = (
-            _provenance(source, experiment, data, fitted) | _full_strokes(recordings) | _oil(recordings) | result.facts
+            training_provenance(source, data, experiment.training.seed, 1, fitted.seconds)
+            | _full_strokes(recordings)
+            | _oil(recordings)
+            | result.facts
         )
         before = None if base is None else base.bundle.provenance.get(RANGES)
         provenance[RANGES] = command_ranges(channels, [*data.train, *data.validation], before)
@@ -135,8 +137,6 @@ def train_twin(
         write_json(run.path / STEPS, step_responses(bundle.twin, data.test))
         bundle = replace(bundle, scores=scores)
         save_twin(bundle, run.file(FOLDER))
-        run.write_status("finished")
-        run.remove_parts()
     return TrainedTwin(bundle, scores, False)
 
 
@@ -191,19 +191,6 @@ def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormula
     result, tried = TwinChoice(fit, spec, run).best()
     write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
     return result
-
-
-def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, fitted: FittedTwin) -> dict[str, Any]:
-    parts = {part: [series.name for series in getattr(data, part)] for part in ("train", "validation", "test")}
-    return {
-        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        "command": command_line(),
-        "edp_version": __version__,
-        "environment": environment(1),
-        "seed": experiment.training.seed,
-        "seconds": round(fitted.seconds, 2),
-        "data": {"source": source.label, "reader": source.to_plain(), "digest": data.digest, "names": parts},
-    }
 
 
 def _oil(recordings: Sequence[Recording]) -> dict[str, Any]:

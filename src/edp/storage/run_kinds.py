@@ -1,0 +1,50 @@
+"""Registry of the kinds of runs: what each leaves on disk, and which command writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+BUNDLE, TWIN, CONTROLLER = "bundle/bundle.json", "twin/twin.json", "controller/controller.json"
+"""Headers of what runs make, with their arrays in the same folder."""
+
+
+@dataclass(frozen=True)
+class RunKind:
+    """A kind of run.
+
+    Attributes:
+        name: as `edp runs` shows it and `run.json` states it.
+        command: that writes such a run.
+        result: file that only this kind of run has. Runs of earlier versions, which do not state their kind, are
+            recognised by it.
+        model: header of the model that a finished run has; empty for a kind without a model.
+        lock: file that the process at work holds locked.
+    """
+
+    name: str
+    command: str
+    result: str
+    model: str = ""
+    lock: str = ".lock"
+
+
+RUN_KINDS: Mapping[str, RunKind] = {
+    kind.name: kind
+    for kind in (
+        RunKind("twin", "edp twin", TWIN, TWIN),
+        RunKind("control", "edp control", CONTROLLER, CONTROLLER),
+        RunKind("tuning", "edp tune", "tuning.json"),
+        RunKind("search", "edp search", "study.json", lock="ledger/.lock"),
+        RunKind("auto", "edp train --preset auto", "auto.json", BUNDLE),
+        RunKind("pretraining", "edp pretrain", "foundation.json", BUNDLE),
+        RunKind("adaptation", "edp adapt", "adaptation.json", BUNDLE),
+        RunKind("transfer", "edp finetune", "transfer.json", BUNDLE),
+        RunKind("compression", "edp compress", "compression.json"),
+        RunKind("monitor run", "edp monitor run", "alarms.jsonl"),
+        RunKind("monitor", "edp monitor fit", "monitor.json", "monitor.json"),
+        RunKind("fleet", "edp finetune --fleet", "fleet.json"),
+        RunKind("network", "edp train", BUNDLE, BUNDLE),
+    )
+}
+"""By name, in the order in which their results are looked for: the kinds whose run is also a network come before it."""
