@@ -59,7 +59,7 @@ class Run:
     """
 
     def __init__(self, path: str | Path, kind: str = "network") -> None:
-        check_claimable(path)
+        check_claimable(path, kind)
         self.path, self.kind, self.key, self.is_finished = make_folder(path), RUN_KINDS[kind].name, "", False
         try:
             self._lock = hold(self.path / ".lock")
@@ -226,18 +226,29 @@ def run_kind(folder: str | Path) -> RunKind | None:
     return stated or next((kind for kind in RUN_KINDS.values() if is_file_at(path / kind.result)), None)
 
 
-def check_claimable(path: str | Path | Run) -> None:
+def check_claimable(path: str | Path | Run, kind: str) -> None:
     """Refuse a folder that `Run` would refuse; call it before logs are read or anything is computed.
 
     Nothing is made or changed: a command that is refused later leaves no folder. A run that is open already passes.
 
+    Args:
+        path: of a run folder to be, or an open run.
+        kind: name of the kind of run, see `edp.storage.run_kinds`.
+
     Raises:
         BusyError: another process holds it.
-        StorageError: it is a folder of another kind, such as a store.
+        StorageError: it holds a run of another kind, or is a folder of something else, such as a store.
     """
     if isinstance(path, Run):
         return
-    check_kind(path, "run", "study", "fleet", what="a run")
+    asked, found = RUN_KINDS[kind], run_kind(path)
+    if found is not None and found != asked:
+        raise StorageError(
+            f"'{path}' holds a run of {found.command}, into which {asked.command} does not write; nothing was changed. "
+            "Choose a new or empty folder"
+        )
+    if found is None:
+        check_kind(path, "run", what=asked.command)
     holder = held_by(Path(path) / ".lock")
     if holder is not None:
         raise _busy(Path(path), holder)

@@ -122,7 +122,7 @@ def train(
         Diverged: the loss was not finite any more, now or in an earlier sitting; a bundle holds the best weights
             before that, where an epoch was finished.
     """
-    check_claimable(out)
+    check_claimable(out, "network")
     # The judge changes no weights: the same run may be judged in several ways.
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
     if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read

@@ -14,8 +14,10 @@ from edp.monitor.monitor_file import load_monitor
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY
 from edp.storage import write_json
+from edp.storage.run_listing import list_runs
 from edp.testing.monitor import rig_sessions
 from edp.workflows.monitor import fit_monitor
+from edp.workflows.monitor.run_monitor import RESULT
 
 pytestmark = pytest.mark.training
 NAMES = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
@@ -142,16 +144,27 @@ def test_too_few_hours_are_one_message_before_anything_is_written(edp, healthy, 
 def test_what_is_remarked_of_logs_stands_on_the_page_and_a_damaged_remark_is_refused(edp, fitted, tmp_path):
     out = tmp_path / "watched"
     assert edp("monitor", "run", fitted, write(logs(1, first=42), tmp_path / "day"), "--out", out).code in (0, 5)
-    run = json.loads((out / "run.json").read_text())
+    run = json.loads((out / RESULT).read_text())
     assert run["unlike"] == {}
-    write_json(out / "run.json", run | {"unlike": {"<b>monday": "all axes are off"}})
+    write_json(out / RESULT, run | {"unlike": {"<b>monday": "all axes are off"}})
     assert edp("monitor", "report", out).code == 0
     assert "Of &lt;b&gt;monday: all axes are off." in (out / "report.html").read_text()
     for damaged in ([], {"monday": 3}, {"monday": "x" * 5000}, {"monday": ["a", None]}):
-        write_json(out / "run.json", run | {"unlike": damaged})
+        write_json(out / RESULT, run | {"unlike": damaged})
         ended = edp("monitor", "report", out)
         assert ended.code == 1
         assert "run the monitor again" in " ".join(ended.err.split())
+
+
+def test_a_result_of_an_earlier_version_is_read(edp, fitted, tmp_path):
+    out = tmp_path / "watched"
+    assert edp("monitor", "run", fitted, write(logs(1, first=42), tmp_path / "day"), "--out", out).code in (0, 5)
+    for name in ("provenance.json", "status.json"):
+        (out / name).unlink()
+    (out / RESULT).rename(out / "run.json")
+    assert edp("monitor", "report", out).code == 0
+    (row,) = list_runs(tmp_path)[0]
+    assert (row.kind, row.state) == ("monitor run", "finished")
 
 
 def test_logs_in_two_folders_are_told_to_be_put_into_one(edp, healthy, tmp_path):

@@ -45,6 +45,6 @@ def test_what_cannot_be_quantised_is_said(edp, trained, tmp_path):
     assert "computes in w8a16 already; give the float run" in again.err
     over = edp("quantise", trained, "--out", trained)
     assert over.code == 1
-    assert "holds a trained run, which would be lost" in over.err
+    assert "holds another run" in over.err
     assert not (tmp_path / "twice").exists()
     assert load_bundle(trained).predictor.number_format == "float32"

@@ -16,7 +16,7 @@ from edp.recording import Recording
 from edp.storage.seals import HASH, content_digest
 from edp.testing.monitor import rig_sessions
 from edp.workflows.monitor import fit_to_recordings
-from edp.workflows.monitor.fit_monitor import _divided
+from edp.workflows.monitor.fit_monitor import _healthy_sessions
 
 from .conftest import EXPERIMENT, TICKS
 
@@ -129,7 +129,7 @@ def test_too_few_hours_name_the_rate_that_they_support(healthy):
     # What is advised must hold after minutes of training, too, when doubtful sessions are left out.
     advised = float(re.search(r"--hours-per-false-alarm ([\d.]+)", str(ended.value)).group(1))
     experiment = load_monitor_experiment(None, (), {"hours_per_false_alarm": advised})
-    rest = _divided(healthy, experiment)[2]
+    rest = _healthy_sessions(healthy, experiment).rest
     assert 0.0 < advised < 0.85 * sum(session.duration_s for session in rest) / 3600.0
 
 

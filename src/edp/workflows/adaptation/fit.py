@@ -47,7 +47,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
         EdpError: not a run folder, a network whose predictions are not measured later, or a folder that holds another
             run.
     """
-    check_claimable(out)
+    check_claimable(out, "adaptation")
     folder = Path(run)
     bundle, experiment, provenance, data = trained_run(folder)
     spec = spec or AdaptationSpec()

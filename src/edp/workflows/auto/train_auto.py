@@ -80,7 +80,7 @@ def train_auto(
     Raises:
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
     """
-    check_claimable(out)
+    check_claimable(out, "auto")
     once = _ReadOnce(source)
     foundation = read_foundation(settings.auto.foundation)
     if foundation is not None:

@@ -96,7 +96,7 @@ def distil(
         EdpError: not a run, a student that is no smaller, teachers that contradict one another, other data or settings
             in `out`.
     """
-    check_claimable(out)
+    check_claimable(out, "network")
     spec = request.spec
     teacher, experiment, own = read_run(run, request.changes)
     order = CompressionRequest(

@@ -35,7 +35,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         EdpError: not a run folder, a network without an integer form or already in integer form, or a folder that
             holds another run or cannot be written, which is seen before anything is computed.
     """
-    check_claimable(out)
+    check_claimable(out, "network")
     folder = Path(run)
     bundle, experiment, provenance, data = trained_run(folder)
     if bundle.predictor.number_format != "float32":

@@ -185,7 +185,7 @@ def search(
         EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a test set that was
             opened for another choice.
     """
-    check_claimable(out)
+    check_claimable(out, "compression")
     spec = request.spec
     teacher, experiment, own = read_run(run, request.changes)
     plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.recipes)

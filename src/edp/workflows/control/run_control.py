@@ -64,7 +64,7 @@ def control_loops(
         EdpError: settings, models, guard or folder cannot be used.
     """
     chosen = sources or ControlSources()
-    check_claimable(out)
+    check_claimable(out, "control")
     check_free(out, "edp control")
     # Before the folder is claimed: a reference or plant that is refused must not keep the corrected command out.
     bench = ControlBench(experiment, chosen)

@@ -88,7 +88,7 @@ def tune_gains(
         raise ConfigError(
             f"seed = {experiment.seed}: references from {TUNING_SEED} on are for tuning; choose lower ones"
         )
-    check_claimable(out)
+    check_claimable(out, "tuning")
     check_free(out, "edp tune")
     # Both before the first trial, and before the folder is claimed: what is refused is refused at once.
     bench = ControlBench(replace(experiment, seed=TUNING_SEED, loops=chosen.loops), tuned_on)

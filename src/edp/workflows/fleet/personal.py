@@ -91,7 +91,7 @@ def finetune_fleet(
     Raises:
         EdpError: a source or store that cannot be used.
     """
-    check_claimable(out)
+    check_claimable(out, "fleet")
     base = read_source(source, recordings=False)
     digest = weights_digest(base.predictor)
     machines = machines_of(store)

@@ -99,9 +99,10 @@ def fit_monitor(
     Raises:
         EdpError: runs or logs that cannot be used, or too few hours for the promise, or a process died.
     """
-    check_claimable(out)
+    check_claimable(out, "monitor")
     bundles = [_network_of(run) for run in runs]
     recordings = source.read()
+    _healthy_sessions(recordings, experiment)  # what is refused must not keep a corrected command out of the folder
     settings = monitor_toml(experiment)
     models = [model_digest(run) for run in runs]
     origin = source.origin(recordings)
@@ -184,13 +185,9 @@ def fit_to_recordings(
         EdpError: recordings that cannot be used, or too few hours for the promise.
     """
     began = time.process_time()
-    check_dictionary(experiment.dictionary)
-    channels = watched_channels(recordings, experiment)
-    _check_values(recordings, channels)
-    sessions = _enough_sessions(recordings)
-    train, validation, rest = _divided(sessions, experiment)
-    _check_hours(sessions, rest, experiment)
-    check_healthy_sessions(experiment.chain, channels, rest)
+    divided = _healthy_sessions(recordings, experiment)
+    channels, sessions, rest = divided.channels, divided.sessions, divided.rest
+    train, validation = divided.train, divided.validation
     material = FitMaterial(
         train=train,
         validation=validation,
@@ -408,10 +405,28 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
         )
 
 
-def _divided(
-    sessions: Sequence[Recording], experiment: MonitorExperiment
-) -> tuple[list[Recording], list[Recording], list[Recording]]:
-    """Sessions that train residuals, that choose among fits, and the rest, drawn at random."""
+@dataclass(frozen=True, eq=False)
+class _HealthySessions:
+    """Healthy sessions: those that train residuals, that choose among fits, and the rest, which sets the limit."""
+
+    channels: tuple[Channel, ...]
+    sessions: list[Recording]
+    train: list[Recording]
+    validation: list[Recording]
+    rest: list[Recording]
+
+
+def _healthy_sessions(recordings: Sequence[Recording], experiment: MonitorExperiment) -> _HealthySessions:
+    """Divide healthy logs into sessions drawn at random, and check that a monitor can be fitted to them.
+
+    Raises:
+        DataError: channels, values or hours that a monitor cannot be fitted to.
+        ConfigError: a dictionary that cannot be.
+    """
+    check_dictionary(experiment.dictionary)
+    channels = watched_channels(recordings, experiment)
+    _check_values(recordings, channels)
+    sessions = _enough_sessions(recordings)
     order = np.random.default_rng(experiment.seed).permutation(len(sessions)).tolist()
     total, drawn = sum(session.samples for session in sessions), 0
     count = 0
@@ -422,4 +437,7 @@ def _divided(
     count = min(count, len(sessions) - 4)
     chosen = [sessions[i] for i in order[:count]]
     cut = max(1, count // 6)
-    return chosen[cut:], chosen[:cut], [sessions[i] for i in sorted(order[count:])]
+    rest = [sessions[i] for i in sorted(order[count:])]
+    _check_hours(sessions, rest, experiment)
+    check_healthy_sessions(experiment.chain, channels, rest)
+    return _HealthySessions(channels, sessions, chosen[cut:], chosen[:cut], rest)

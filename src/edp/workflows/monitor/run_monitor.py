@@ -114,7 +114,7 @@ def run_monitor(
     outside: dict[str, str] = {}
     traces: list[RecordingTrace] = []
     if out is not None:
-        check_claimable(out)
+        check_claimable(out, "monitor run")
     groups = groups_of(monitor)
     recordings = source.read()
     for done, recording in enumerate(recordings):

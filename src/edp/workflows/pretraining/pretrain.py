@@ -80,7 +80,7 @@ def pretrain(
         EdpError: recordings without machine, too few machines, or settings that do not go with the method.
         Diverged: the loss was not finite any more.
     """
-    check_claimable(out)
+    check_claimable(out, "pretraining")
     if not isinstance(experiment.split, ByMachine):
         # Other splits leave recordings of a machine on both sides, and the network would know the machines that judge
         # it.

@@ -118,7 +118,7 @@ def finetune(
         EdpError: logs that do not go with the source, settings that cannot be, or another run in `out`.
         Diverged: the training of the method that is kept diverged.
     """
-    check_claimable(out)
+    check_claimable(out, KIND)
     callbacks = callbacks or FinetuneCallbacks()
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)

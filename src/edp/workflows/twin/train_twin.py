@@ -89,7 +89,7 @@ def train_twin(
     Raises:
         EdpError: the recordings, settings or folder cannot be used; what was on disk stays.
     """
-    check_claimable(out)
+    check_claimable(out, "twin")
     tell = on_step or (lambda text: None)
     if experiment.ground:
         grounded, finished = ground_twin(source, experiment, out, start, tell)
