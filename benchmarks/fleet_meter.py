@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-WORKER = b"edp.workflows.executors.worker"
+WORKER = b"edp.jobs.worker"
 """In the command line of a worker."""
 TICK_S = 0.1
 CLOCK = os.sysconf("SC_CLK_TCK")

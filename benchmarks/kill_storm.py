@@ -20,8 +20,8 @@ from typing import Any
 
 from common import finish, parser, table, verdict
 from edp.storage.ledger import Ledger, TrainingIdentity, known, read_records
-from edp.workflows.executors.base import Job, complete
-from edp.workflows.executors.processes import LocalPool
+from edp.jobs.base import Job, complete
+from edp.jobs.processes import LocalPool
 
 STUDY = "study"
 """First argument of the coordinator's own process."""

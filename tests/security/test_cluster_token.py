@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from edp.errors import ConfigError
-from edp.workflows.executors import cluster
+from edp.jobs import cluster
 from edp.workflows.search.runner import Resources
 
 

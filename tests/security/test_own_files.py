@@ -40,7 +40,7 @@ READERS = {
     "sandbox/sandbox.py": "messages between processes",
     "sandbox/sandbox_worker.py": "messages between processes",
     "live/protocol.py": "messages of viewers",
-    "workflows/executors/packing.py": "results of workers",
+    "jobs/packing.py": "results of workers",
     "workflows/search/trainings.py": "settings within a job",
     "workflows/fleet/judging.py": "settings within a job",
     "workflows/fleet/machines.py": "facts of an index that was read",

@@ -146,8 +146,8 @@ GUARDED = {
     "sandbox/sandbox_worker.py": "the worker that forks, which is not started without forks",
     "storage/memory.py": "an import that may fail, and suppressed",
     "storage/portable.py": "sys.platform, and hasattr",
-    "workflows/executors/perform.py": "an import that may fail",
-    "workflows/executors/processes.py": "refused on win32 before a process is started",
+    "jobs/perform.py": "an import that may fail",
+    "jobs/processes.py": "refused on win32 before a process is started",
 }
 """Where they are used, and what keeps Windows from them."""
 

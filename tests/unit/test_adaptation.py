@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from edp.cli import app
 from edp.config.experiment import load_experiment
 from edp.data.twin_channels import TwinChannels
-from edp.errors import BundleError, ConfigError, ExportError
+from edp.errors import BundleError, ConfigError, StorageError
 from edp.ir.rls import AdaptationSpec, RlsStatus
 from edp.networks import AdaptedStream
 from edp.networks.twin import TWINS, fit_scales
@@ -247,7 +247,7 @@ def test_a_grey_box_that_follows_leaves_as_c(run, adapted, lever_sessions, tmp_p
 
 
 def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, lever_sessions, tmp_path):
-    with pytest.raises(ExportError, match="would be lost"):
+    with pytest.raises(StorageError, match="nothing was changed"):
         adapt(run, run, SPEC)
     out = tmp_path / "out"
     with pytest.raises(ConfigError, match="only 1 inputs"):

@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 from edp.cli import app
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
+from edp.jobs import Workforce
 from edp.logs import write_recording
 from edp.logs.drawn import drawn_recordings
 from edp.logs.source import DataSource
 from edp.recording import Recording
-from edp.workflows.executors import Workforce
 from edp.workflows.fleet.inspecting import inspect_with
 from edp.workflows.judged_data import judged_data
 from edp.workflows.train_evaluate import train, trained_run

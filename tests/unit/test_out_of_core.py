@@ -22,6 +22,7 @@ from edp.data.spread_rows import spread_series
 from edp.data.task import TargetMode, Task
 from edp.errors import DataError, StorageError
 from edp.evaluation.tally import Tally
+from edp.jobs.packing import packed, unpacked
 from edp.logs import read_data_set, write_recording
 from edp.logs.quality.cross_recording import compare
 from edp.logs.quality.quality import inspect
@@ -32,7 +33,6 @@ from edp.recording import Recording, spread_recordings, spread_stretches
 from edp.signals import Channel, Kind
 from edp.stats.sketch import QuantileSketch
 from edp.storage import write_json
-from edp.workflows.executors.packing import packed, unpacked
 
 NAMES = ("a", "b", "c", "d", "e", "f")
 CHANNELS = tuple(Channel(name, Kind.VELOCITY if name in "bd" else Kind.GENERIC) for name in NAMES)

@@ -19,8 +19,8 @@ from edp.settings.bounds import above, span
 
 if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
+    from edp.jobs import Workforce
     from edp.logs.source import DataSource
-    from edp.workflows.executors import Workforce
 
 
 def evaluate(

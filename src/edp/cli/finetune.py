@@ -15,8 +15,8 @@ from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforc
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
+    from edp.jobs import Workforce
     from edp.report.transfer.facts import Transfer
-    from edp.workflows.executors import Workforce
     from edp.workflows.fleet.personal import PersonalOrder
 
 

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from edp.config.experiment import FeatureSettings
+    from edp.jobs import Workforce
     from edp.logs import DataQuality
     from edp.logs.source import DataSource
     from edp.settings.tree import Change
     from edp.training import TrainingProgress
-    from edp.workflows.executors import Workforce
     from edp.workflows.feature_selection.select import Selection, SelectionOrder
     from edp.workflows.fleet.inspecting import OnLog
 

@@ -13,9 +13,9 @@ from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforc
 from edp.errors import count_of
 
 if TYPE_CHECKING:
+    from edp.jobs import Workforce
     from edp.sim.data_set import Simulated, SimulationOrder
     from edp.sim.predictability import LimitSpec
-    from edp.workflows.executors import Workforce
 
 
 def simulate(

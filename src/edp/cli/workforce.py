@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from edp.workflows.executors import Workforce
+    from edp.jobs import Workforce
 
 WorkersOption = Annotated[int, typer.Option(min=0, max=256, help="Processes side by side; 0: one for each core.")]
 ClusterOption = Annotated[
@@ -31,7 +31,7 @@ def workforce_of(workers: int, cluster: str, open_cluster: bool, usual: int = 1)
         open_cluster: as given.
         usual: number of workers where the option is left out; not refused beside a cluster.
     """
-    from edp.workflows.executors import Workforce
+    from edp.jobs import Workforce
 
     chosen = 1 if cluster and workers == usual else workers
     return Workforce(workers=chosen, cluster=cluster, open_cluster=open_cluster)

@@ -206,11 +206,12 @@ def missing_text(folder: str | Path, kind: str, what: str = "") -> str:
     Raises:
         StorageError: the folder cannot be looked into, or its identity or status is damaged.
     """
-    asked, found = RUN_KINDS[kind], run_kind(folder)
-    held = f"it has no {Path(asked.result).name}"
-    if found is not None and found != asked:
-        held += f" and holds a run of {found.command}"
-    other = f"'{folder}' is not {what or f'a run of {asked.command}'}: {held}; give a folder that {asked.command} wrote"
+    asked, present = RUN_KINDS[kind], run_kind(folder)
+    reason = f"it has no {Path(asked.result).name}"
+    if present is not None and present != asked:
+        reason += f" and holds a run of {present.command}"
+    what = what or f"a run of {asked.command}"
+    other = f"'{folder}' is not {what}: {reason}; give a folder that {asked.command} wrote"
     return unfinished_text(folder) or other
 
 
@@ -241,13 +242,13 @@ def check_claimable(path: str | Path | Run, kind: str) -> None:
     """
     if isinstance(path, Run):
         return
-    asked, found = RUN_KINDS[kind], run_kind(path)
-    if found is not None and found != asked:
+    asked, present = RUN_KINDS[kind], run_kind(path)
+    if present is not None and present != asked:
         raise StorageError(
-            f"'{path}' holds a run of {found.command}, into which {asked.command} does not write; nothing was changed. "
-            "Choose a new or empty folder"
+            f"'{path}' holds a run of {present.command}, into which {asked.command} does not write; nothing was "
+            "changed. Choose a new or empty folder"
         )
-    if found is None:
+    if present is None:
         check_kind(path, "run", what=asked.command)
     holder = held_by(Path(path) / ".lock")
     if holder is not None:

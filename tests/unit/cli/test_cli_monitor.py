@@ -60,7 +60,7 @@ def test_fit_says_what_is_watched_and_what_is_promised(edp, healthy, tmp_path):
     assert ended.code == 0, ended.err
     facts = ended.json
     assert (folder / "monitor.json").is_file()
-    assert (folder / "settings.toml").is_file()
+    assert (folder / "config.toml").is_file()
     assert "virtual:CylVels_1" in facts["residuals"]
     assert "asked for one in 0.06 h" in facts["promise"]
     assert facts["doubtful"] == []

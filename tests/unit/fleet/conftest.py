@@ -2,8 +2,8 @@
 
 import pytest
 
+from edp.jobs import Workforce
 from edp.sim.data_set import SimulationOrder, simulate_data_set
-from edp.workflows.executors import Workforce
 
 
 @pytest.fixture(scope="session")

@@ -10,12 +10,12 @@ from ray_nodes import needs_ray, three_nodes
 
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
+from edp.jobs import Workforce, cluster
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.executors import Workforce, cluster
 from edp.workflows.feature_selection.select import SelectionOrder, select_features
 from edp.workflows.fleet.inspecting import inspect_with
 from edp.workflows.fleet.judging import evaluate_with

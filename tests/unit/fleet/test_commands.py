@@ -9,13 +9,13 @@ import pytest
 
 from edp.data.coverage import Coverage
 from edp.errors import ConfigError, DataError, StorageError
+from edp.jobs import Workforce
+from edp.jobs.units import UnitError
 from edp.logs import read_data_set
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
 from edp.storage import replacing
 from edp.workflows.covering import coverage
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.units import UnitError
 from edp.workflows.fleet import simulating, storing
 from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 from edp.workflows.fleet.simulating import simulate_with

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError, DataError
-from edp.workflows.executors import EXECUTORS, InProcess, LocalPool, Workforce
-from edp.workflows.executors.packing import classes_in, packed, unpacked
-from edp.workflows.executors.units import UnitError, WorkUnit, forget_units, run_units
+from edp.jobs import EXECUTORS, InProcess, LocalPool, Workforce
+from edp.jobs.packing import classes_in, packed, unpacked
+from edp.jobs.units import UnitError, WorkUnit, forget_units, run_units
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageError
+from edp.jobs import Workforce
 from edp.logs.source import DataSource
 from edp.report.fleet.facts import fleet_facts, headline, machine_sheet, verdict, worst_sheet
 from edp.report.fleet.page import render
@@ -14,7 +15,6 @@ from edp.storage import write_json
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.delta import read_delta, with_delta
-from edp.workflows.executors import Workforce
 from edp.workflows.fleet import personal
 from edp.workflows.fleet.judge_fleet import PAGE, FleetQuestion, drift_of, report_fleet
 from edp.workflows.fleet.personal import FLEET, PersonalOrder, finetune_fleet, network_of, read_fleet

@@ -1,8 +1,8 @@
 """A pretraining as a unit of work leaves the run that one process leaves."""
 
+from edp.jobs import Workforce
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.executors import Workforce
 from edp.workflows.fleet.training import pretrain_with
 from edp.workflows.pretraining import Pretrain, pretrain
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from edp.jobs.base import Job
 from edp.storage.ledger import TrainingIdentity
-from edp.workflows.executors.base import Job
 
 
 @pytest.fixture

@@ -10,12 +10,12 @@ from types import SimpleNamespace
 import pytest
 from ray_nodes import needs_ray, three_nodes
 
-import edp.workflows.executors.cluster
+import edp.jobs.cluster
 from edp.errors import ConfigError
+from edp.jobs.base import START, complete
+from edp.jobs.cluster import RayPool
+from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus, read_state
-from edp.workflows.executors.base import START, complete
-from edp.workflows.executors.cluster import RayPool
-from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 
@@ -128,16 +128,16 @@ class OneNode:
         self.results.pop(reference, None)
 
     def shutdown(self):
-        for pool in edp.workflows.executors.cluster._pool.values():
+        for pool in edp.jobs.cluster._pool.values():
             pool.close()
-        edp.workflows.executors.cluster._pool.clear()
+        edp.jobs.cluster._pool.clear()
 
 
 @pytest.fixture
 def node(monkeypatch):
     one = OneNode()
-    monkeypatch.setattr(edp.workflows.executors.cluster, "_ray", lambda: one)
-    monkeypatch.setattr(edp.workflows.executors.cluster, "_reach", lambda ray, address: None)
+    monkeypatch.setattr(edp.jobs.cluster, "_ray", lambda: one)
+    monkeypatch.setattr(edp.jobs.cluster, "_reach", lambda ray, address: None)
     monkeypatch.setattr(RayPool, "_check_nodes", lambda self: None)
     return one
 

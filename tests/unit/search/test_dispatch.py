@@ -3,8 +3,8 @@
 import pytest
 
 from edp.config.experiment import load_experiment
+from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus
-from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.run_phases import run_phases

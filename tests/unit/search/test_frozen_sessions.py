@@ -11,6 +11,7 @@ from edp.config.experiment import load_experiment, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen, Session
 from edp.errors import ConfigError, DataError
 from edp.evaluation.controller import Budget
+from edp.jobs.perform import perform
 from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
 from edp.storage import read_json
@@ -28,7 +29,6 @@ from edp.workflows.compression import (
     search,
 )
 from edp.workflows.compression.quantise import quantise
-from edp.workflows.executors.perform import perform
 from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_settings
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search

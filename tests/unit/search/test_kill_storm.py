@@ -13,8 +13,8 @@ from edp.storage.ledger import Ledger, read_records
 STUDY = """
 import sys
 from edp.storage.ledger import Ledger, TrainingIdentity
-from edp.workflows.executors.base import Job, complete
-from edp.workflows.executors.processes import LocalPool
+from edp.jobs.base import Job, complete
+from edp.jobs.processes import LocalPool
 
 def identity(seed):
     facts = {"code": "c", "data": "d", "environment": {"threads": "1"}}

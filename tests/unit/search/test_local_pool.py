@@ -8,10 +8,10 @@ import time
 import pytest
 
 from edp.errors import ConfigError, StorageError
+from edp.jobs import perform as performing
+from edp.jobs.base import complete
+from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingStatus, claim, leave_arrival
-from edp.workflows.executors import perform as performing
-from edp.workflows.executors.base import complete
-from edp.workflows.executors.processes import LocalPool
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +238,7 @@ def test_a_pool_of_nothing(wrong):
 
 
 def test_memory_caps_are_refused_where_they_cannot_be_held(pool, job_of, monkeypatch):
-    monkeypatch.setattr("edp.workflows.executors.processes.sys.platform", "darwin")
+    monkeypatch.setattr("edp.jobs.processes.sys.platform", "darwin")
     with pytest.raises(ConfigError, match="needs Linux"):
         pool.submit(job_of(0, memory_mb=1))
 

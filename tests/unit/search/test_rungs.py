@@ -11,6 +11,8 @@ import pytest
 import edp.storage
 from edp.config.experiment import load_experiment
 from edp.errors import LostError, StorageError
+from edp.jobs.perform import perform
+from edp.jobs.processes import LocalPool
 from edp.report import write_study_page
 from edp.storage.ledger import (
     Ledger,
@@ -23,8 +25,6 @@ from edp.storage.ledger import (
     read_state,
 )
 from edp.storage.study_file import read_study
-from edp.workflows.executors.perform import perform
-from edp.workflows.executors.processes import LocalPool
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.export import export_study
 from edp.workflows.search.jobs import job_of as job_of_order
@@ -313,7 +313,7 @@ def test_a_search_whose_states_cannot_be_written_is_stopped(six_sessions, plan, 
     def full(folder, key, state):
         raise StorageError("cannot write 'states': No space left on device; free space")
 
-    monkeypatch.setattr("edp.workflows.executors.perform.leave_state", full)
+    monkeypatch.setattr("edp.jobs.perform.leave_state", full)
     with pytest.raises(LostError, match="No space left"):
         run_search(six_sessions, plan, tmp_path, CREW, "calibration")
     monkeypatch.undo()

@@ -7,13 +7,13 @@ import pytest
 
 from edp.config.experiment import load_experiment
 from edp.errors import BusyError, ConfigError, DataError, LostError, StorageError
+from edp.jobs.base import ended
+from edp.jobs.perform import perform
 from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
 from edp.storage import write_json
 from edp.storage.ledger import Ledger, TrainingStatus
 from edp.storage.study_file import read_study
-from edp.workflows.executors.base import ended
-from edp.workflows.executors.perform import perform
 from edp.workflows.search.plan import SearchPlan, load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 from edp.workflows.search.study_log import look_at

@@ -6,11 +6,11 @@ import json
 import pytest
 
 from edp.config.experiment import load_experiment
+from edp.jobs.perform import perform
 from edp.report import write_study_page
 from edp.storage.ledger import Ledger
 from edp.storage.study_file import read_study
 from edp.training.parts import fit_part
-from edp.workflows.executors.perform import perform
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search

@@ -7,10 +7,10 @@ import pytest
 
 from edp.errors import BundleError
 from edp.evaluation import judge
+from edp.jobs import Workforce
 from edp.networks import running
 from edp.storage import read_json
 from edp.workflows import train_evaluate
-from edp.workflows.executors import Workforce
 from edp.workflows.fleet.judging import UNITS, evaluate_with
 from edp.workflows.fleet.training import finetune_with
 from edp.workflows.train_evaluate import evaluate, trained_run

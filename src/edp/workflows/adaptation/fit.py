@@ -52,8 +52,9 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     bundle, experiment, provenance, data = trained_run(folder)
     spec = spec or AdaptationSpec()
     key = run_key({"adaptation": asdict(spec), "weights": weights_digest(bundle.predictor)}, data.digest)
+    # Before the folder is claimed: what is refused must not keep a corrected command out.
+    adaptation = fit_adaptation(bundle.predictor, data, spec)
     with Run.create(out, "adaptation", key, experiment_toml(experiment)) as target:
-        adaptation = fit_adaptation(bundle.predictor, data, spec)
         if is_file_at(folder / HISTORY):
             write_bytes(target.file(HISTORY), (folder / HISTORY).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})

@@ -11,6 +11,9 @@ from typing import Any
 
 from edp.data.coverage import Coverage
 from edp.errors import DataError, EdpError
+from edp.jobs import Workforce
+from edp.jobs.packing import packed, unpacked
+from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.logs import DataQuality, QualityReport, Sketch, compare, inspect, look_into, sketch, unique_names
 from edp.logs.quality.inspection import unreadable
 from edp.logs.quality.sketches import Sketches
@@ -23,9 +26,6 @@ from edp.signals import SignalMap
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path, is_file_at, is_there, status_of
 from edp.workflows.covering import coverage
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.packing import packed, unpacked
-from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 from edp.workflows.fleet.storing import keys_of, stored_logs
 
 STORED_UNITS = 64

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from edp import __version__
 from edp.errors import EdpError
+from edp.jobs import Workforce
+from edp.jobs.units import UnitResult, WorkUnit, forget_units, run_units
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.networks.running import stream_errors
@@ -28,8 +30,6 @@ from edp.training import Bundle, load_bundle
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
 from edp.training.delta import MOST_BYTES, read_delta, with_delta
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.units import UnitResult, WorkUnit, forget_units, run_units
 from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
 from edp.workflows.fleet.personal import UNITS, read_fleet
 from edp.workflows.monitor import run_monitor

@@ -10,15 +10,15 @@ from typing import Any
 
 from edp.config.experiment import build, plain_tree
 from edp.evaluation.judge import JudgedModel, JudgedPart, JudgeSpec, ModelBench, by_effort, network_parts
+from edp.jobs import Workforce
+from edp.jobs.packing import packed, unpacked
+from edp.jobs.units import UnitResult, WorkUnit, forget_units, run_units
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path
 from edp.storage.provenance import read_provenance
 from edp.training.blas import one_blas_thread
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.packing import packed, unpacked
-from edp.workflows.executors.units import UnitResult, WorkUnit, forget_units, run_units
 from edp.workflows.judged_data import judged_data
 from edp.workflows.train_evaluate import evaluate, other_recordings, trained_run
 

@@ -15,6 +15,8 @@ from edp.config.experiment import Change
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, EdpError, StorageError, closest
 from edp.evaluation.judge import score_predictions
+from edp.jobs import Workforce
+from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import KINDS
@@ -24,8 +26,6 @@ from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import Run, check_claimable, missing_text, run_key
 from edp.training.bundle import load_bundle, save_bundle, weights_digest
 from edp.training.delta import DELTA_BYTES, SUFFIX, delta_from_bytes, delta_of, read_delta, with_delta
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
 from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec
 from edp.workflows.transfer.case import TransferCase

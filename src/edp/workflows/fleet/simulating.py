@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, StorageError
+from edp.jobs import Workforce
+from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.logs import WriteOptions, write_recording
 from edp.sim.data_set import Simulated, SimulationOrder, simulate_data_set
 from edp.sim.scenario import Scenario, plain
 from edp.sim.simulate import simulate
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path, is_folder_at, is_there
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 
 
 def simulate_with(

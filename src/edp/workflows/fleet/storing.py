@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, DataError, StorageError
+from edp.jobs import Workforce
+from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource
 from edp.logs.store import StoreIndex, StoreProgress
@@ -23,8 +25,6 @@ from edp.signals import SignalMap
 from edp.storage import check_writable, hold, make_folder, read_object, release
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import entries_of, full_path, is_file_at, is_folder_at, is_there
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 
 SIDE_BY_SIDE = 16
 """Readers that a cluster is taken to have when logs are put into batches: few enough that files stay large."""

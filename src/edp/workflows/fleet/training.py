@@ -12,12 +12,12 @@ from typing import Any
 
 from edp.config.experiment import Experiment, build, plain_tree
 from edp.errors import ConfigError
+from edp.jobs import Workforce
+from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.logs.source import DataSource
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path, is_file_at
 from edp.training import Diverged
-from edp.workflows.executors import Workforce
-from edp.workflows.executors.units import UnitResult, WorkUnit, run_units
 from edp.workflows.fleet.storing import keys_of
 from edp.workflows.pretraining import MetaSpec, Pretrain, pretrain
 from edp.workflows.transfer import FinetuneCallbacks, FinetuneRequest, FinetuneSpec, finetune

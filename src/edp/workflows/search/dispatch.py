@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+from edp.jobs.base import START, Executor, Job, complete
 from edp.storage.ledger import FINAL, Ledger, Record
-from edp.workflows.executors.base import START, Executor, Job, complete
 from edp.workflows.search.context import Outcome
 from edp.workflows.search.jobs import job_of
 from edp.workflows.search.smaller import before

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
+from edp.jobs.base import START, Job
 from edp.storage.ledger import TrainingIdentity, WithState, code_version, read_state
 from edp.storage.provenance import environment
-from edp.workflows.executors.base import START, Job
 from edp.workflows.search.smaller import make_smaller
 from edp.workflows.search.trainings import TrainingRequest, experiment_of, train_part
 

@@ -16,6 +16,7 @@ import tomli_w
 from edp.config.experiment import Experiment, Table, build, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.errors import ConfigError, DataError
+from edp.jobs import Executor, LocalPool, RayPool
 from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.settings.bounds import MOST_THREADS, above, check_bounds, integer
@@ -23,7 +24,6 @@ from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record, check_uncoordinated
 from edp.storage.portable import cores
-from edp.workflows.executors import Executor, LocalPool, RayPool
 from edp.workflows.search.context import Decision, SearchContext, is_enough, set_apart
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.networks import JudgedNetwork, frozen_split, network_name, write_networks

@@ -179,8 +179,7 @@ def train_method(source: str | Path, logs: DataSource, order: FinetuneRequest, o
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
     data, _ = target_data(begun, logs, experiment, order)
-    kept = name == order.method
-    with Run(out, KIND) if kept else nullcontext(_baseline_folder(Path(out), name)) as folder:
+    with Run(out, KIND) if name == order.method else nullcontext(_baseline_folder(Path(out), name)) as folder:
         case = TransferCase(begun, logs, data, experiment, order.spec, folder, lambda training, event: None)
         METHODS[name]().make(case)
 

@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from edp.errors import ConfigError
-from edp.storage.ledger import Record, TrainingStatus
-from edp.workflows.executors.base import (
+from edp.jobs.base import (
     EXECUTORS,
     RETRIES,
     ClosedAtExit,
@@ -33,7 +32,8 @@ from edp.workflows.executors.base import (
     ended,
     refuse_twice,
 )
-from edp.workflows.executors.perform import BEGUN
+from edp.jobs.perform import BEGUN
+from edp.storage.ledger import Record, TrainingStatus
 
 TICK_S = 0.1
 """Interval of checks of the memory of a training; without a cap the pool sleeps until something happens."""
@@ -65,7 +65,7 @@ class _Worker:
         pinned = {name: str(threads) for name in THREADS}
         places = os.pathsep.join(folder for folder in sys.path if folder)
         # `-P`: the working directory must not shadow modules of the library.
-        command = [sys.executable, "-P", "-m", "edp.workflows.executors.worker", str(theirs.fileno()), str(os.getpid())]
+        command = [sys.executable, "-P", "-m", "edp.jobs.worker", str(theirs.fileno()), str(os.getpid())]
         try:
             self.process = subprocess.Popen(
                 command,
@@ -117,7 +117,7 @@ class _Worker:
 
 
 class LocalPool(ClosedAtExit):
-    """Runs jobs in processes of this machine; see `edp.workflows.executors.base.Executor`.
+    """Runs jobs in processes of this machine; see `edp.jobs.base.Executor`.
 
     Use it from one thread that lives as long as the pool: on Linux a worker dies with the thread that started it.
 

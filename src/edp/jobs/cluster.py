@@ -16,11 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, LostError
-from edp.storage import write_bytes
-from edp.storage.ledger import Record, TrainingStatus, code_version, left_state
-from edp.storage.paths import is_there
-from edp.storage.provenance import environment
-from edp.workflows.executors.base import (
+from edp.jobs.base import (
     EXECUTORS,
     RETRIES,
     START,
@@ -31,7 +27,11 @@ from edp.workflows.executors.base import (
     ended,
     refuse_twice,
 )
-from edp.workflows.executors.processes import LocalPool
+from edp.jobs.processes import LocalPool
+from edp.storage import write_bytes
+from edp.storage.ledger import Record, TrainingStatus, code_version, left_state
+from edp.storage.paths import is_there
+from edp.storage.provenance import environment
 
 NAMESPACE = "edp"
 # An hour: nodes may be busy with a training before they answer.
@@ -43,7 +43,7 @@ _pool: dict[int, LocalPool] = {}
 
 
 class RayPool(ClosedAtExit):
-    """Runs jobs on the nodes of a Ray cluster; see `edp.workflows.executors.base.Executor`.
+    """Runs jobs on the nodes of a Ray cluster; see `edp.jobs.base.Executor`.
 
     Caps on time and memory, and retries of a training whose process is killed, are those of `LocalPool`, which runs on
     the node; a training whose node or Ray worker is lost starts again elsewhere.

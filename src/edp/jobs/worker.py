@@ -1,4 +1,4 @@
-"""The process that does jobs for a pool: ``python -m edp.workflows.executors.worker`` with a socket; not for
+"""The process that does jobs for a pool: ``python -m edp.jobs.worker`` with a socket; not for
 people.
 
 It lives as long as its parent and not longer, and answers each job with one record.
@@ -14,8 +14,8 @@ import threading
 from multiprocessing.connection import Connection
 from typing import Any
 
+from edp.jobs.perform import BEGUN, perform
 from edp.sandbox.processes import die_with_parent
-from edp.workflows.executors.perform import BEGUN, perform
 
 
 def serve(connection: Connection) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 
+from edp.jobs.base import EXECUTORS, ClosedAtExit, Executor, Job, Workforce, refuse_twice
+from edp.jobs.perform import perform
 from edp.storage.ledger import Record
-from edp.workflows.executors.base import EXECUTORS, ClosedAtExit, Executor, Job, Workforce, refuse_twice
-from edp.workflows.executors.perform import perform
 
 
 class InProcess(ClosedAtExit):
-    """Does a job when its end is asked for; see `edp.workflows.executors.base.Executor`.
+    """Does a job when its end is asked for; see `edp.jobs.base.Executor`.
 
     Caps on time and memory, which only a second process could hold a job to, are those of the pools.
     """

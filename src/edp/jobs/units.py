@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import EdpError, LostError, StorageError
+from edp.jobs.base import START, Executor, Job, Workforce, complete
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, code_version, read_state
 from edp.storage.paths import is_folder_at
 from edp.storage.provenance import environment
-from edp.workflows.executors.base import START, Executor, Job, Workforce, complete
 
 TRIED_AGAIN = tuple(status for status in TrainingStatus if status is not TrainingStatus.DONE)
 """A full disk or a log that was mended since: only what is done stays done when the command is given again."""

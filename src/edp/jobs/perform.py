@@ -38,7 +38,7 @@ def perform(
 
     Args:
         identity: what to train.
-        where: see `edp.workflows.executors.base.Job`.
+        where: see `edp.jobs.base.Job`.
         folder: of the ledger, to claim the training and leave its state and its record.
         begun: called before the function of the training.
     """
