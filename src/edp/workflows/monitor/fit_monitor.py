@@ -36,7 +36,7 @@ from edp.storage.paths import is_there
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
-from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, machine_of
+from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, check_dictionary_inputs, machine_of
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
@@ -174,6 +174,7 @@ def fit_to_recordings(
     train, validation, rest = _divided(sessions, experiment)
     _check_hours(sessions, rest, experiment)
     check_healthy_sessions(experiment.chain, channels, rest)
+    check_dictionary_inputs(experiment, channels, rest)
     material = FitMaterial(
         train=train,
         validation=validation,
