@@ -32,12 +32,12 @@ import numpy as np
 
 from common import finish, kept, parser, table, verdict
 from edp.config.experiment import Experiment, load_experiment
-from edp.logs.source import DataSource
-from edp.sim.data_set import SimulationOrder, simulate_data_set
-from edp.training import load_bundle
 from edp.jobs import Workforce
 from edp.jobs.base import Executor
 from edp.jobs.units import WorkUnit, run_units
+from edp.logs.source import DataSource
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.training import load_bundle
 from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 from edp.workflows.fleet.judge_fleet import FleetQuestion, report_fleet
 from edp.workflows.fleet.judging import evaluate_with

@@ -27,10 +27,10 @@ import torch
 
 from common import RESULTS, Verdict, finish, in_folder, kept, parser, table, verdict
 from edp.config.experiment import Experiment
+from edp.jobs import Workforce
 from edp.logs.store import is_store
 from edp.sim.machine.family import member_mass
 from edp.storage import read_json
-from edp.jobs import Workforce
 from edp.workflows.fleet.personal import PersonalOrder, finetune_fleet
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set
 from edp.workflows.transfer import FinetuneSpec

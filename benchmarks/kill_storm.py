@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from common import finish, parser, table, verdict
-from edp.storage.ledger import Ledger, TrainingIdentity, known, read_records
 from edp.jobs.base import Job, complete
 from edp.jobs.processes import LocalPool
+from edp.storage.ledger import Ledger, TrainingIdentity, known, read_records
 
 STUDY = "study"
 """First argument of the coordinator's own process."""

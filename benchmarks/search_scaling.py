@@ -17,10 +17,10 @@ from statistics import median
 
 from common import finish, parser, table, verdict
 from edp.config.experiment import load_experiment
-from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, digest_of
-from edp.storage.provenance import environment
 from edp.jobs.base import Job, complete
 from edp.jobs.processes import LocalPool
+from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, digest_of
+from edp.storage.provenance import environment
 from edp.workflows.search.jobs import job_of
 from edp.workflows.search.trainings import TrainingRequest, settings_of
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set

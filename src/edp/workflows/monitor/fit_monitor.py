@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import BundleError, ConfigError, DataError, LostError, closest
+from edp.errors import BundleError, ConfigError, DataError, LostError, closest, percent
 from edp.logs.source import DataSource
 from edp.monitor.detectable import effort_line, found_sizes, healthy_range, measure_found_sizes, promise_lines
 from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_sessions, fit_chain
@@ -37,7 +37,7 @@ from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
-from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, machine_of
+from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, check_dictionary_inputs, machine_of
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
@@ -399,7 +399,7 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
         share = left / hours
         raise ConfigError(
             f"{hours:.3g} h of healthy logs are too few for one false alarm in {promised:g} h: "
-            f"{1.0 - share:.0%} of them train residuals, and what is left supports one in {left:.3g} h; ask "
+            f"{percent(1.0 - share)} of them train residuals, and what is left supports one in {left:.3g} h; ask "
             f"for one in {ROOM * left:.3g} (--hours-per-false-alarm {ROOM * left:.3g}), which leaves room for sessions "
             f"that turn out doubtful, or bring {promised / (ROOM * share) - hours:.3g} h more"
         )
@@ -440,4 +440,5 @@ def _healthy_sessions(recordings: Sequence[Recording], experiment: MonitorExperi
     rest = [sessions[i] for i in sorted(order[count:])]
     _check_hours(sessions, rest, experiment)
     check_healthy_sessions(experiment.chain, channels, rest)
+    check_dictionary_inputs(experiment, channels, rest)
     return _HealthySessions(channels, sessions, chosen[cut:], chosen[:cut], rest)
