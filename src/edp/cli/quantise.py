@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.wording import number
 
 
 def quantise(
@@ -29,7 +30,8 @@ def quantise(
     def show() -> None:
         change = 100.0 * (result["integer"] / result["float"] - 1.0)
         out.print(
-            f"error on the validation part: {change:+.2f} % against float32; constants {result['bytes']:,.0f} bytes"
+            f"error on the validation part: {number(change, 2, signed=True)} % against float32; constants "
+            f"{number(result['bytes'], 0)} bytes"
         )
         out.print(f"next: edp evaluate {folder}, edp export {folder} --to c --out firmware/predictor")
 

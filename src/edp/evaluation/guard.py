@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from edp.stats.resampled import paired_t
+from edp.wording import figure
 
 NETWORK = "network"
 TWIN = "twin"
@@ -162,7 +163,9 @@ def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> 
     if NETWORK not in models:
         return None
     unit = "minute" if minutes == 1 else "minutes"
-    advice = ADVICE if minutes is None else f"give it more than {minutes:g} {unit} (--minutes), or more recordings"
+    advice = (
+        ADVICE if minutes is None else f"give it more than {figure(minutes)} {unit} (--minutes), or more recordings"
+    )
     better = []
     for name, model in models.items():
         if name == NETWORK:

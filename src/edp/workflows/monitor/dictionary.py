@@ -20,6 +20,7 @@ from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import SideBySide
 from edp.recording import MACHINE, Recording
 from edp.sim.machine.machine_files import load_machine, machine_names
+from edp.wording import figure
 from edp.workflows.monitor.fault_sessions import (
     FaultSession,
     cases_of,
@@ -192,7 +193,7 @@ def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
     rows = monitor.conditioned_rows(recording)
     at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
     if at is None or after is None:
-        raise ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {monitor.block_s:g} s")
+        raise ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {figure(monitor.block_s)} s")
     return np.stack([mean_features(at), mean_features(after)])
 
 

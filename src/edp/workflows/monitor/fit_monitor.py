@@ -36,6 +36,7 @@ from edp.storage.paths import is_there
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
+from edp.wording import figure
 from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, machine_of
 
 LEAST_SESSIONS = 8
@@ -271,7 +272,9 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
     first = recordings[0]
     rates = sorted({recording.rate_hz for recording in recordings})
     if rates[-1] > rates[0] * 1.001:
-        raise DataError(f"healthy logs have rates from {rates[0]:g} to {rates[-1]:g} Hz; set rate_hz in the signal map")
+        raise DataError(
+            f"healthy logs have rates from {figure(rates[0])} to {figure(rates[-1])} Hz; set rate_hz in the signal map"
+        )
     for name in experiment.channels:
         for recording in recordings:
             if name not in recording.channel_names:
@@ -384,10 +387,11 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
     if left < promised:
         share = left / hours
         raise ConfigError(
-            f"{hours:.3g} h of healthy logs are too few for one false alarm in {promised:g} h: "
-            f"{1.0 - share:.0%} of them train residuals, and what is left supports one in {left:.3g} h; ask "
-            f"for one in {ROOM * left:.3g} (--hours-per-false-alarm {ROOM * left:.3g}), which leaves room for sessions "
-            f"that turn out doubtful, or bring {promised / (ROOM * share) - hours:.3g} h more"
+            f"{figure(hours, 3)} h of healthy logs are too few for one false alarm in {figure(promised)} h: "
+            f"{1.0 - share:.0%} of them train residuals, and what is left supports one in {figure(left, 3)} h; ask "
+            f"for one in {figure(ROOM * left, 3)} (--hours-per-false-alarm {figure(ROOM * left, 3)}), which leaves "
+            "room for sessions "
+            f"that turn out doubtful, or bring {figure(promised / (ROOM * share) - hours, 3)} h more"
         )
 
 

@@ -46,17 +46,36 @@ def number(value: float | None, decimals: int | None = None, signed: bool = Fals
     return text.replace("-", "−")
 
 
-def figure(value: float | None) -> str:
+def figure(value: float | None, digits: int = MAX_DIGITS) -> str:
     """Return a setting or measured quantity as text: four significant digits, without zeros at the end.
 
     Whole numbers are shown in full.
+
+    Args:
+        value: the quantity.
+        digits: fewer significant digits, for quantities that are known less well.
     """
     if value is None or not math.isfinite(value):
         return MISSING
     if 0 < abs(value) < TINY:
-        return f"{value:.{MAX_DIGITS - 1}g}".replace("-", "−")
-    text = number(value, 0 if float(value).is_integer() else _useful_decimals(value))
+        return f"{value:.{min(digits, MAX_DIGITS - 1)}g}".replace("-", "−")
+    text = number(value, 0 if float(value).is_integer() else _useful_decimals(value, digits))
     return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as pages show it: empty for numbers without a unit, which is "1" in files."""
+    return "" if unit == "1" else unit
+
+
+def behind(unit: str) -> str:
+    """Return a unit with the blank before it, empty for numbers without a unit."""
+    return f" {unit_text(unit)}".rstrip()
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """Return a number with its unit, as `number` and `unit_text` show them."""
+    return number(value) + behind(unit)
 
 
 def interval(low: float | None, high: float | None, signed: bool = False) -> str:
@@ -70,11 +89,11 @@ def interval_decimals(low: float, high: float) -> int:
     return decimals_for([high - low or high], significant=2)
 
 
-def _useful_decimals(value: float) -> int:
-    """Return the decimals with which a number has at most `MAX_DIGITS` significant digits."""
+def _useful_decimals(value: float, digits: int = MAX_DIGITS) -> int:
+    """Return the decimals with which a number has at most `digits` significant digits."""
     # The exponent after rounding: 9.9996 has two digits before the point once it is rounded.
-    exponent = int(f"{abs(value):.{MAX_DIGITS - 1}e}".partition("e")[2])
-    return max(MAX_DIGITS - 1 - exponent, 0)
+    exponent = int(f"{abs(value):.{digits - 1}e}".partition("e")[2])
+    return max(digits - 1 - exponent, 0)
 
 
 def percent(share: float | None, signed: bool = False) -> str:
