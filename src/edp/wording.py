@@ -30,7 +30,7 @@ def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
 
 
 def number(value: float | None, decimals: int | None = None, signed: bool = False) -> str:
-    """Return a number as text, with thousands separated and a true minus sign; a dash if there is no number.
+    """Return a number as text, with thousands separated and a true minus sign; a dash for None, NaN or infinity.
 
     Decimals that would be the fifth significant digit or a later one are left out, whatever `decimals` asks for.
     """
