@@ -12,6 +12,7 @@ from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, tabl
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
 from edp.errors import ConfigError
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from edp.evaluation.footprint import Footprint
@@ -83,6 +84,6 @@ def _show(counts: Mapping[str, Footprint], facts: Mapping[str, Any]) -> None:
     rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
     table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
     error = facts["validation_mae"]
-    tail = "" if error is None else f", validation MAE {error:.4g} (report units)"
+    tail = "" if error is None else f", validation MAE {figure(error)} (report units)"
     out.print(f"distilled in {duration(facts['seconds'])}{tail}; bundle in {facts['bundle']}")
     out.print(f"next: edp evaluate {facts['run']}")

@@ -14,6 +14,7 @@ from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.workforce import WorkersOption
 from edp.errors import count_of
 from edp.storage.paths import full_path
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from edp.workflows.monitor import FittedMonitor
@@ -171,8 +172,8 @@ def run(
         rows = [
             [
                 first.recording,
-                f"{first.raised_s:g}",
-                f"{first.since_s:g}",
+                figure(first.raised_s),
+                figure(first.since_s),
                 first.severity,
                 1 + len(again),
                 first.sentence,
@@ -186,7 +187,7 @@ def run(
         if len(rows) > MOST_SHOWN:
             out.print(f"and {len(rows) - MOST_SHOWN:,} more")
         count = f"{len(watched.alarms):,} alarms" if watched.alarms else "no alarm"
-        out.print(f"{count} in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
+        out.print(f"{count} in {figure(watched.hours, 3)} h; {watched.monitor.limit.sentence()}")
         for line in watched.silence:
             out.print(line)
         if target is not None:

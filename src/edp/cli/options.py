@@ -42,7 +42,7 @@ EXCLUDED: Mapping[tuple[str, str], tuple[str, ...]] = {
 
 
 def within(bound: Bound) -> Callable[[typer.CallbackParam, Any], Any]:
-    """Return a Typer callback that raises ConfigError for numbers outside a bound, also within lists.
+    """Return a Typer callback that raises ConfigError for a value outside a bound, also within lists.
 
     Raises:
         ConfigError: when called, with the option, the value and the bound.

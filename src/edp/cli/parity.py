@@ -11,6 +11,7 @@ from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
 from edp.cli.options import MOST_TICKS
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.wording import figure, number
 
 if TYPE_CHECKING:
     from edp.workflows.parity import Row
@@ -91,7 +92,14 @@ def _ask(bundle: Path) -> None:
 def _show(rows: list[Row], ticks: int) -> None:
     shown = [row for row in rows if row.largest is not None]
     cells = [
-        (row.title, row.verdict, f"{row.largest:.3g}", f"{row.mean:.2g}", row.tolerance, f"{row.microseconds:,.1f}")
+        (
+            row.title,
+            row.verdict,
+            figure(row.largest, 3),
+            figure(row.mean, 2),
+            row.tolerance,
+            number(row.microseconds, 1),
+        )
         for row in shown
     ]
     heads = ["form", "verdict", "largest", "mean", "allowed", "µs a tick"]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
-from edp.errors import percent
+from edp.wording import percent
 
 
 def quantise(

@@ -14,7 +14,8 @@ from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listin
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
 from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
-from edp.errors import count_of, percent
+from edp.errors import count_of
+from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -170,7 +171,7 @@ class ScreeningDisplay:
 def show_selection(selection: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
     screening = selection.screening
-    rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in screening.proposal.choices if c.keep]
+    rows = [(c.channel, number(c.score, 2), c.reason) for c in screening.proposal.choices if c.keep]
     listing(
         f"keep: {len(rows)} of {count_of(len(screening.channels), 'channel')}",
         ["channel", "score", "why"],
@@ -188,7 +189,8 @@ def show_selection(selection: Selection) -> None:
     _show_lags(selection)
     window = screening.proposal.window
     out.print(
-        f"memory: W = {window} samples ({1e3 * window / screening.rate_hz:g} ms): {screening.proposal.window_reason}"
+        f"memory: W = {window} samples ({figure(1e3 * window / screening.rate_hz)} ms): "
+        f"{screening.proposal.window_reason}"
     )
     for note in (*screening.proposal.notes, *selection.notes):
         out.print(f"note: {note}")
@@ -214,8 +216,8 @@ def _show_trials(selection: Selection) -> None:
     if trials is None:
         return
     ahead = list(trials.persistence)
-    rows = [(t.name, len(t.channels), t.parameters, *(f"{t.error[h]:.3f}" for h in ahead)) for t in trials.trials]
-    rows.append(("persistence", "-", "-", *(f"{trials.persistence[h]:.3f}" for h in ahead)))
+    rows = [(t.name, len(t.channels), t.parameters, *(number(t.error[h], 3) for h in ahead)) for t in trials.trials]
+    rows.append(("persistence", "-", "-", *(number(trials.persistence[h], 3) for h in ahead)))
     headings = ["feature set", "channels", "parameters", *(f"MAE {h} ahead, {trials.unit}" for h in ahead)]
     out.print()
     table("held-out error of one network on each set", headings, rows)

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.errors import count_of
+from edp.wording import number
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -257,7 +258,9 @@ def _deploying(result: SearchResult) -> str:
 def _show_status(progress: dict[str, Any]) -> None:
     counts = progress["counts"]
     running = f"process {progress['holder']}" if progress["holder"] else "nobody now"
-    out.print(f"{progress['data']['path']}: {progress['data']['sessions']} sessions, {progress['data']['hours']:.2f} h")
+    out.print(
+        f"{progress['data']['path']}: {progress['data']['sessions']} sessions, {number(progress['data']['hours'], 2)} h"
+    )
     out.print(f"mode {progress['mode']}, {progress['state']}, coordinated by {running}; written {progress['updated']}")
     rows = [
         (

@@ -12,7 +12,8 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
 from edp.cli.options import MOST_WORKERS
-from edp.errors import ConfigError, percent
+from edp.errors import ConfigError
+from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -88,7 +89,7 @@ def train(
     }
 
     def show() -> None:
-        tail = "" if best is None else f", validation MAE {best:.4g} (report units)"
+        tail = "" if best is None else f", validation MAE {figure(best)} (report units)"
         out.print(f"trained in {duration(bundle.provenance['seconds'])}{tail}; bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
@@ -103,7 +104,7 @@ def _train_auto(
 
     settings = load_auto(config, changes)
     if not quiet:
-        limit = f"{settings.auto.minutes:g} min"
+        limit = f"{figure(settings.auto.minutes)} min"
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
     with progress(quiet) as shown:
         display = TrainingDisplay(shown, Steps(quiet))
@@ -129,7 +130,7 @@ def _promise_table(facts: dict[str, Any]) -> None:
         mark = "*" if name == facts["chosen"] else ""
         share = percent(math.expm1(facts["excess"][name] - facts["excess"][facts["chosen"]]), signed=True)
         rows.append([f"{one['label']} {mark}".strip(), f"{one['parameters']:,}", duration(one["seconds"]), share])
-    title = f"error on left-out data against the model that is kept (*), within {facts['minutes']:g} min"
+    title = f"error on left-out data against the model that is kept (*), within {figure(facts['minutes'])} min"
     table(title, ["model", "parameters", "trained in", "error"], rows)
 
 
@@ -141,7 +142,11 @@ def _expected_table(facts: dict[str, Any]) -> None:
     horizon = max(promised, key=int)
     expected = [promised[horizon], interval["low"][horizon], interval["high"][horizon]]
     rows = [
-        [target, *(f"{values[target]:.4g}" for values in expected), f"{skill['promise'][horizon][target]:.2f}"]
+        [
+            target,
+            *(figure(values[target]) for values in expected),
+            number(skill["promise"][horizon][target], 2),
+        ]
         for target in list(promised[horizon])[:MOST_EXPECTED]
     ]
     beside = "persistence's" if skill["against"] == "persistence" else "the linear model's"
@@ -210,10 +215,10 @@ class TrainingDisplay:
         """Show one event."""
         if event.row is not None and event.row["best"]:
             self.best = event.row["validation_mae"]
-        score = "" if self.best is None else f", validation MAE {self.best:.4g}"
+        score = "" if self.best is None else f", validation MAE {figure(self.best)}"
         stage = "refit, " if event.refit else ""
         epoch = count_text(event.epoch, event.epochs, "/")
-        note = f"{self.model}{stage}epoch {epoch}, {event.targets_per_s:,.0f} targets/s{score}"
+        note = f"{self.model}{stage}epoch {epoch}, {number(event.targets_per_s, 0)} targets/s{score}"
         self.shown.update(self.bar, completed=event.share, note=note)
         self.steps.say(f"train: {note}{left_text(event.seconds_left)}", force=event.row is not None)
 

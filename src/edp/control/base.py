@@ -21,6 +21,7 @@ from edp.control.plant import interface_of as interface_of
 from edp.control.reference import TipReference
 from edp.errors import ConfigError, EdpError
 from edp.registry import Registry
+from edp.wording import figure
 
 Array = NDArray[np.float64]
 MOST_EVENTS = 1_000
@@ -154,7 +155,8 @@ class Controller(ABC):
         """
         if reference.rate_hz != self.plant.rate_hz:
             raise ConfigError(
-                f"the reference has {reference.rate_hz:g} Hz, {self.plant.source} {self.plant.rate_hz:g} Hz; give both "
+                f"the reference has {figure(reference.rate_hz)} Hz, {self.plant.source} {figure(self.plant.rate_hz)} "
+                "Hz; give both "
                 "the same rate"
             )
         measured = np.asarray(observation, float)[self._columns]

@@ -30,6 +30,7 @@ from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
 from edp.storage.paths import full_path, is_file_at
+from edp.wording import figure, setting_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,8 +262,9 @@ class DataSource:
             )
         if self.at_most_h is not None:
             raise ConfigError(
-                f"--at-most {self.at_most_h:g} came with '{self.path}', which is no store; read the logs once with "
-                "`edp store build LOGS --out STORE`, and give this command the store"
+                f"--at-most {setting_text(self.at_most_h)} came with '{self.path}', which is no store; read the logs "
+                "once "
+                "with `edp store build LOGS --out STORE`, and give this command the store"
             )
 
     def check_store_options(self) -> None:
@@ -378,7 +380,7 @@ def _check_listed(recordings: list[Recording], path: Path) -> None:
     rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
     # A thousandth, as `edp.logs.read.RATE_TOLERANCE`.
     if max(rates) > 1.001 * min(rates):
-        shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
+        shown = ", ".join(f"{name} {figure(rate)} Hz" for rate, name in rates.items())
         raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
 
 

@@ -21,6 +21,7 @@ from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_m
 from edp.errors import ConfigError
 from edp.storage.paths import is_folder_at
 from edp.training.bundle import load_bundle
+from edp.wording import figure, setting_text
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,8 @@ class ControlBench:
         for channel, value in zip(self.plant.channels, row, strict=True):
             if channel.name.startswith("CylPressures_") and value > first.limits.pressure_pa:
                 raise ConfigError(
-                    f"limits: pressure_pa = {first.limits.pressure_pa:g} Pa, but the machine rests with "
-                    f"{channel.name} at {value:.3g} Pa; allow more"
+                    f"limits: pressure_pa = {setting_text(first.limits.pressure_pa)} Pa, but the machine rests with "
+                    f"{channel.name} at {figure(value, 3)} Pa; allow more"
                 )
         measured = row[self.plant.columns(controller.reads)]
         # A channel that is missing at the start is named where the loop begins.
