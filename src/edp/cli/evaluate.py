@@ -11,7 +11,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.options import MOST_HOURS, MOST_MINUTES, within
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import DataOption, MapOption, RepairOption, source_if_given
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train or edp twin.")],
-    data: Annotated[Path | None, typer.Option(help="Other recordings to judge on; default: the held-out ones.")] = None,
+    data: DataOption = [],  # noqa: B006
     baselines: Annotated[
         str | None, typer.Option(help="Comma-separated names, 'all' or 'none'; default: those of the settings.")
     ] = None,
@@ -65,7 +65,7 @@ def evaluate(
     """
     from edp.training.twin_bundle import holds_twin
 
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     workforce = workforce_of(workers, cluster, open_cluster)
     if minutes is not None and not workforce.alone:
         raise ConfigError("--minutes bounds what one process does; leave it out with --workers and --cluster")

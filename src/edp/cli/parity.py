@@ -10,7 +10,7 @@ import typer
 from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
 from edp.cli.options import MOST_TICKS
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import MapOption, RepairOption, source_if_given
 
 if TYPE_CHECKING:
     from edp.workflows.parity import Row
@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 def parity(
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp quantise or edp twin.")],
     data: Annotated[
-        Path | None, typer.Option(help="Log whose first ticks are the reference recording; default: random inputs.")
-    ] = None,
+        list[Path],
+        typer.Option(
+            help="Logs and folders of logs whose first ticks, in equal parts, are the reference recording; may be "
+            "repeated. Default: random inputs."
+        ),
+    ] = [],  # noqa: B006
     ticks: Annotated[
         int | None,
         typer.Option(
@@ -59,7 +63,7 @@ def parity(
     if not (yes or from_own_run(bundle)):
         _ask(bundle)
     loaded = load_exported(bundle)
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     case = golden_case(loaded, ticks) if source is None else recorded_case(loaded, source, ticks)
 
     def tell(row: Row) -> None:

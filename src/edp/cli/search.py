@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.errors import count_of
 
 if TYPE_CHECKING:
@@ -52,9 +52,7 @@ app = typer.Typer(
 
 @app.command(DEFAULT)
 def run(
-    data: Annotated[
-        Path, typer.Argument(help="A folder of logs, data-set file (.toml), or store; each log is a session.")
-    ],
+    data: LogsArgument,
     study: Annotated[Path, typer.Option("--study", help="Folder of the study; an unfinished study continues.")],
     preset: Annotated[str, typer.Option(help="Extent of the search: quick, standard or thesis.")] = "quick",
     config: Annotated[
@@ -84,6 +82,8 @@ def run(
     as_json: JsonFlag = False,
 ) -> None:
     """Search for the network: from which features and backbone to which modules, each step tested.
+
+    Each log is a session; too few logs are divided into sessions.
 
     Stop it at any moment (Ctrl-C, or a power failure): the same command continues, and repeats no training.
 
@@ -241,7 +241,7 @@ def _show(result: SearchResult, page: Path) -> None:
         return
     if result.networks:
         out.print(f"next: {_deploying(result)}")
-    data, word = result.source.path, "or" if result.networks else "next"
+    data, word = shell_words(result.source.paths), "or" if result.networks else "next"
     out.print(f"{word}: edp train {data} --config {result.teacher} --out runs/teacher (frozen sessions stay frozen)")
 
 

@@ -31,6 +31,14 @@ LogsArgument = Annotated[
         help="Logs and folders of logs; or one data-set file (.toml), or one store.",
     ),
 ]
+DataOption = Annotated[
+    list[Path],
+    typer.Option(
+        "--data",
+        help="Other recordings: logs and folders of logs, a data-set file, or a store; may be repeated. Default: those "
+        "of the run.",
+    ),
+]
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
     list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
@@ -173,6 +181,11 @@ def run(
 def shell_words(paths: Iterable[Path]) -> str:
     """Return paths as arguments of a command that can be typed."""
     return shlex.join(str(path) for path in paths)
+
+
+def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource | None:
+    """Return a data source from command-line options; None if no path was given."""
+    return source_of(data, signal_map, repair) if data else None
 
 
 def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
