@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
+from edp.cli.options import check_effects
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.workforce import WorkersOption
 from edp.errors import ConfigError, count_of
@@ -34,6 +35,7 @@ app = typer.Typer(
 
 @app.command("fit")
 def fit(
+    context: typer.Context,
     arguments: Annotated[
         list[Path],
         typer.Argument(
@@ -71,7 +73,7 @@ def fit(
 
     Example: `edp monitor fit runs/m22 logs/healthy --out monitors/m22`
     """
-    from edp.config.monitor import load_monitor_experiment
+    from edp.config.monitor import load_monitor_experiment, trains_networks
     from edp.workflows.monitor import fit_monitor
     from edp.workflows.monitor.fit_monitor import holds_model
 
@@ -79,6 +81,7 @@ def fit(
     options |= {} if minutes is None else {"minutes": minutes}
     options |= {} if machine is None else {"dictionary": {"machine": machine}}
     experiment = load_monitor_experiment(config, changes, options)
+    check_effects(context, {"minutes": trains_networks(experiment)})
     runs = [path for path in arguments if holds_model(path)]
     logs = [path for path in arguments if path not in runs]
     if not logs:

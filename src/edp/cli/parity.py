@@ -9,7 +9,7 @@ import typer
 
 from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
-from edp.cli.options import MOST_TICKS
+from edp.cli.options import MOST_TICKS, check_effects
 from edp.cli.train import MapOption, RepairOption, source_if_given
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def parity(
+    context: typer.Context,
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp quantise or edp twin.")],
     data: Annotated[
         list[Path],
@@ -60,6 +61,7 @@ def parity(
     from edp.workflows.deployment import load_exported
     from edp.workflows.parity import compare, from_own_run, golden_case, recorded_case
 
+    check_effects(context, {"interpreters": not forms or any(form.startswith("onnx_") for form in forms)})
     if not (yes or from_own_run(bundle)):
         _ask(bundle)
     loaded = load_exported(bundle)

@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.options import check_effects
 from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.errors import count_of
 
@@ -52,6 +53,7 @@ app = typer.Typer(
 
 @app.command(DEFAULT)
 def run(
+    context: typer.Context,
     data: LogsArgument,
     study: Annotated[Path, typer.Option("--study", help="Folder of the study; an unfinished study continues.")],
     preset: Annotated[str, typer.Option(help="Extent of the search: quick, standard or thesis.")] = "quick",
@@ -64,7 +66,11 @@ def run(
     ] = [],  # noqa: B006
     phase: Annotated[str | None, typer.Option(help="Last phase to run; default: all.")] = None,
     budget: Annotated[
-        Path | None, typer.Option(help="Limits of the controller (TOML) for phase 6; by default those of the thesis.")
+        Path | None,
+        typer.Option(
+            help="Limits of the controller (TOML) for phase 6, to which a study is bound from its first phase on; by "
+            "default those of the thesis."
+        ),
     ] = None,
     workers: Annotated[int, typer.Option(help="Parallel trainings; 0: one for each core.")] = 0,
     cluster: Annotated[str, typer.Option(help="Address of a Ray cluster for the trainings, or auto.")] = "",
@@ -97,6 +103,7 @@ def run(
     # JSON quotes the path as TOML wants it.
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
+    check_effects(context, {"budget": plan.spec.compression.on})
     resources = Resources(
         workers=workers,
         threads=threads,

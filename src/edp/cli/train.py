@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
-from edp.cli.options import MOST_WORKERS
+from edp.cli.options import MOST_WORKERS, check_effects
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ RepairOption = Annotated[
 
 
 def train(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
@@ -80,12 +81,11 @@ def train(
 
     source = source_of(data, signal_map, repair)
     preset = preset or usual_preset(config, changes)
+    check_effects(context, {"minutes": preset == AUTO, "workers": preset == AUTO})
     if preset == AUTO:
         own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
         _train_auto(source, folder, config, [*changes, *own], workers, as_json)
         return
-    if minutes is not None:
-        raise ConfigError(f"--minutes came with the preset '{preset}'; only the preset auto has a budget: leave it out")
     bundle, best = run(data, folder, config, preset, changes, source, as_json)
     facts = {
         "run": str(folder),
@@ -191,7 +191,6 @@ def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[
 def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
     """A data source from command-line options."""
     from edp.config.experiment import build
-    from edp.errors import ConfigError
     from edp.logs.repair import Repair
     from edp.logs.source import DataSource
 
