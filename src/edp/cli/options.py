@@ -49,7 +49,7 @@ TRIAL_TABLES = ("trials", "task", "split", "model", "training", "judge")
 """Settings of the trials of edp screen: their own table and those of an experiment."""
 DEPENDENT: Mapping[tuple[str, str], str] = {
     ("animate", "horizon"): "a run before the log",
-    ("evaluate", "baselines"): "the run of a network; the floors of a twin are those of its settings, judge.floors",
+    ("evaluate", "baselines"): "the run of a network (judge.floors are those of a twin)",
     ("evaluate", "minutes"): "the run of a network, baselines, and one process",
     ("evaluate", "at_most"): "the run of a network",
     ("evaluate", "channel_importance"): "the run of a network",
@@ -60,14 +60,14 @@ DEPENDENT: Mapping[tuple[str, str], str] = {
     ("parity", "interpreters"): "a form of ONNX Runtime: onnx_step or onnx_window",
     ("pretrain", "changes.pretrain"): "an episodic method",
     ("report", "limit"): "the run of a network, which looks a fixed time ahead",
-    ("report", "budget"): "the run of a network; edp footprint compares a twin with a budget",
+    ("report", "budget"): "the run of a network (edp footprint takes twins)",
     ("search run", "budget"): "phase 6 (search.compression.on)",
     **{("screen", f"changes.{table}"): "--trials" for table in TRIAL_TABLES},
     ("simulate", "changes.limit"): "--limit",
     ("train", "minutes"): "the preset auto",
     ("train", "workers"): "the preset auto",
-    ("twin", "minutes"): "a choice among formulations: without twin.kind, --start and ground",
-    ("twin", "workers"): "several networks to train: a choice among formulations, twin.members above 1, or --start",
+    ("twin", "minutes"): "a choice among formulations (without twin.kind, --start and ground)",
+    ("twin", "workers"): "several trainings (a choice among formulations, twin.members above 1, or --start)",
 }
 """Parameters by command whose effect depends on settings or files that the command reads, each with what it needs.
 
