@@ -85,9 +85,7 @@ def fit(
     runs = [path for path in arguments if holds_model(path)]
     logs = [path for path in arguments if path not in runs]
     if not logs:
-        raise ConfigError(
-            f"edp monitor fit: got {count_of(len(runs), 'run folder')} without logs; give healthy logs, too"
-        )
+        raise ConfigError("edp monitor fit: got run folders alone, expected healthy logs; name them after the runs")
     source = source_of(logs, signal_map, repair)
     began = time.monotonic()
     with progress(as_json) as shown:
