@@ -364,13 +364,6 @@ class ChannelMap:
                 where = f"signal map, channel '{self.name}'"
                 raise ConfigError(f"{where}: {key} = {number:g}; give a finite number of at most {LARGEST:g}")
 
-    def channel(self) -> Channel:
-        """The channel this entry yields; a name outside the vocabulary needs a kind (default generic)."""
-        standard_channel = VOCABULARY.get(self.name)
-        if standard_channel is not None and self.kind in (None, standard_channel.kind):
-            return standard_channel
-        return Channel(self.name, self.kind or Kind.GENERIC, self.description)
-
 
 @dataclass(frozen=True)
 class SignalMap:

@@ -14,6 +14,7 @@ from edp.cli.options import MOST_HOURS, MOST_MINUTES, check_effects, within
 from edp.cli.train import DataOption, MapOption, RepairOption, source_if_given
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.errors import percent
 from edp.settings.bounds import above, span
 
 if TYPE_CHECKING:
@@ -213,7 +214,7 @@ def importance_table(importances: ChannelImportances) -> None:
         rows = []
         for row in importances.ranked(int(horizon)):
             bounds = f"{row.renewed.low:.3g} to {row.renewed.high:.3g}"
-            figures = [f"{row.renewed.mean:.3g}", bounds, f"{row.exchanged.mean:.3g}", f"{row.explained:.0%}"]
+            figures = [f"{row.renewed.mean:.3g}", bounds, f"{row.exchanged.mean:.3g}", percent(row.explained)]
             rows.append([", ".join(row.members), *figures])
         title = f"growth of the error at k = {horizon} (MAE {error['mean']:.4g} {unit}) without the channel, {unit}"
         table(title, ["channel", "its own", "95 %", "with all it shares", "explained by others"], rows)
@@ -281,7 +282,7 @@ def interval_rows(scores: dict[str, Any], unit: str) -> None:
     """Print how much of the truth the network's intervals hold, where it states any."""
     intervals = scores["models"]["network"].get("intervals", {})
     rows = [
-        [f"k = {horizon}", f"{row['coverage']:.1%}", f"{row['covered']['mean']:.1%}", f"{row['width']['mean']:.4g}"]
+        [f"k = {horizon}", percent(row["coverage"]), percent(row["covered"]["mean"]), f"{row['width']['mean']:.4g}"]
         for horizon, entries in intervals.items()
         for row in entries
     ]

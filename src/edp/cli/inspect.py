@@ -13,7 +13,7 @@ from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, show_lines, show_report, verdict_text
 from edp.cli.train import LogsArgument, MapOption, shell_words
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
-from edp.errors import DataError, EdpError, count_of
+from edp.errors import DataError, EdpError, count_of, percent
 from edp.storage.paths import full_path, is_file_at
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ def _verdict(met: bool) -> str:
 
 
 def _share(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f} %"
+    return "-" if value is None else percent(value)
 
 
 def _count(value: int | None) -> str:

@@ -11,7 +11,7 @@ import typer
 
 from edp.cli.console import Steps, count_text, out, table
 from edp.cli.options import MOST_HOURS, within
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.settings.bounds import above
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def show_report(report: QualityReport) -> None:
             "", ["channel", "unit", "step", "noise", "SNR, dB", "new, Hz", "stuck, s", "at ends", "verdict"],
             [
                 (c.name, c.unit, _short(c.step), _short(c.noise, 3), _short(c.snr_db, 3), f"{c.new_hz:.4g}",
-                 f"{c.stuck_s:.3g}", f"{100 * c.at_ends:.1f} %", c.verdict)
+                 f"{c.stuck_s:.3g}", percent(c.at_ends), c.verdict)
                 for c in report.channels
             ],
         )  # fmt: skip

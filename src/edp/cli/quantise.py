@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.errors import percent
 
 
 def quantise(
@@ -27,10 +28,8 @@ def quantise(
     result = make(run, folder, ticks)
 
     def show() -> None:
-        change = 100.0 * (result["integer"] / result["float"] - 1.0)
-        out.print(
-            f"error on the validation part: {change:+.2f} % against float32; constants {result['bytes']:,.0f} bytes"
-        )
+        change = percent(result["integer"] / result["float"] - 1.0, signed=True)
+        out.print(f"error on the validation part: {change} against float32; constants {result['bytes']:,.0f} bytes")
         out.print(f"next: edp evaluate {folder}, edp export {folder} --to c --out firmware/predictor")
 
     emit(as_json, {"folder": str(folder), **result}, show)

@@ -15,7 +15,7 @@ from edp.cli.options import TRIAL_TABLES, check_effects
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
 from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
-from edp.errors import count_of
+from edp.errors import count_of, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -167,7 +167,7 @@ class ScreeningDisplay:
         gained, elapsed = share - first_share, now - began
         tail = left_text(elapsed / gained * (1.0 - share)) if gained >= TOLD_SHARE else ""
         self.shown.update(self.bars[what], completed=share, note=note)
-        self.steps.say(f"{what}: {note}, {100 * share:.0f} %{tail}")
+        self.steps.say(f"{what}: {note}, {percent(share)}{tail}")
 
 
 def show_selection(selection: Selection) -> None:

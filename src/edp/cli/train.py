@@ -12,7 +12,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
 from edp.cli.options import MOST_WORKERS, check_effects
-from edp.errors import ConfigError
+from edp.errors import ConfigError, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -135,7 +135,7 @@ def _promise_table(facts: dict[str, Any]) -> None:
     rows = []
     for name, one in facts["candidates"].items():
         mark = "*" if name == facts["chosen"] else ""
-        share = f"{100 * math.exp(facts['excess'][name] - facts['excess'][facts['chosen']]) - 100:+.1f} %"
+        share = percent(math.expm1(facts["excess"][name] - facts["excess"][facts["chosen"]]), signed=True)
         rows.append([f"{one['label']} {mark}".strip(), f"{one['parameters']:,}", duration(one["seconds"]), share])
     title = f"error on left-out data against the model that is kept (*), within {facts['minutes']:g} min"
     table(title, ["model", "parameters", "trained in", "error"], rows)

@@ -11,7 +11,7 @@ from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_te
 from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, check_effects, within
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.settings.bounds import MIN_MINUTES, above, span
 from edp.storage.paths import full_path, is_file_at
 
@@ -156,7 +156,7 @@ def rollout(
             out.print(beyond_sentence(result.beyond), style="bold")
         error_table(result.scores)
         if result.coverage is not None and result.calibrated_s is not None:
-            promise = f"{result.coverage:.0%} up to {result.calibrated_s:g} s"
+            promise = f"{percent(result.coverage)} up to {result.calibrated_s:g} s"
             out.print(f"intervals in _twin_low and _twin_high are meant to hold {promise}")
         if file is not None:
             out.print(f"{result.recording.samples:,} ticks in {file}")
@@ -199,7 +199,7 @@ def score_table(models: dict[str, Any]) -> None:
         name = _with_unit(f"stroke after {row['at_s']:g} s", row)
         rows.append([name, *(_number(one["stroke_error"][k]["mean"]) for one in models.values())])
     rows.append(["pressure, deviations", *(_number(one["pressure_nrmse"]["mean"]) for one in models.values())])
-    rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in models.values())])
+    rows.append(["diverged runs", *(percent(one["diverged"]) for one in models.values())])
     out.print(
         f"{count_of(first['runs'], 'free run')} of {first['seconds']:g} s on commands alone, mean over actuators "
         "and runs:"
@@ -221,7 +221,7 @@ def actuator_tables(models: dict[str, Any]) -> None:
         for k, row in enumerate(strokes):
             errors = (one["stroke_error"][k]["by_channel"][stroke] for one in every)
             rows.append([f"after {row['at_s']:g} s, {length}", *map(_number, errors)])
-        rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in every)])
+        rows.append(["diverged runs", *(percent(one["diverged"]) for one in every)])
         table(f"{velocity}: its MAE, and the error of {stroke} by time", ["", *models], rows)
     if first["pressure_nrmse"]["mean"] is not None:
         listed = ", ".join(f"{name} {_number(one['pressure_nrmse']['mean'])}" for name, one in models.items())
@@ -253,8 +253,8 @@ def coverage_table(scores: dict[str, Any]) -> None:
     if intervals is None or not intervals["at"]:
         return
     parts = [part for part in ("velocities", "strokes", "pressures") if part in intervals["at"][0]]
-    rows = [[f"{row['at_s']:g} s", *(f"{row[part]['share']:.1%}" for part in parts)] for row in intervals["at"]]
-    table(f"share of free runs in intervals meant to hold {intervals['coverage']:.0%}", ["", *parts], rows)
+    rows = [[f"{row['at_s']:g} s", *(percent(row[part]["share"]) for part in parts)] for row in intervals["at"]]
+    table(f"share of free runs in intervals meant to hold {percent(intervals['coverage'])}", ["", *parts], rows)
 
 
 def situation_table(scores: dict[str, Any]) -> None:
@@ -262,7 +262,7 @@ def situation_table(scores: dict[str, Any]) -> None:
     rows = []
     for name, row in scores["situations"].items():
         strokes = row.get("stroke_error", {"mean": None})
-        cells = [f"{row['share']:.1%}", *map(_number, (row["velocity_mae"]["mean"], strokes["mean"]))]
+        cells = [percent(row["share"]), *map(_number, (row["velocity_mae"]["mean"], strokes["mean"]))]
         rows.append([name.replace("_", " "), *cells, _number(row["pressure_nrmse"]["mean"])])
     heads = ["", "share of the time", _with_unit("velocity", scores["velocity_mae"]), "stroke", "pressure (NRMSE)"]
     table("errors by what the actuators did", heads, rows)

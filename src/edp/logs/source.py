@@ -26,6 +26,7 @@ from edp.logs.store.building import StoredLog, StoreProgress, build_store
 from edp.logs.store.index import StoreIndex, is_store, read_index
 from edp.logs.store.opening import read_store
 from edp.logs.store.remote import is_remote_store, local_store
+from edp.logs.units import with_kinds, without_derived_kinds
 from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
@@ -153,7 +154,8 @@ class DataSource:
         """What provenance keeps, to read the same data again."""
         plain: dict[str, Any] = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
-            plain["map"] = plain_tree(self.signal_map)
+            # Kinds that units tell are written out: an entry without one was read by an earlier version.
+            plain["map"] = plain_tree(with_kinds(self.signal_map))
         if self.repair is not None:
             plain["repair"] = plain_tree(self.repair)
         if self.at_most_h is not None:
@@ -165,7 +167,7 @@ class DataSource:
     @staticmethod
     def from_plain(plain: dict[str, Any]) -> DataSource:
         """The source that `to_plain` described."""
-        signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
+        signal_map = without_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
         more = tuple(Path(path) for path in plain.get("more", ()))
         return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"), more)

@@ -240,7 +240,9 @@ def _delays(
     for segment, sign in itertools.product(segments, injection.signs):
         onset, column = round(ONSET * segment.samples), segment.index(name)
         values = segment.values.copy()
-        values[:, column] = injection.apply(values[:, column], onset, sign * size, segment.rate_hz)
+        # A logger shows degrees Celsius: a scale acts on them, not on kelvin.
+        zero = np.float32(KINDS[segment.channels[column].kind].from_report(0.0))
+        values[:, column] = zero + injection.apply(values[:, column] - zero, onset, sign * size, segment.rate_hz)
         began = onset / segment.rate_hz
         raised = [alarm.raised_s for alarm in _alarms(monitor, replace(segment, values=values))]
         later = [at - began for at in raised if at > began]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edp.errors import ConfigError, DataError
+from edp.errors import ConfigError, DataError, percent, percent_interval
 from edp.stats.checks import Array, Mask, tested_mask
 from edp.stats.clustered import clustered_t
 from edp.stats.effects import EffectSize, effect_size, rank_stability
@@ -184,13 +184,13 @@ def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rul
 
 def _reason(change: tuple[float, float, float], adjusted: float, dropped: int, p: float, rule: Rule) -> str:
     """Why a module is in or out, with the figures."""
-    middle, low, high = (100.0 * share for share in change)
-    figures = f"{middle:+.2f} % ({low:+.2f} to {high:+.2f} %)"
+    middle, low, high = change
+    figures = f"{percent(middle, signed=True)} ({percent_interval(low, high)})"
     if dropped:
         return f"dropped after {dropped} runs: {figures}, p {p:.2g}, no sign of an improvement"
     if adjusted >= rule.alpha:
         return f"{figures}, but adjusted p {adjusted:.2g} is not below {rule.alpha:g}"
-    if middle > -100.0 * rule.least_gain:
+    if middle > -rule.least_gain:
         return (
             f"{figures}: significant (adjusted p {adjusted:.2g}), but below the {100 * rule.least_gain:g} % asked for"
         )

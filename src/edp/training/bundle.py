@@ -248,7 +248,9 @@ def _bundle_folder(folder: str | Path) -> Path:
     # Both the run folder and the bundle in it are accepted.
     path = path / "bundle" if is_entry_at(path / "bundle" / HEADER) else path
     if is_entry_at(path / "twin" / "twin.json"):
-        raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
+        raise BundleError(
+            f"'{path}' holds a twin, not a network that predicts; edp rollout runs it, edp.load_twin loads it"
+        )
     if not is_entry_at(path / HEADER):
         missing = f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote"
         raise BundleError(unfinished_text(path) or missing)

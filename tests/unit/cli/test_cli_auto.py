@@ -57,7 +57,7 @@ def test_a_network_that_loses_says_so_first_and_by_its_exit_code(edp, trained):
     write_json(file, scores)
     lost = edp(*few)
     assert lost.code == 6
-    assert lost.out.startswith("On the held-out recordings Persistence has 50.0 % less error")
+    assert lost.out.startswith("On the held-out recordings Persistence has 50 % less error")
     assert edp(*few, "--json").json["beaten_by"] == "Persistence"
     for targets in scores["models"]["network"]["overall"].values():
         for metrics in targets.values():

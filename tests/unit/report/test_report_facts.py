@@ -2,10 +2,10 @@ import json
 
 import pytest
 
-from edp.errors import DataError, StorageError
+from edp.errors import DataError, StorageError, percent
 from edp.evaluation.guard import network_verdict
 from edp.report.common.tables import comparison_tables, key_figures
-from edp.report.common.wording import decimals_for, duration, listed, number, percent, unbroken
+from edp.report.common.wording import decimals_for, duration, listed, number, unbroken
 from edp.report.run.facts import (
     NETWORK,
     comparison_rows,

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.evaluation.guard import MEASURE, MEASURE_NAME
-from edp.report.common.wording import MISSING, count_text, decimals_for, duration, figure, moment, number, percent
+from edp.report.common.wording import MISSING, count_text, decimals_for, duration, figure, moment, number
 from edp.report.run.budget import budget_rows
 from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors

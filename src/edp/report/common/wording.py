@@ -77,14 +77,6 @@ def _useful_decimals(value: float) -> int:
     return max(MAX_DIGITS - 1 - exponent, 0)
 
 
-def percent(share: float | None, signed: bool = False) -> str:
-    """A share of one as a percentage: one decimal below ten percent, none above."""
-    if share is None or not math.isfinite(share):
-        return MISSING
-    # 0.0995 is where one decimal would round up to ten percent.
-    return number(100 * share, 1 if abs(share) < 0.0995 else 0, signed) + " %"
-
-
 def setting_text(value: object) -> str:
     """Return a setting as text, exactly as it was given; members of a list have commas between them."""
     if isinstance(value, Mapping):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from edp.errors import percent
 from edp.report.common.sheets import Column, Sheet, Value, chance, figures
 from edp.report.common.templates import template
-from edp.report.common.wording import count_text, number, percent, unbroken
+from edp.report.common.wording import count_text, number, unbroken
 from edp.report.compare.charts import compare_charts
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import Measure

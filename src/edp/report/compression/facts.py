@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edp.errors import StorageError, count_of
+from edp.errors import StorageError, count_of, percent
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import listed, number, percent
+from edp.report.common.wording import listed, number
 from edp.storage import read_json
 from edp.storage.paths import is_file_at
 

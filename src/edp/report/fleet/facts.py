@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import figure, number, percent
+from edp.report.common.wording import figure, number
 
 WORST = 10
 SURE_T = 4.0

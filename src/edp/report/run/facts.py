@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError, StorageError, count_of
+from edp.errors import DataError, StorageError, count_of, percent
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import read_scores
-from edp.report.common.wording import decimals_for, figure, listed, number, percent
+from edp.report.common.wording import decimals_for, figure, listed, number
 from edp.report.run.budget import budget_name, budget_rows
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from edp.data.splits import kind_of_name
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
-from edp.report.common.wording import listed, number, percent
+from edp.report.common.wording import listed, number
 from edp.storage import read_object
 from edp.storage.paths import is_file_at
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.report.common.sheets import Column, Sheet, Value, chance, figures, plainly
-from edp.report.common.wording import count_text, duration, moment, number, percent
+from edp.report.common.wording import count_text, duration, moment, number
 from edp.report.search.facts import StudyFacts, known, of_phase, real
 from edp.report.search.modules import modules_sheets, ordered, span
 from edp.report.search.smaller import smaller_sheet

@@ -6,9 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.evaluation.guard import ErrorOutcome, outcome_of
-from edp.report.common.wording import count_text, duration, listed, number, percent, setting_text
+from edp.report.common.wording import count_text, duration, listed, number, setting_text
 from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, real
 from edp.report.search.smaller import chosen_words
 from edp.report.search.views import titled

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from edp.errors import StorageError, count_of
-from edp.evaluation.guard import ErrorVerdict
+from edp.errors import StorageError, count_of, percent
+from edp.evaluation.guard import ErrorRatios, ErrorVerdict, best_verdict, by_recording
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import listed, number, percent
+from edp.report.common.wording import listed, number
 from edp.storage import read_json
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at
@@ -77,6 +78,11 @@ class Transfer:
         """Scores of a method."""
         scores: Mapping[str, Any] = self.methods[method]["domains"][domain][horizon][target]
         return scores
+
+    def recordings(self, method: str, horizon: str) -> dict[str, float]:
+        """Return the mean absolute error over targets of each log of the target; empty for earlier versions."""
+        by_log = self.methods[method].get("recordings", {})
+        return {name: float(errors[horizon]) for name, errors in by_log.items() if errors.get(horizon) is not None}
 
     def gain(self, horizon: str) -> float:
         """Share of the MAE of direct transfer that is gone."""
@@ -183,13 +189,24 @@ def method_sheet(facts: Transfer, horizon: str) -> Sheet:
 def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
     """Return the verdict on the fine-tuned network against the best other method at the furthest horizon."""
     horizon, method = facts.horizons[-1], facts.content["method"]
-    errors = {name: facts.score(name, horizon)["mae"] for name in facts.methods}
-    own, others = errors.pop(method), {name: error for name, error in errors.items() if error > 0}
-    if not others or not own:
+    own, ratios = float(facts.score(method, horizon)["mae"]), []
+    for name in facts.methods:
+        error = float(facts.score(name, horizon)["mae"])
+        if name != method and own > 0 < error:
+            theirs = facts.recordings(name, horizon)
+            logs = {
+                recording: [math.log(mae / theirs[recording])]
+                for recording, mae in facts.recordings(method, horizon).items()
+                if mae > 0 < theirs.get(recording, 0.0)
+            }
+            by_output = {MEAN: [math.log(own / error)]}
+            ratios.append(ErrorRatios(facts.methods[name]["label"], by_output, by_recording(logs)))
+    verdict = best_verdict(ratios, ErrorVerdict("", 0.0, (), "fine-tuned network"))
+    if verdict is None:
         return None
-    best = min(others, key=lambda name: others[name])
-    advice = f"take {facts.methods[best]['label']}, or give more recordings of this machine"
-    return ErrorVerdict(facts.methods[best]["label"], 1 - others[best] / own, (), "fine-tuned network", advice)
+    advice = f"take {verdict.label}, or give more recordings of this machine"
+    # Errors are means over targets, so that no target is named.
+    return replace(verdict, outputs=(), advice=advice)
 
 
 def headline(facts: Transfer) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from edp.errors import StorageError, count_of
+from edp.errors import StorageError, count_of, percent
 from edp.evaluation.guard import twin_verdict
 from edp.evaluation.scores_file import (
     COUNT,
@@ -28,7 +28,7 @@ from edp.evaluation.scores_file import (
     read_shaped,
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import figure, listed, number, percent, short_labels
+from edp.report.common.wording import figure, listed, number, short_labels
 from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.report.twin.ground import ground_line

@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from edp.report.common.wording import listed, percent
+from edp.errors import percent
+from edp.report.common.wording import listed
 
 
 def ground_line(provenance: Mapping[str, Any]) -> str:

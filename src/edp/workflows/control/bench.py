@@ -142,7 +142,12 @@ class ControlBench:
 
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""
-        return float(np.mean([result.score.position_rms_mm for result in self.results(spec)]))
+        return float(np.mean(list(self.costs(spec).values())))
+
+    def costs(self, spec: ControllerSpec) -> dict[str, float]:
+        """Return the position error of the tip, rms, mm, of each reference by its name."""
+        errors = [result.score.position_rms_mm for result in self.results(spec)]
+        return {f"{task.name} {task.seed}": float(error) for task, error in zip(self.tasks, errors, strict=True)}
 
 
 def _check_used(experiment: ControlExperiment, sources: ControlSources) -> None:

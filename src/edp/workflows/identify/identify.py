@@ -14,7 +14,7 @@ from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
-from edp.evaluation.free_run import free_run_scores
+from edp.evaluation.free_run import check_runs, free_run_scores
 from edp.evaluation.guard import GREY, MACHINE
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
@@ -143,12 +143,15 @@ def identify(
         )
     channels, data = prepared_twin(recordings, settings)
     _check_strokes(channels, data, base)
+    # What could not be judged, or holds no number, is refused before the fit of minutes.
+    celsius, notes = _celsius(recordings, base)
+    scales, judge = fit_scales(channels, data.train) if loaded is None else loaded[0].scales, settings.judge
+    check_runs(channels, scales, grey.prefix_ticks, data.test, judge.seconds, judge.starts)
     if loaded is None:
         fitted = _fitted(base, machine, grey, (channels, data, settings.training.seed), (on_event, tell))
     else:
         check_same_linkage(loaded[0], base, machine)
         fitted = _informed(loaded[0], data, settings.training.seed)
-    celsius, notes = _celsius(recordings, base)
     parts = parts_of(fitted.twin, fitted.elements, base, celsius)
     notes += _notes(parts)
     tell("fitting the machine itself to free runs")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import ConfigError, DataError, LostError, closest
+from edp.errors import ConfigError, DataError, LostError, closest, percent
 from edp.logs.source import DataSource
 from edp.monitor.detectable import effort_line, found_sizes, healthy_range, measure_found_sizes, promise_lines
 from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_sessions, fit_chain
@@ -36,7 +36,7 @@ from edp.storage.paths import is_there
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
-from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, machine_of
+from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, check_dictionary_inputs, machine_of
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
@@ -174,6 +174,7 @@ def fit_to_recordings(
     train, validation, rest = _divided(sessions, experiment)
     _check_hours(sessions, rest, experiment)
     check_healthy_sessions(experiment.chain, channels, rest)
+    check_dictionary_inputs(experiment, channels, rest)
     material = FitMaterial(
         train=train,
         validation=validation,
@@ -385,7 +386,7 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
         share = left / hours
         raise ConfigError(
             f"{hours:.3g} h of healthy logs are too few for one false alarm in {promised:g} h: "
-            f"{1.0 - share:.0%} of them train residuals, and what is left supports one in {left:.3g} h; ask "
+            f"{percent(1.0 - share)} of them train residuals, and what is left supports one in {left:.3g} h; ask "
             f"for one in {ROOM * left:.3g} (--hours-per-false-alarm {ROOM * left:.3g}), which leaves room for sessions "
             f"that turn out doubtful, or bring {promised / (ROOM * share) - hours:.3g} h more"
         )

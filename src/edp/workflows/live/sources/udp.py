@@ -13,7 +13,7 @@ import numpy as np
 
 from edp.errors import ConfigError, DataError
 from edp.live.addresses import LOOPBACK, resolve_bind
-from edp.logs.units import check_unit, unit_for
+from edp.logs.units import check_unit, mapped_channel, unit_for
 from edp.settings.bounds import shown
 from edp.signals import VOCABULARY, Channel, Kind, SignalMap
 from edp.storage.reading import parse_json
@@ -80,7 +80,7 @@ class UdpSource(LiveSource):
     def of(cls, options: SourceOptions, needs: Needs) -> UdpSource:
         """`SourceOptions.value` is the port; the setting ``bind`` another address than loopback."""
         rate, signal_map = chosen_rate(options, needs, "--udp"), options.signal_map()
-        mapped = tuple(entry.channel() for entry in signal_map.channels) if signal_map else ()
+        mapped = tuple(mapped_channel(entry) for entry in signal_map.channels) if signal_map else ()
         names = {channel.name for channel in mapped}
         channels = (*mapped, *(channel for channel in needs.channels if channel.name not in names))
         host = options.settings.get("bind", LOOPBACK)
@@ -183,7 +183,7 @@ def _conversions(signal_map: SignalMap | None) -> Callable[[str, Mapping[str, fl
     """From a channel's name and a row to its value in SI units."""
     entries: dict[str, Any] = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
     units = {
-        name: unit_for(check_unit(entry.unit, where), entry.channel().kind, where)
+        name: unit_for(check_unit(entry.unit, where), mapped_channel(entry).kind, where)
         for name, entry in entries.items()
         if entry.unit is not None and (where := f"signal map, channel '{name}'")
     }

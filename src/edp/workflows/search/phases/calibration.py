@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.experiment import Table
-from edp.errors import DataError
+from edp.errors import DataError, percent, percent_interval
 from edp.stats.efficiency import SizeScore, most_efficient
 from edp.stats.paired import fill_worst
 from edp.stats.pareto import pareto
@@ -94,8 +94,8 @@ class Calibration:
             scores = facts["final"]["scores"]
             listed = ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
             against = "".join(
-                f"; {item['best']} against {name} {100 * item['change']:+.2f} % ({100 * item['low']:+.2f} to "
-                f"{100 * item['high']:+.2f} %)"
+                f"; {item['best']} against {name} {percent(item['change'], signed=True)} "
+                f"({percent_interval(item['low'], item['high'])})"
                 for name, item in facts["final"]["against"].items()
             )
             sentences.append(f"Each on all {context.spec.folds} folds: {listed} {context.unit}{against}.")

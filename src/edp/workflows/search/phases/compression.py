@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from edp.config.experiment import Experiment, Table, build
-from edp.errors import ConfigError
+from edp.errors import ConfigError, percent
 from edp.networks.narrow import width_of
 from edp.networks.predictor import build_model
 from edp.stats.pareto import pareto
@@ -126,7 +126,7 @@ class CompressionPhase:
         usage = row["resource_usage"]
         sentences.append(
             f"Chosen for '{budget.name}': {row['name']} with {usage['parameter_bytes']:,} bytes of parameters "
-            f"and {usage['cycles'][2]:,} cycles a tick; its error there is {100 * (row['error'] - 1):+.1f} % "
+            f"and {usage['cycles'][2]:,} cycles a tick; its error there is {percent(row['error'] - 1, signed=True)} "
             "against the teacher's."
         )
         formats = ("float32", row["format"])
@@ -145,7 +145,7 @@ class CompressionPhase:
         facts["held_out_test"] = {"scores": scores, "error": error}
         sentences.append(
             f"On the second test set ({', '.join(context.second)}), opened for these two alone: "
-            f"{100 * (error - 1):+.1f} % against the teacher's error."
+            f"{percent(error - 1, signed=True)} against the teacher's error."
         )
         return Decision(NAME, facts, tuple(sentences))
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.experiment import Table
+from edp.errors import percent
 from edp.stats.checks import Mask
 from edp.stats.clustered import clustered_t
 from edp.stats.confirm import ModuleEvidence, Rule, confirm
@@ -133,7 +134,7 @@ def _thesis_text(name: str, evidence: Sequence[ThesisEvidence]) -> str:
     verdict = "confirmed" if any(entry.confirmed for entry in evidence) else "not confirmed"
     return (
         f"{MODULES[name].title}: {verdict}; on {best.metric} adjusted p {best.adjusted:.2g}, d_z {best.d_z:.2f}, "
-        f"wins {100 * best.stability:.0f} %."
+        f"wins {percent(best.stability)}."
     )
 
 

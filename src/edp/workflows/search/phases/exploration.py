@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from edp.errors import count_of
+from edp.errors import count_of, percent
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.workflows.search.context import Decision, Outcome, SearchContext
@@ -69,9 +69,8 @@ class Exploration:
         verdict = "it is the teacher" if better else "the winner of phase 4 stays the teacher"
         sentences = (
             f"Best of {len(facts['trials'])} questions about all modules: {names}.",
-            f"Against the winner of phase 4 on {count_of(size, 'fresh run')}: {100 * comparison['change']:+.2f} % "
-            "(one-sided p "
-            f"{comparison['p']:.2g}); {verdict}.",
+            f"Against the winner of phase 4 on {count_of(size, 'fresh run')}: "
+            f"{percent(comparison['change'], signed=True)} (one-sided p {comparison['p']:.2g}); {verdict}.",
             *facts["said_of_pruned"],
         )
         return Decision("exploration", facts, sentences)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.config.experiment import Table
-from edp.errors import DataError, count_of
+from edp.errors import DataError, count_of, percent, percent_interval
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
@@ -104,14 +104,13 @@ class Isolation:
         ]
         for backbone, comparison in facts["comparisons"].items():
             sentences.append(
-                f"{backbone}: {chosen} against {comparison['reference']} {100 * comparison['change']:+.2f} % "
+                f"{backbone}: {chosen} against {comparison['reference']} {percent(comparison['change'], signed=True)} "
                 f"(one-sided p {comparison['p']:.2g}, two-way clustered t over {count_of(spec.variance_runs, 'run')})."
             )
         for backbone, comparison in facts["backbones"].items():
             sentences.append(
-                f"With {chosen}, {comparison['best']} against {backbone} {100 * comparison['change']:+.2f} % "
-                f"({100 * comparison['low']:+.2f} to {100 * comparison['high']:+.2f} %); phase 1 tunes each before "
-                "one is chosen."
+                f"With {chosen}, {comparison['best']} against {backbone} {percent(comparison['change'], signed=True)} "
+                f"({percent_interval(comparison['low'], comparison['high'])}); phase 1 tunes each before one is chosen."
             )
         return Decision("isolation", facts, tuple(sentences))
 

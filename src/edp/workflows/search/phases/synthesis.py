@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.experiment import Table
+from edp.errors import percent
 from edp.stats.clustered import clustered_t
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import title_of
@@ -55,7 +56,7 @@ class Synthesis:
         test = facts["test"]
         ours, base = (_shown(test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
         gain = facts["test_gain"]
-        interval = "" if gain is None else f"; {100 * gain['change']:+.2f} %, p {gain['p']:.2g}"
+        interval = "" if gain is None else f"; {percent(gain['change'], signed=True)}, p {gain['p']:.2g}"
         sentences.append(
             f"On {len(context.test)} test sessions, opened once: {ours}, the baseline {base} (composite score, mean of "
             f"{context.spec.run_seeds} seeds{interval})."
