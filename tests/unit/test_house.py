@@ -35,7 +35,8 @@ def test_rooms_are_few_and_imports_go_down(house):
     # 141 before the monitor read networks, twins and recordings (seven more rooms), and settings and testing read it.
     # 150 before the live view, which imports errors, signals, storage and report, and is imported by workflows.
     # 155 before options of the command line took their bounds from settings.
-    assert house.arrows <= 156
+    # 156 before numbers in messages of all rooms came from `edp.wording`, which stands below them.
+    assert house.arrows <= 175
     assert house.circles == []
 
 

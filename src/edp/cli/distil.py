@@ -10,7 +10,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.settings import SettingsOption
-from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
+from edp.cli.train import DataOption, MapOption, RepairOption, TrainingDisplay, source_if_given
 from edp.errors import ConfigError
 from edp.wording import figure
 
@@ -26,15 +26,15 @@ def distil(
         int | None,
         typer.Option(help="Width of the student (distil.units): recurrent units, or channels of the first level."),
     ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(help="Log, folder of logs, data-set file, or store; default: those of the run."),
-    ] = None,
+    data: DataOption = [],  # noqa: B006
     teachers: Annotated[list[Path], typer.Option("--teacher", help="A further teacher; may be repeated.")] = [],  # noqa: B006
     further: Annotated[
-        Path | None,
-        typer.Option(help="Recordings without measured targets; the student learns the teachers' predictions on them."),
-    ] = None,
+        list[Path],
+        typer.Option(
+            help="Recordings without measured targets, on which the student learns the teachers' predictions; may be "
+            "repeated."
+        ),
+    ] = [],  # noqa: B006
     config: SettingsOption = None,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting, such as distil.pruned=true or training.epochs=10.")
@@ -62,10 +62,10 @@ def distil(
     request = DistilRequest(
         spec=spec,
         teachers=tuple(map(str, teachers)),
-        further=None if further is None else source_of(further, signal_map, repair),
+        further=source_if_given(further, signal_map, repair),
         changes=others,
     )
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     with progress(as_json) as shown:
         display = TrainingDisplay(shown, Steps(as_json))
         bundle = make(run, request, folder, source, display.on_event)

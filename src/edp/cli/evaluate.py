@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
-from edp.cli.options import MOST_HOURS, MOST_MINUTES, within
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.options import MOST_HOURS, MOST_MINUTES, check_effects, within
+from edp.cli.train import DataOption, MapOption, RepairOption, source_if_given
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
-from edp.errors import ConfigError
 from edp.settings.bounds import above, span
 from edp.wording import figure, number, percent, setting_text
 
@@ -25,8 +24,9 @@ if TYPE_CHECKING:
 
 
 def evaluate(
+    context: typer.Context,
     run: Annotated[Path, typer.Argument(help="Run folder of edp train or edp twin.")],
-    data: Annotated[Path | None, typer.Option(help="Other recordings to judge on; default: the held-out ones.")] = None,
+    data: DataOption = [],  # noqa: B006
     baselines: Annotated[
         str | None, typer.Option(help="Comma-separated names, 'all' or 'none'; default: those of the settings.")
     ] = None,
@@ -66,18 +66,16 @@ def evaluate(
     """
     from edp.training.twin_bundle import holds_twin
 
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     workforce = workforce_of(workers, cluster, open_cluster)
-    if minutes is not None and not workforce.alone:
-        raise ConfigError("--minutes bounds what one process does; leave it out with --workers and --cluster")
-    if holds_twin(run):
-        plain = baselines is None and not channel_importance and minutes is None and at_most is None
-        refuse_for_a_twin(run, workforce.alone, plain)
+    names = None if baselines is None else baseline_names(baselines)
+    is_twin = holds_twin(run)
+    of_networks = ("baselines", "at_most", "channel_importance", "workers", "cluster")
+    effects = {"predictor": is_twin, "minutes": not is_twin and names != [] and workforce.alone}
+    check_effects(context, effects | dict.fromkeys(of_networks, not is_twin))
+    if is_twin:
         evaluate_twin_run(run, source, predictor, as_json)
         return
-    if predictor is not None:
-        raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
-    names = None if baselines is None else baseline_names(baselines)
     from edp.evaluation.guard import network_verdict
     from edp.report.run.choice import promise_line, read_choice
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
@@ -106,27 +104,6 @@ def evaluate(
     importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
     emit(as_json, facts | importance_json, show)
     end_with(verdict)
-
-
-def refuse_for_a_twin(run: Path, alone: bool, plain: bool) -> None:
-    """Refuse what a twin's evaluation does not have: more than one process, and options of networks' evaluations.
-
-    Args:
-        run: folder of the twin.
-        alone: whether one process works.
-        plain: whether none of these options is given.
-
-    Raises:
-        ConfigError: one of both is not so.
-    """
-    if not alone:
-        raise ConfigError(f"'{run}' holds a twin, which one process judges; leave --workers and --cluster out")
-    if not plain:
-        raise ConfigError(
-            f"'{run}' holds a twin, which has no --baselines, --minutes, --at-most or --channel-importance; leave "
-            "them out: "
-            "its floors are those of its settings, judge.floors"
-        )
 
 
 def show_scores(scores: dict[str, Any], sentences: Sequence[str], minutes: float | None) -> None:

@@ -30,7 +30,7 @@ _NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
 
 
 def init(
-    logs: Annotated[Path, typer.Argument(help="A log, or a folder of logs, of any columns.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Logs and folders of logs, of any columns.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder to write map.toml and settings.toml into.")] = Path(),
     yes: Annotated[bool, typer.Option("--yes", help="Write the files without asking.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,

@@ -9,8 +9,8 @@ import typer
 
 from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
-from edp.cli.options import MOST_TICKS
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.options import MOST_TICKS, check_effects
+from edp.cli.train import MapOption, RepairOption, source_if_given
 from edp.wording import figure, number
 
 if TYPE_CHECKING:
@@ -18,10 +18,15 @@ if TYPE_CHECKING:
 
 
 def parity(
+    context: typer.Context,
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp quantise or edp twin.")],
     data: Annotated[
-        Path | None, typer.Option(help="Log whose first ticks are the reference recording; default: random inputs.")
-    ] = None,
+        list[Path],
+        typer.Option(
+            help="Logs and folders of logs whose first ticks, in equal parts, are the reference recording; may be "
+            "repeated. Default: random inputs."
+        ),
+    ] = [],  # noqa: B006
     ticks: Annotated[
         int | None,
         typer.Option(
@@ -57,10 +62,11 @@ def parity(
     from edp.workflows.deployment import load_exported
     from edp.workflows.parity import compare, from_own_run, golden_case, recorded_case
 
+    check_effects(context, {"interpreters": not forms or any(form.startswith("onnx_") for form in forms)})
     if not (yes or from_own_run(bundle)):
         _ask(bundle)
     loaded = load_exported(bundle)
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     case = golden_case(loaded, ticks) if source is None else recorded_case(loaded, source, ticks)
 
     def tell(row: Row) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listing, out, progress, table
+from edp.cli.options import TRIAL_TABLES, check_effects
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
 from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
@@ -37,6 +38,7 @@ TOLD_SHARE = 0.005
 
 
 def screen(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Folder for page, pictures, feature sets and figures.")],
     targets: Annotated[str, typer.Option(help="Channels to predict: a,b. Default: the velocities.")] = "",
@@ -84,6 +86,7 @@ def screen(
     from edp.workflows.feature_selection.select import SelectionOrder
     from edp.workflows.feature_selection.trials import TrialSpec
 
+    check_effects(context, {f"changes.{table}": trials for table in TRIAL_TABLES})
     asked = {"targets": _names(targets) or None, "horizon": horizon}
     layers: list[Change] = [*changes, {"screen": {key: value for key, value in asked.items() if value is not None}}]
     spec, others = command_settings("screen", ScreeningSpec, config, layers, ("trials", *TRAINING_TABLES))

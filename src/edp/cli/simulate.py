@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, out, progress, table
+from edp.cli.options import check_effects
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import count_of
 from edp.wording import figure, number
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 
 def simulate(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder for the logs; an unfinished data set continues.")],
     scenario: Annotated[
         Path | None,
@@ -87,6 +89,7 @@ def simulate(
     from edp.sim.faults import fault_text, parse_fault
     from edp.sim.scenario_file import limit_settings
 
+    check_effects(context, {"changes.limit": limit})
     order = SimulationOrder.of(
         scenario,
         _note,

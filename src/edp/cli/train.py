@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
-from edp.cli.options import MOST_WORKERS
+from edp.cli.options import MOST_WORKERS, check_effects
 from edp.errors import ConfigError
 from edp.wording import figure, number, percent
 
@@ -32,6 +32,14 @@ LogsArgument = Annotated[
         help="Logs and folders of logs; or one data-set file (.toml), or one store.",
     ),
 ]
+DataOption = Annotated[
+    list[Path],
+    typer.Option(
+        "--data",
+        help="Other recordings: logs and folders of logs, a data-set file, or a store; may be repeated. Default: those "
+        "of the run.",
+    ),
+]
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
     list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
@@ -39,6 +47,7 @@ RepairOption = Annotated[
 
 
 def train(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
@@ -73,12 +82,11 @@ def train(
 
     source = source_of(data, signal_map, repair)
     preset = preset or usual_preset(config, changes)
+    check_effects(context, {"minutes": preset == AUTO, "workers": preset == AUTO})
     if preset == AUTO:
         own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
         _train_auto(source, folder, config, [*changes, *own], workers, as_json)
         return
-    if minutes is not None:
-        raise ConfigError(f"--minutes came with the preset '{preset}'; only the preset auto has a budget: leave it out")
     bundle, best = run(data, folder, config, preset, changes, source, as_json)
     facts = {
         "run": str(folder),
@@ -180,10 +188,14 @@ def shell_words(paths: Iterable[Path]) -> str:
     return shlex.join(str(path) for path in paths)
 
 
+def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource | None:
+    """Return a data source from command-line options; None if no path was given."""
+    return source_of(data, signal_map, repair) if data else None
+
+
 def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
     """A data source from command-line options."""
     from edp.config.experiment import build
-    from edp.errors import ConfigError
     from edp.logs.repair import Repair
     from edp.logs.source import DataSource
 

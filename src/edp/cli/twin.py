@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_text, out, progress, table
-from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, within
+from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, check_effects, within
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 def twin(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
@@ -55,12 +56,17 @@ def twin(
 
     Example: `edp twin data/m22 --out runs/twin`
     """
-    from edp.config.twin import load_twin_experiment, with_budget
+    from edp.config.twin import has_choice, load_twin_experiment, trains_several, with_budget
     from edp.evaluation.guard import twin_verdict
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
 
     experiment = load_twin_experiment(config, changes)
+    effects = {
+        "minutes": has_choice(experiment) and start is None,
+        "workers": trains_several(experiment) or start is not None,
+    }
+    check_effects(context, {name: effect and not experiment.ground for name, effect in effects.items()})
     if minutes is not None:
         experiment = with_budget(experiment, minutes)
     with progress(as_json) as shown:

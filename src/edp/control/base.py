@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -245,6 +245,17 @@ class ControllerSpec(Protocol):
             ConfigError: the plant or the models lack what it needs, or the limits contradict it.
         """
         ...
+
+
+def unused_models(needs: Sequence[str], available: Collection[str]) -> list[str]:
+    """Return the available models that a controller does not use.
+
+    Args:
+        needs: see `ControllerSpec`; of ``a or b`` the first that is available is used.
+        available: names of models.
+    """
+    used = {next((name for name in need.split(" or ") if name in available), "") for need in needs}
+    return sorted(set(available) - used)
 
 
 CONTROLLERS: Registry[type] = Registry("controller")

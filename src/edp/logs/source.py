@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -63,6 +64,10 @@ class DataSetSettings:
     repair: Repair = field(default_factory=Repair)
 
 
+_LONGEST_STEM = 120
+"""Characters of a log's name in the name of a folder; file systems allow 255 bytes."""
+
+
 @dataclass(frozen=True)
 class DataSource:
     """Where recordings come from.
@@ -97,12 +102,18 @@ class DataSource:
 
     @staticmethod
     def of(
-        path: str | Path | Sequence[Path], map_file: str | Path | None = None, repair: Repair | None = None
+        path: str | Path | Sequence[str | Path], map_file: str | Path | None = None, repair: Repair | None = None
     ) -> DataSource:
-        """Return a source from one path or several."""
-        first, *more = [Path(path)] if isinstance(path, str | Path) else path
+        """Return a source from one path or several.
+
+        Raises:
+            ConfigError: there is no path, or paths that cannot be read together.
+        """
+        paths = [Path(entry) for entry in ([path] if isinstance(path, str | Path) else path)]
+        if not paths:
+            raise ConfigError("logs: got an empty list of paths, expected at least one; give a log or a folder of logs")
         signal_map = None if map_file is None else load_signal_map(map_file)
-        return DataSource(first, signal_map, repair, more=tuple(more))
+        return DataSource(paths[0], signal_map, repair, more=tuple(paths[1:]))
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -113,6 +124,18 @@ class DataSource:
     def label(self) -> str:
         """Description of the source for results and messages."""
         return str(self.path) if not self.more else f"{self.path} and {len(self.more)} more"
+
+    @property
+    def short_name(self) -> str:
+        """Name for titles and folders: the stem of the path; of several paths with their number and a hash of all."""
+        stem = self.path.stem if self.address else full_path(self.path).stem
+        stem = stem[:_LONGEST_STEM]
+        if not self.more:
+            return stem
+        # A set: the order of the paths names no other logs.
+        every = "\0".join(sorted({str(full_path(path)) for path in self.paths}))
+        digest = hashlib.blake2b(every.encode(errors="surrogateescape"), digest_size=4).hexdigest()
+        return f"{stem}_and_{len(self.more)}_more_{digest}"
 
     @property
     def stored(self) -> bool:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from edp.config.control import ControlExperiment
-from edp.control.controllers import ControllerSpec
+from edp.control.base import unused_models
+from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult, run_loop, start_options
 from edp.control.models import ControlModels
@@ -67,6 +68,7 @@ class ControlBench:
         models: ControlModels | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
+        _check_used(experiment, sources)
         self.experiment, self._options = experiment, options
         rate = experiment.rate_hz
         probe = plant_of(experiment.machine, RUN_S + 1.0, rate, sources.plant, sources.trusted)
@@ -147,6 +149,18 @@ class ControlBench:
         """Return the position error of the tip, rms, mm, of each reference by its name."""
         errors = [result.score.position_rms_mm for result in self.results(spec)]
         return {f"{task.name} {task.seed}": float(error) for task, error in zip(self.tasks, errors, strict=True)}
+
+
+def _check_used(experiment: ControlExperiment, sources: ControlSources) -> None:
+    """Raise ConfigError for models that the controller of an experiment does not use."""
+    needs, kind = experiment.controller.needs, CONTROLLERS.name_of(experiment.controller)
+    available = [name for name in ("twin", "predictor") if getattr(sources, name) is not None]
+    for name in unused_models(needs, available):
+        uses = " and a ".join(need.replace("_", " ") for need in needs)
+        raise ConfigError(
+            f"--{name}: it has no effect with the controller '{kind}', which uses a {uses}; "
+            f"leave --{name} out, or choose another controller"
+        )
 
 
 def _bundle_of(run: Path) -> Path:

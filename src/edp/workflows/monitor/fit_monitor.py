@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import BundleError, ConfigError, DataError, LostError, closest
+from edp.errors import ConfigError, DataError, LostError, closest
 from edp.logs.source import DataSource
 from edp.monitor.detectable import effort_line, found_sizes, healthy_range, measure_found_sizes, promise_lines
 from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_sessions, fit_chain
@@ -118,6 +118,11 @@ def fit_monitor(
         return replace(fitted, folder=folder)
 
 
+def holds_model(path: str | Path) -> bool:
+    """Return whether a path is a run folder or a bundle, finished or not, in place of logs."""
+    return any(is_there(Path(path) / name) for name in ("bundle", "bundle.json", "run.json", "twin"))
+
+
 def _in_one_thread(function: Callable[[Any], Any], job: Any) -> Any:
     """A job with the sums of a fit in one process."""
     with one_blas_thread():
@@ -132,17 +137,12 @@ def _died(label: str) -> LostError:
 
 
 def _network_of(run: str | Path) -> Bundle | TwinBundle:
-    """The network or twin of a run.
+    """Return the network or twin of a run.
 
     Raises:
-        BundleError: it holds none, or is damaged.
+        BundleError: the folder holds none, or is damaged.
     """
-    try:
-        return load_twin(run) if holds_twin(run) else load_bundle(run)
-    except BundleError as error:
-        if any(is_there(Path(run) / name) for name in ("bundle", "bundle.json", "run.json", "twin")):
-            raise
-        raise BundleError(f"{error}; healthy logs are the last argument alone: put them into one folder") from error
+    return load_twin(run) if holds_twin(run) else load_bundle(run)
 
 
 @one_blas_thread()

@@ -339,7 +339,7 @@ def _facts(plan: SearchPlan, data: _Data, source: DataSource, context: SearchCon
         "unit": data.unit,
         "preset": plan.preset,
         "data": {
-            "path": str(source.path),
+            "path": source.label,
             "sessions": len(data.names),
             "hours": round(data.hours, 4),
             "hash": data.digest,

@@ -18,7 +18,7 @@ SIMULATED = "sim:"
 class LogSource(LiveSource):
     """One log, from its first row to its last."""
 
-    options: ClassVar[frozenset[str]] = frozenset({"map", "machine", "speed"})
+    options: ClassVar[frozenset[str]] = frozenset({"map", "machine", "speed", "until-end"})
 
     def __init__(self, recording: Recording, machine: str | None = None) -> None:
         self.recording: Recording = recording

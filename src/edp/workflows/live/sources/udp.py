@@ -48,7 +48,7 @@ class UdpSource(LiveSource):
     """
 
     steered: ClassVar[bool] = False
-    options: ClassVar[frozenset[str]] = frozenset({"map", "rate", "machine", "udp-bind"})
+    options: ClassVar[frozenset[str]] = frozenset({"map", "rate", "machine", "udp-bind", "until-end"})
     ending = "the source was closed"
 
     def __init__(
