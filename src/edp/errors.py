@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable
+
+from edp.wording import figure
 
 MOST_CHARACTERS = 8_000
 """Of a message: two screens. Names and values in it come from files, which may hold a hundred thousand characters."""
@@ -69,12 +70,8 @@ SHOWN_CAUSE = 300
 """Characters of what a library says, in a message: some quote the file."""
 
 
-HUGE_SHARE = 1e13
-"""Share of one from which a percentage is shown with a power of ten."""
-
-
 def brief(error: BaseException | str, most: int = SHOWN_CAUSE) -> str:
-    """Return the message of an error on one line of bounded length; its type where there is no message.
+    """Return the message of an error on one line of bounded length, or its type if the message is empty.
 
     The end of a long message is kept: the path of a file often comes first, and the reason last.
     """
@@ -89,9 +86,7 @@ def count_of(count: float | str | None, noun: str) -> str:
         count: a number, or its text.
         noun: in the singular; only its last word gets a plural.
     """
-    text = (
-        "–" if count is None else count if isinstance(count, str) else f"{count:,g}" if count % 1 else f"{count:,.0f}"
-    )
+    text = count if isinstance(count, str) else figure(count)
     if text == "1":
         return f"1 {noun}"
     if noun.endswith("xis"):
@@ -99,27 +94,6 @@ def count_of(count: float | str | None, noun: str) -> str:
     if noun.endswith("y") and noun[-2:-1] not in "aeiou":
         return f"{text} {noun[:-1]}ies"
     return f"{text} {noun}{'es' if noun.endswith(('s', 'x', 'ch', 'sh')) else 's'}"
-
-
-def percent(share: float | None, signed: bool = False) -> str:
-    """Return a share of one as a percentage: one decimal below ten percent, none above; a dash if it is not known.
-
-    Headlines, first lines, tables and pages show percentages of results by this rule alone.
-    """
-    if share is None or not math.isfinite(share):
-        return "–"
-    if abs(share) >= HUGE_SHARE:
-        return f"{100 * share:{'+' if signed else ''}.3g} %".replace("-", "−")
-    # 0.0995 is where one decimal would round up to ten percent.
-    text = f"{100 * share:{'+' if signed else ''},.{1 if abs(share) < 0.0995 else 0}f}"
-    # A rounded zero must not carry a sign.
-    text = text.lstrip("+-") if float(text.replace(",", "")) == 0 else text
-    return text.replace("-", "−") + " %"
-
-
-def percent_interval(low: float, high: float) -> str:
-    """Return an interval of relative changes, such as "−3.1 % to +12 %"."""
-    return f"{percent(low, signed=True)} to {percent(high, signed=True)}"
 
 
 def closest(name: str, options: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""One rule for percentages in headlines, first lines, tables of the terminal and pages: `edp.errors.percent`."""
+"""One rule for percentages in headlines, first lines, tables of the terminal and pages: `edp.wording.percent`."""
 
 import math
 import re
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from edp.errors import percent, percent_interval
 from edp.evaluation.guard import ErrorVerdict
+from edp.wording import percent, percent_interval
 
 SOURCE = Path(__file__).parents[2] / "src/edp"
 ROOMS = ("cli", "evaluation", "report", "stats", "workflows")

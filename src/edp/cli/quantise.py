@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
-from edp.errors import percent
+from edp.wording import number, percent
 
 
 def quantise(
@@ -29,7 +29,9 @@ def quantise(
 
     def show() -> None:
         change = percent(result["integer"] / result["float"] - 1.0, signed=True)
-        out.print(f"error on the validation part: {change} against float32; constants {result['bytes']:,.0f} bytes")
+        out.print(
+            f"error on the validation part: {change} against float32; constants {number(result['bytes'], 0)} bytes"
+        )
         out.print(f"next: edp evaluate {folder}, edp export {folder} --to c --out firmware/predictor")
 
     emit(as_json, {"folder": str(folder), **result}, show)

@@ -16,6 +16,7 @@ from edp.errors import DataError
 from edp.evaluation.free_run_parts import by_channel, by_horizon, by_name, nrmse_by_channel, situations
 from edp.networks.twin import FreeRunIntervals, Twin, TwinScales, calibrate, even_starts, starts_within
 from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
+from edp.wording import figure
 
 Array = NDArray[np.float32]
 MOST_SECONDS = 86_400.0
@@ -191,7 +192,8 @@ def _run_ticks(channels: TwinChannels, prefix: int, series: Sequence[Series], se
     ticks = min(round(seconds * rate), longest - prefix - 1)
     if ticks < 1:
         raise DataError(
-            f"the longest recording has {longest} ticks ({longest / rate:g} s); the twin needs {prefix} measured ones "
+            f"the longest recording has {longest} ticks ({figure(longest / rate)} s); the twin needs {prefix} "
+            "measured ones "
             "and two more to be judged: give longer recordings"
         )
     return prefix + ticks + 1

@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from edp.errors import count_of, percent, percent_interval
+from edp.errors import count_of
 from edp.stats.resampled import paired_t
+from edp.wording import figure, percent, percent_interval
 
 NETWORK = "network"
 TWIN = "twin"
@@ -218,7 +219,9 @@ def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> 
     if NETWORK not in models:
         return None
     unit = "minute" if minutes == 1 else "minutes"
-    advice = ADVICE if minutes is None else f"give it more than {minutes:g} {unit} (--minutes), or more recordings"
+    advice = (
+        ADVICE if minutes is None else f"give it more than {figure(minutes)} {unit} (--minutes), or more recordings"
+    )
     horizons, targets = scores["task"]["horizons"], [target["name"] for target in scores["targets"]]
     ratios = []
     for name, model in models.items():

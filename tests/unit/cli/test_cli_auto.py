@@ -41,7 +41,7 @@ def test_settings_of_a_network_take_the_preset_standard(edp, logs, tmp_path, sma
 def test_minutes_are_of_the_preset_auto_alone(edp, logs, tmp_path):
     ended = edp("train", logs, "--out", tmp_path / "run", "--preset", "quick", "--minutes", "3")
     assert ended.code == 1
-    assert "only the preset auto has a budget" in ended.err
+    assert "--minutes: it has no effect without the preset auto" in ended.err
     assert not (tmp_path / "run").exists()
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.errors import count_of
-from edp.report.common.wording import count_text, duration, figure, moment, number
+from edp.wording import count_text, duration, figure, moment, number
 
 _TEXTS = (
     ("Machine", "machine"), ("Plant", "plant"), ("Twin of the controller", "twin"),

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError, count_of, percent
+from edp.errors import DataError, count_of
 from edp.evaluation.guard import LEAST, ErrorOutcome
-from edp.report.common.wording import figure, listed, number
 from edp.report.compare.runs import FREE, MEAN, ComparedRun, Measure, read_runs, recording_that_differs
 from edp.report.run.facts import NETWORK, TRUTH
 from edp.stats.multiple import holm
 from edp.stats.resampled import paired_t
+from edp.wording import figure, listed, number, percent
 
 FEWEST = 3
 """Common recordings from which an interval over recordings is given: two leave one degree of freedom."""

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from edp.errors import percent
 from edp.evaluation.guard import NETWORK
 from edp.report.common.sheets import Column, Sheet, figures
+from edp.wording import percent
 
 WORDS = {
     "rest": "at rest, now and then",

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from edp.errors import percent
 from edp.report.common.sheets import Column, Sheet, figures
-from edp.report.common.wording import number
 from edp.report.search.facts import StudyFacts, of_phase, real
+from edp.wording import number, percent
 
 
 @of_phase("compression", None)

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from edp.errors import StorageError, count_of, percent
+from edp.errors import StorageError, count_of
 from edp.evaluation.guard import ErrorRatios, ErrorVerdict, best_verdict, by_recording
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import listed, number
 from edp.storage import read_json
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at
+from edp.wording import listed, number, percent, quantity, unit_text
 
 RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 2
 TARGET, SOURCE, MEAN = "target", "source", "mean"
@@ -56,7 +56,7 @@ class Transfer:
     def unit(self) -> str:
         """The unit that all targets share."""
         units = {target["unit"] for target in self.targets}
-        return units.pop() if len(units) == 1 else "mixed units"
+        return unit_text(units.pop()) if len(units) == 1 else "mixed units"
 
     @property
     def methods(self) -> Mapping[str, Mapping[str, Any]]:
@@ -132,7 +132,7 @@ def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
             keys = ("mse", "mae", "r2", "p95", "p99", "bias", "skew")
             rows.append((facts.methods[method]["label"], facts.name(target), *(scores[key] for key in keys)))
     unit = facts.unit
-    square = f"({unit})²" if unit != "mixed units" else unit
+    square = unit if unit in ("", "mixed units") else f"({unit})²"
     heads = (("MSE", square), ("MAE", unit), ("R²", ""), ("P95", unit), ("P99", unit), ("Bias", unit), ("Skew", ""))
     shows = [figures([row[2 + column] for row in rows]) for column in range(len(heads))]
     shows[2] = figures([], decimals=4)
@@ -223,7 +223,7 @@ def _figures(facts: Transfer) -> str:
     if not gain:
         return "No epoch was better on the validation part than the source's network as it is, so that one is kept"
     how = f"{percent(abs(gain))} {'less' if gain > 0 else 'more'}"
-    words = f"{number(after)} instead of {number(before)} {facts.unit}"
+    words = f"{number(after)} instead of {quantity(before, facts.unit)}"
     return f"{facts.methods[facts.content['method']]['label']}: {how} error than direct transfer, {words}"
 
 
@@ -240,11 +240,11 @@ def verdict(facts: Transfer) -> list[str]:
     best = min(baselines, key=lambda name: facts.score(name, horizon)["mae"])
     if facts.score(best, horizon)["mae"] < facts.score(method, horizon)["mae"]:
         better = facts.methods[best]["label"]
-        lines.append(f"{better} has less: {number(facts.score(best, horizon)['mae'])} {facts.unit}.")
+        lines.append(f"{better} has less: {quantity(facts.score(best, horizon)['mae'], facts.unit)}.")
     if SOURCE in facts.domains:
         was, now = (facts.score(name, horizon, domain=SOURCE)["mae"] for name in facts.pair)
         change = percent(now / was - 1, signed=True)
-        lines.append(f"On the source's own test part the error is {number(now)} {facts.unit}, {change}.")
+        lines.append(f"On the source's own test part the error is {quantity(now, facts.unit)}, {change}.")
     return lines
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from edp.data.prepared import Prepared
-from edp.errors import percent
 from edp.networks.predictor import build_model
 from edp.report.run.choice import FLOOR, PERSISTENCE
+from edp.wording import percent
 from edp.workflows.auto.candidates import CANDIDATES, Amount
 from edp.workflows.auto.promise import (
     PortfolioChoice,

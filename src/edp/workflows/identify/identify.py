@@ -32,6 +32,7 @@ from edp.storage.paths import is_there
 from edp.training.free_run import FreeRunProgress
 from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.twin_bundle import load_twin
+from edp.wording import figure
 from edp.workflows.identify.bodies import Poses, linked_bodies, realised
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
 from edp.workflows.identify.elements import (
@@ -341,7 +342,7 @@ def _celsius(recordings: Sequence[Recording], base: Machine) -> tuple[float, lis
     ]
     if len(logged) < len(recordings):
         celsius = base.oil.temperature
-        return celsius, [f"the logs have no {OIL}: {celsius:g} degC of machine {base.name} is taken"]
+        return celsius, [f"the logs have no {OIL}: {figure(celsius)} degC of machine {base.name} is taken"]
     celsius = float(np.nanmean(np.concatenate(logged).astype(np.float64))) - FREEZING
     if not np.isfinite(celsius):
         raise DataError(f"'{OIL}' holds no number; correct the log, or leave the channel out")

@@ -23,6 +23,7 @@ from edp.monitor.session_blocks import block_ticks
 from edp.recording import MACHINE, Recording
 from edp.signals import Channel
 from edp.sim.machine.machine_files import load_machine, machine_names
+from edp.wording import figure
 from edp.workflows.monitor.fault_sessions import (
     FaultSession,
     cases_of,
@@ -100,7 +101,7 @@ def check_dictionary_inputs(
 
 
 def _too_short(block_s: float) -> ConfigError:
-    return ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {block_s:g} s")
+    return ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {figure(block_s)} s")
 
 
 def _check_machine(inputs: Sequence[str], machine: str, rate_hz: float) -> None:

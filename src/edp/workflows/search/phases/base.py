@@ -9,9 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from edp.config.experiment import Table
-from edp.errors import ConfigError, percent
+from edp.errors import ConfigError
 from edp.registry import Registry
 from edp.stats.clustered import MeanTest
+from edp.wording import percent
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.space import Choice, Range, Space, apply
 from edp.workflows.search.study import Study, Trial

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from edp.config.experiment import Experiment, Table, build
-from edp.errors import ConfigError, percent
+from edp.errors import ConfigError
 from edp.networks.narrow import width_of
 from edp.networks.predictor import build_model
 from edp.stats.pareto import pareto
 from edp.training.bundle import blank_scaler
+from edp.wording import percent
 from edp.workflows.compression import FORMATS
 from edp.workflows.compression.judged import recipe_text, relative
 from edp.workflows.compression.planning import CompressionPlan, make_plan
