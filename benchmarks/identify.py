@@ -26,10 +26,10 @@ from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes
 from edp.storage.provenance import environment
+from edp.training.identification.bodies import Poses, base_parameters, load_by_base
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS
+from edp.training.identification.machine_text import machine_text
 from edp.workflows.identify import Identified, identify
-from edp.workflows.identify.bodies import Poses, base_parameters, load_by_base
-from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
-from edp.workflows.identify.machine_text import machine_text
 
 NEAR = 0.1
 """Of the truth: the goal."""

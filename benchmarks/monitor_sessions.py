@@ -36,7 +36,7 @@ from edp.sim.plan import DEFAULT_MIX, hand_out
 from edp.sim.scenario import SimulationError
 from edp.sim.view import View
 from edp.storage import make_folder, read_json, write_bytes, write_json
-from edp.workflows.identify.machine_text import machine_text
+from edp.training.identification.machine_text import machine_text
 
 Floats = NDArray[np.float64]
 CHANNELS = (

@@ -27,7 +27,7 @@ DIFFERENCES = {
     "training/bagging/perceptrons.py": "errors",
     "training/validation.py": "errors",
     "workflows/twin/judge_twin.py": "kept in a file; readers add `display_offset` to values",
-    "workflows/compression/imitation.py": "errors",
+    "training/compression/imitation.py": "errors",
     "workflows/auto/promise.py": "errors",
     "workflows/adaptation/replay.py": "errors",
     "workflows/fleet/judge_fleet.py": "errors",

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from edp.training.spec import TrainingSpec
-from edp.workflows.transfer.strategies import LowRank
+from edp.training.transfer.strategies import LowRank
 
 
 @pytest.mark.covering

@@ -93,7 +93,7 @@ ROUNDED_OTHERWISE = {
     "report/": "held by the test above",
     "settings/bounds.py": "bounds, exactly as they are checked",
     "logs/reference.py": "factors of units, which are exact",
-    "workflows/identify/machine_text.py": "numbers of a machine file, which are read again",
+    "training/identification/machine_text.py": "numbers of a machine file, which are read again",
     "monitor/residuals/balances.py": "names of residuals",
     "workflows/api/predictions.py": "names of columns",
 }

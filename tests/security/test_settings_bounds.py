@@ -26,16 +26,16 @@ from edp.networks.size import size_at_most
 from edp.settings.bounds import MOST_SEED, Bound, shown
 from edp.signals import Kind
 from edp.training.bundle import blank_scaler
+from edp.training.compression.distillation import DistillationSpec, SoftmaxDivergence
 from edp.training.fit import Loop
+from edp.training.pretraining.spec import MetaSpec
 from edp.training.spec import TrainingSpec
-from edp.workflows.compression.distillation import DistillationSpec, SoftmaxDivergence
+from edp.training.transfer.both_domains import BothSpec
+from edp.training.transfer.spec import FinetuneSpec
 from edp.workflows.feature_selection.trials import TrialSpec
-from edp.workflows.pretraining.spec import MetaSpec
 from edp.workflows.search.runner import Resources
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.study import SamplerSpec
-from edp.workflows.transfer.both_domains import BothSpec
-from edp.workflows.transfer.spec import FinetuneSpec
 
 TREE = [FeatureSettings, TaskSettings, ModelSpec, TrainingSpec, ChunkSpec, AdaptiveWeights, JudgeSpec]
 OTHERS = [

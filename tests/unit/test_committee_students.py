@@ -23,15 +23,15 @@ from edp.signals import Channel, Kind
 from edp.training.bagging.fit import fit_bagged
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.table import bank_rows
+from edp.training.compression.committee import committee_start
+from edp.training.compression.distillation import DistillationSpec
+from edp.training.compression.imitation import CommitteeImitation, moved_rows, predict_rows
+from edp.training.compression.pruning import check_pruning
+from edp.training.compression.qat import RoundingSpec
 from edp.training.fit import fit
 from edp.training.spec import TrainingSpec, by_gradient
 from edp.training.warm_start import WarmStart
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.committee import committee_start
-from edp.workflows.compression.distillation import DistillationSpec
-from edp.workflows.compression.imitation import CommitteeImitation, moved_rows, predict_rows
-from edp.workflows.compression.pruning import check_pruning
-from edp.workflows.compression.qat import RoundingSpec
 
 pytestmark = pytest.mark.training
 HORIZON = 2

@@ -24,12 +24,12 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.storage.runs import KeyedRun, Run
 from edp.training.averages import NoAverage
+from edp.training.compression.hints import Components, hint_error
 from edp.training.fit import fit
 from edp.training.objective import Objective
 from edp.training.strategy import BatchContext
 from edp.training.warm_start import continue_from
 from edp.workflows.compression import Distillation, DistillationSpec, SoftmaxDivergence
-from edp.workflows.compression.hints import Components, hint_error
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 

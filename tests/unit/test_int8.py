@@ -15,8 +15,8 @@ from edp.networks.predictor import ModelSpec, build_model
 from edp.networks.running import stream_predictions
 from edp.networks.stream import Stream
 from edp.training.bundle import blank_scaler, make_bundle, save_bundle
+from edp.training.compression.int8 import round_tick
 from edp.workflows.compression import dynamic_int8
-from edp.workflows.compression.int8 import round_tick
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 MODEL = ModelSpec(

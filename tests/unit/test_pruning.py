@@ -15,8 +15,8 @@ from edp.networks.initial import ConstantState
 from edp.networks.narrow import student
 from edp.networks.predictor import ModelSpec, build_model
 from edp.networks.running import stream_predictions
+from edp.training.compression.taylor import _loss
 from edp.workflows.compression import importance, prune
-from edp.workflows.compression.taylor import _loss
 
 HYBRID = HybridSpec(channels=(8, 8, 6), kernel=3, units=8, layers=2)
 NETWORKS = {

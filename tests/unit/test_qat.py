@@ -20,6 +20,7 @@ from edp.networks.running import stream_predictions
 from edp.storage.runs import KeyedRun, Run
 from edp.training import fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler
+from edp.training.compression.rounding import Site
 from edp.training.validation import validation_scores
 from edp.workflows.compression import (
     Distillation,
@@ -29,7 +30,6 @@ from edp.workflows.compression import (
     RoundingSpec,
     weight_levels,
 )
-from edp.workflows.compression.rounding import Site
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 

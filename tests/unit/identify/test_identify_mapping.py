@@ -16,7 +16,7 @@ from edp.sim.machine.machine_files import load_machine, parse_machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import dynamics
 from edp.sim.physics.valve import opening, pilot_half_step, spool_filters, spool_half_step
-from edp.workflows.identify.bodies import (
+from edp.training.identification.bodies import (
     Poses,
     base_parameters,
     grey_load,
@@ -24,11 +24,11 @@ from edp.workflows.identify.bodies import (
     realised,
     solved_base,
 )
-from edp.workflows.identify.elements import check_strokes, excavator_elements, full_commands
-from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS, guesses, with_values
-from edp.workflows.identify.machine_text import machine_text
-from edp.workflows.identify.mapping import GreyParts, grey_numbers
-from edp.workflows.identify.tie import CUSHIONS, MachineTie, coordinates, deviations, kept_back, nearest
+from edp.training.identification.elements import check_strokes, excavator_elements, full_commands
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, with_values
+from edp.training.identification.machine_text import machine_text
+from edp.training.identification.mapping import GreyParts, grey_numbers
+from edp.training.identification.tie import CUSHIONS, MachineTie, coordinates, deviations, kept_back, nearest
 
 M22 = load_machine("M22")
 PILOTS = ("BmUp", "BmDwn", "AmIn", "AmOut", "BktIn", "BktOut")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from edp.testing.twins import sample_series
-from edp.workflows.identify.rows import TOLD, IdentifiedNumber
-from edp.workflows.identify.stability import LEAST_BLOCKS, MOST_BLOCKS, divided, spread
+from edp.training.identification.rows import TOLD, IdentifiedNumber
+from edp.training.identification.stability import LEAST_BLOCKS, MOST_BLOCKS, divided, spread
 
 RNG = np.random.default_rng(0)
 

@@ -15,8 +15,8 @@ from edp.networks.predictor import build_model
 from edp.networks.running import mean_error
 from edp.training import load_bundle
 from edp.training.delta import delta_of
+from edp.training.pretraining.methods.codes import WithCodes, coded_block
 from edp.workflows.pretraining import Pretrain, pretrain
-from edp.workflows.pretraining.methods.codes import WithCodes, coded_block
 from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
 

@@ -19,6 +19,7 @@ from edp.storage.ledger import Ledger
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.fit import Loop
+from edp.training.transfer.spec import FinetuneSpec
 from edp.workflows.compression import (
     CompressionSearchRequest,
     CompressionSearchSpec,
@@ -37,7 +38,6 @@ from edp.workflows.search.study_log import look_at
 from edp.workflows.search.trainings import experiment_of
 from edp.workflows.train_evaluate import evaluate, prepare_data, train, trained_run
 from edp.workflows.transfer.finetune import FinetuneRequest, finetune
-from edp.workflows.transfer.spec import FinetuneSpec
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',

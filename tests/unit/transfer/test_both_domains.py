@@ -11,7 +11,7 @@ from edp.errors import ConfigError
 from edp.networks.predictor import build_model
 from edp.networks.running import stream_predictions
 from edp.training.fit import fit
-from edp.workflows.transfer.both_domains import BothDomains, BothSpec, Classifier, ramp, reverse
+from edp.training.transfer.both_domains import BothDomains, BothSpec, Classifier, ramp, reverse
 from edp.workflows.transfer.methods.rehearsal import share
 
 

@@ -9,8 +9,8 @@ from edp.errors import ConfigError, DataError
 from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
+from edp.training.transfer.checks import CONVENTION, PilotPair, check_signs, check_units, correlation
 from edp.workflows.transfer import FinetuneRequest, finetune
-from edp.workflows.transfer.checks import CONVENTION, PilotPair, check_signs, check_units, correlation
 from edp.workflows.transfer.source import read_source
 
 

@@ -22,14 +22,14 @@ from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.optimizers import Soap
 from edp.training.spec import TrainingSpec
+from edp.training.transfer.both_domains import BothDomains, BothSpec
+from edp.training.transfer.strategies import LowRank
 from edp.training.warm_start import WarmStart
 from edp.workflows.train_evaluate import evaluate, train
 from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec, finetune
-from edp.workflows.transfer.both_domains import BothDomains, BothSpec
 from edp.workflows.transfer.case import tuned as tuning
 from edp.workflows.transfer.scores import errors_of, measure, skew
 from edp.workflows.transfer.source import read_source, target_experiment, task_settings
-from edp.workflows.transfer.strategies import LowRank
 
 UPDATES = ("training.updates=25",)
 BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")

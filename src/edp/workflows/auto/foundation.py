@@ -14,12 +14,12 @@ from edp.settings.tree import Table
 from edp.training.bundle import weights_digest
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import TrainingStrategy
+from edp.training.transfer.centring import Centred
+from edp.training.transfer.checks import check_channels, check_lengths, check_signs, check_units
+from edp.training.transfer.spec import FinetuneSpec
 from edp.training.warm_start import WarmStart
 from edp.workflows.transfer.case import tuned
-from edp.workflows.transfer.centring import Centred
-from edp.workflows.transfer.checks import check_channels, check_lengths, check_signs, check_units
 from edp.workflows.transfer.source import SourceModel, read_source
-from edp.workflows.transfer.spec import FinetuneSpec
 
 SETTING = "auto.foundation"
 LEAST_UPDATES = 120

@@ -1,21 +1,21 @@
 """Make a trained network smaller: students, distillation, pruning, dynamic INT8, quantisation-aware training."""
 
+from edp.training.compression.distillation import Distillation, DistillationSpec, SoftmaxDivergence
+from edp.training.compression.int8 import Quantised, dynamic_int8
+from edp.training.compression.pruning import prune
+from edp.training.compression.qat import QuantisationAware, RoundingSpec
+from edp.training.compression.rounding import NetworkRounding, weight_levels
+from edp.training.compression.taylor import FeatureImportance, importance
 from edp.workflows.compression.bench import Bench, CompressionRequest, tuning
 from edp.workflows.compression.distil import DISTIL_SETTINGS, DistilRequest, DistilSpec, distil
-from edp.workflows.compression.distillation import Distillation, DistillationSpec, SoftmaxDivergence
 from edp.workflows.compression.formats import FORMATS, Deployed, ResourceUsage, deploy, resource_usage
-from edp.workflows.compression.int8 import Quantised, dynamic_int8
 from edp.workflows.compression.judged import CompressionResult, Judged
-from edp.workflows.compression.pruning import prune
-from edp.workflows.compression.qat import QuantisationAware, RoundingSpec
-from edp.workflows.compression.rounding import NetworkRounding, weight_levels
 from edp.workflows.compression.searching import (
     CompressionCallbacks,
     CompressionSearchRequest,
     CompressionSearchSpec,
     search,
 )
-from edp.workflows.compression.taylor import FeatureImportance, importance
 from edp.workflows.compression.variants import VARIANTS, CompressedCandidate
 
 __all__ = [

@@ -10,14 +10,14 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.networks.narrow import student, width_of
 from edp.networks.predictor import ModelSpec, Predictor
+from edp.training.compression.committee import committee_start
+from edp.training.compression.distillation import Distillation, DistillationSpec
+from edp.training.compression.imitation import CommitteeImitation, imitates
+from edp.training.compression.pruning import prune
+from edp.training.compression.qat import QuantisationAware, RoundingSpec
 from edp.training.fit import fit
 from edp.training.spec import TrainingSpec, by_gradient
 from edp.training.strategy import DirectFit, TrainingStrategy
-from edp.workflows.compression.committee import committee_start
-from edp.workflows.compression.distillation import Distillation, DistillationSpec
-from edp.workflows.compression.imitation import CommitteeImitation, imitates
-from edp.workflows.compression.pruning import prune
-from edp.workflows.compression.qat import QuantisationAware, RoundingSpec
 
 # Training with rounded numbers goes on from a trained network: shorter, and in smaller steps.
 TUNING_EPOCHS, TUNING_RATE = 1 / 3, 1 / 5

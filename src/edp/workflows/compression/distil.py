@@ -23,11 +23,11 @@ from edp.storage.provenance import read_provenance
 from edp.storage.runs import check_claimable
 from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
+from edp.training.compression.distillation import DistillationSpec
+from edp.training.compression.qat import RoundingSpec
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.distillation import DistillationSpec
-from edp.workflows.compression.qat import RoundingSpec
 from edp.workflows.train_evaluate import StrategyFactory, train
 
 DISTIL_SETTINGS = SettingsTree({"soft": LOSSES})

@@ -9,8 +9,8 @@ from edp.networks.matrices import matrices_of
 from edp.networks.narrow import width_of
 from edp.networks.predictor import Predictor
 from edp.registry import Registry
+from edp.training.compression.qat import RoundingSpec
 from edp.workflows.compression.bench import Bench, CompressionRequest
-from edp.workflows.compression.qat import RoundingSpec
 
 THESIS = RoundingSpec(activation_bits=8, recurrent=False)
 """What fake quantisation of the thesis covers: convolutions and linear layers, 8 bits."""

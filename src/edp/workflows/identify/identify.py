@@ -31,11 +31,8 @@ from edp.storage import check_writable, write_bytes, write_json
 from edp.storage.paths import is_there
 from edp.training.free_run import FreeRunProgress
 from edp.training.grey_fit import GreyProblem, fit_grey_box
-from edp.training.twin_bundle import load_twin
-from edp.wording import figure
-from edp.workflows.identify.bodies import Poses, linked_bodies, realised
-from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
-from edp.workflows.identify.elements import (
+from edp.training.identification.bodies import Poses, linked_bodies, realised
+from edp.training.identification.elements import (
     NO_MOTORS,
     check_same_linkage,
     check_strokes,
@@ -43,12 +40,15 @@ from edp.workflows.identify.elements import (
     full_commands,
     parts_of,
 )
-from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
-from edp.workflows.identify.machine_text import machine_text
-from edp.workflows.identify.mapping import GreyParts
-from edp.workflows.identify.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
-from edp.workflows.identify.stability import covariance
-from edp.workflows.identify.tie import MachineTie, deviations, kept_back, nearest
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS
+from edp.training.identification.machine_text import machine_text
+from edp.training.identification.mapping import GreyParts
+from edp.training.identification.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
+from edp.training.identification.stability import covariance
+from edp.training.identification.tie import MachineTie, deviations, kept_back, nearest
+from edp.training.twin_bundle import load_twin
+from edp.wording import figure
+from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 Doubles = NDArray[np.float64]

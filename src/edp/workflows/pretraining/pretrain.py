@@ -21,9 +21,9 @@ from edp.storage import write_json
 from edp.storage.runs import Run, check_claimable
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.pretraining.methods import PRETRAININGS
-from edp.workflows.pretraining.methods.base import HasModel
-from edp.workflows.pretraining.spec import MetaSpec
+from edp.training.pretraining.methods import PRETRAININGS
+from edp.training.pretraining.methods.base import HasModel
+from edp.training.pretraining.spec import MetaSpec
 from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
 
 RESULT = "foundation.json"

@@ -19,10 +19,10 @@ from edp.training import TrainingProgress
 from edp.training.optimizers import OptimizerSpec, Soap
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import TrainingStrategy
+from edp.training.transfer.centring import Centred
+from edp.training.transfer.spec import FinetuneSpec
 from edp.workflows.train_evaluate import StrategyFactory, train
-from edp.workflows.transfer.centring import Centred
 from edp.workflows.transfer.source import SourceModel
-from edp.workflows.transfer.spec import FinetuneSpec
 
 NEIGHBOURS = 4
 """Windows drawn together, so that smoothness can compare neighbours; divides the usual batches."""

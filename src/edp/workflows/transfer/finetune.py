@@ -25,12 +25,12 @@ from edp.storage.headers import FILES, digests_of
 from edp.storage.runs import Run, check_claimable
 from edp.training import Diverged, TrainingProgress
 from edp.training.bundle import weights_digest
+from edp.training.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
+from edp.training.transfer.spec import FinetuneSpec
 from edp.workflows.transfer.case import TransferCase, tuned
-from edp.workflows.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
 from edp.workflows.transfer.methods import METHODS, Made, Method, code_names
 from edp.workflows.transfer.scores import MeasuredMethod, distributions, errors_of, excerpts, measure
 from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
-from edp.workflows.transfer.spec import FinetuneSpec
 
 KIND, RESULT, SHOWN = "transfer", "transfer.json", "transfer_predictions.safetensors"
 BEFORE = "direct"

@@ -10,8 +10,8 @@ from edp.data.series import Series
 from edp.evaluation.controller import Estimate
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
+from edp.training.compression.int8 import dynamic_int8
 from edp.workflows.compression.formats.base import FORMATS, Predict
-from edp.workflows.compression.int8 import dynamic_int8
 
 
 @FORMATS.register("dynamic_int8")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 from edp.networks.matrices import matrices_of
+from edp.training.transfer.strategies import LowRank
 from edp.workflows.transfer.case import TransferCase
 from edp.workflows.transfer.methods.base import METHODS, Made, of_network
-from edp.workflows.transfer.strategies import LowRank
 
 
 @METHODS.register("low_rank")

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from edp.data.series import Series
 from edp.errors import ConfigError
-from edp.workflows.transfer.both_domains import BothDomains, BothSpec
+from edp.training.transfer.both_domains import BothDomains, BothSpec
 from edp.workflows.transfer.case import TransferCase
 from edp.workflows.transfer.methods.base import METHODS, Made, of_network, size_of
 

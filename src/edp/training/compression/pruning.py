@@ -19,7 +19,7 @@ from edp.networks.heads import HEADS, Heads
 from edp.networks.initial import INITIAL_STATES, ZeroState
 from edp.networks.predictor import ModelSpec, Predictor
 from edp.training.bundle import blank_scaler
-from edp.workflows.compression.taylor import FeatureImportance, importance
+from edp.training.compression.taylor import FeatureImportance, importance
 
 GATES = {"lstm": 4, "gru": 3, "min_gru": 2}
 """Recurrent layers that can be pruned, and how many rows of their matrices belong to a unit."""

@@ -19,11 +19,11 @@ from edp.networks.losses.base import POINT
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_hidden, stream_predictions
 from edp.settings.bounds import MOST_UNITS, MOST_WEIGHT, WEIGHT, below, check_bounds, integer, span
+from edp.training.compression.hints import Components, hint_error
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import BatchContext
 from edp.training.warm_start import check_same_ends, continue_from
-from edp.workflows.compression.hints import Components, hint_error
 
 
 @dataclass(frozen=True, kw_only=True)

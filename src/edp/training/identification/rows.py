@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from edp.networks.twin.grey.datasheet import NORMAL, UNEXCITED
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
+from edp.training.identification.bodies import NAMES, Poses, base_parameters, grey_load, linked_bodies, solved_base
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS
+from edp.training.identification.tie import STEP, MachineTie
 from edp.wording import figure
-from edp.workflows.identify.bodies import NAMES, Poses, base_parameters, grey_load, linked_bodies, solved_base
-from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
-from edp.workflows.identify.tie import STEP, MachineTie
 
 Doubles = NDArray[np.float64]
 TOLD = 0.2

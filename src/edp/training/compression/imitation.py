@@ -31,11 +31,11 @@ from edp.networks.predictor import ModelSpec, Predictor
 from edp.signals import KINDS
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.table import bank_rows
+from edp.training.compression.committee import committee_start
 from edp.training.optimizers import Soap
 from edp.training.outcome import Diverged, Fitted, TrainingProgress
 from edp.training.spec import TrainingSpec
 from edp.training.validation import standard_targets
-from edp.workflows.compression.committee import committee_start
 
 STEPS, CHECKS, BATCH = 5_000, 10, 256
 """Updates, how often they are reported, and recorded rows of each; as many points of lines through rows come with

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from edp.networks.twin.grey.numbers import NumberTable
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import BOUNDS
-from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS, guesses, with_values
-from edp.workflows.identify.mapping import GreyParts, grey_numbers
+from edp.training.identification.machine_numbers import MACHINE_NUMBERS, guesses, with_values
+from edp.training.identification.mapping import GreyParts, grey_numbers
 
 Doubles = NDArray[np.float64]
 STEP = 1e-4

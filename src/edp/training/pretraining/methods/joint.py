@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import ClassVar
 
 from edp.networks.predictor import Predictor
+from edp.training.pretraining.methods.base import PRETRAININGS
+from edp.training.pretraining.spec import MetaSpec
 from edp.training.strategy import TrainingStrategy
 from edp.training.warm_start import WarmStart
-from edp.workflows.pretraining.methods.base import PRETRAININGS
-from edp.workflows.pretraining.spec import MetaSpec
 
 
 @PRETRAININGS.register("joint")

@@ -11,11 +11,11 @@ from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import ConfigError
 from edp.networks.predictor import Predictor
+from edp.training.compression.rounding import NetworkRounding
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import BatchContext, TrainingStrategy
 from edp.training.warm_start import continue_from
-from edp.workflows.compression.rounding import NetworkRounding
 
 
 @dataclass(frozen=True, kw_only=True)

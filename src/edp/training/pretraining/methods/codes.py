@@ -16,11 +16,11 @@ from edp.data.task import Task
 from edp.networks.blocks.machine_code import CodedChannels, MachineCode
 from edp.networks.predictor import ModelSpec, Predictor
 from edp.training.objective import Objective
+from edp.training.pretraining.methods.base import PRETRAININGS
+from edp.training.pretraining.spec import MetaSpec
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import BatchContext, StreamStrategy, TrainingStrategy
 from edp.training.warm_start import continue_from
-from edp.workflows.pretraining.methods.base import PRETRAININGS
-from edp.workflows.pretraining.spec import MetaSpec
 
 UNKNOWN = 0.15
 """Share of the streams of an update with the code of an unknown machine, zero: the network must do without, too."""

@@ -9,10 +9,10 @@ from torch import Tensor
 from edp.networks.predictor import Predictor
 from edp.training.adaptation import Pieces, adapt, loss_with
 from edp.training.objective import Objective
+from edp.training.pretraining.meta import Meta
+from edp.training.pretraining.methods.base import PRETRAININGS
+from edp.training.pretraining.spec import MetaSpec
 from edp.training.strategy import TrainingStrategy
-from edp.workflows.pretraining.meta import Meta
-from edp.workflows.pretraining.methods.base import PRETRAININGS
-from edp.workflows.pretraining.spec import MetaSpec
 
 
 @PRETRAININGS.register("maml")

@@ -12,7 +12,7 @@ from edp.networks.convolution import TemporalBlock
 from edp.networks.heads import GatedUnit, Heads
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import parameters_of
-from edp.workflows.compression.rounding import weight_levels
+from edp.training.compression.rounding import weight_levels
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
+from edp.training.identification.mapping import GreyParts
 from edp.wording import figure
-from edp.workflows.identify.mapping import GreyParts
 
 NO_MOTORS = (
     "the grey box has motors; a machine of the simulator has the cylinders of boom, arm and bucket alone: leave "

@@ -6,8 +6,8 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 from edp.networks.predictor import ModelSpec, Predictor
 from edp.registry import Registry
+from edp.training.pretraining.spec import MetaSpec
 from edp.training.strategy import TrainingStrategy
-from edp.workflows.pretraining.spec import MetaSpec
 
 
 class Pretraining(Protocol):

@@ -20,11 +20,11 @@ from edp.networks.decomposition import decompose
 from edp.networks.predictor import Predictor
 from edp.training.adaptation import Pieces, Weights, adapt
 from edp.training.objective import Objective
+from edp.training.pretraining.spec import MetaSpec
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import BatchContext
 from edp.training.validation import validation_scores
 from edp.training.warm_start import continue_from
-from edp.workflows.pretraining.spec import MetaSpec
 
 
 class Meta(ABC):

@@ -1,0 +1,1 @@
+"""Algorithms that make a network smaller: distillation, pruning, quantisation-aware training, INT8 arithmetic."""

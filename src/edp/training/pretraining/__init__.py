@@ -1,0 +1,1 @@
+"""Training of one network over many machines: joint training and meta-learning."""
