@@ -28,10 +28,10 @@ import numpy as np
 from safetensors.numpy import load_file
 
 from common import PLACE, Bench, benchmark, option, table
-from edp.cli.evaluate import BEATEN
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.gathered import stored_columns
 from edp.data.series import Series
+from edp.evaluation.guard import BEATEN
 from edp.logs.store import read_store
 from edp.logs.store.index import INDEX
 from edp.signals import TABLE_A1
