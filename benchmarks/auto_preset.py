@@ -10,7 +10,6 @@ The recordings are no part of the repository: their folder is given by --shared 
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 import time
@@ -222,7 +221,7 @@ def main(bench: Bench) -> object:
             tasks += of_set
     show(tasks, notes)
     check(bench, tasks)
-    return json.loads(json.dumps({"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}))
+    return {"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}
 
 
 if __name__ == "__main__":

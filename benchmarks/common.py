@@ -27,6 +27,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edp.storage import make_folder, read_json, write_json
 from edp.storage.runs import command_line, environment
 
@@ -153,7 +155,6 @@ class Bench:
             [v.name, v.ours, v.rival, v.ratio, v.goal, "met" if v.met else "NOT MET", v.unit] for v in self.verdicts
         ]
         table(["question", "ours", "rival", "ratio", "goal", "verdict", "unit"], rows)
-        # No measurement is no number: JSON has none for it.
         plain = [finite(asdict(v)) for v in self.verdicts]
         if self.options.out or (self.keep and not self.quick):
             result = {
@@ -163,7 +164,7 @@ class Bench:
                 "commit": commit(),
                 "environment": environment(0),
                 "verdicts": plain,
-                "details": details,
+                "details": finite(details),
             }
             write_json(make_folder(self.options.out or RESULTS) / f"{self.name}.json", result)
         self.verdicts.clear()
@@ -238,7 +239,7 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
 def kept(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """What an earlier run left in this file, or what is found now."""
     if not path.exists():
-        write_json(path, measure())
+        write_json(path, finite(measure()))
     found: dict[str, Any] = read_json(path)
     return found
 
@@ -255,9 +256,10 @@ def commit() -> str:
 
 
 def finite(value: Any) -> Any:
-    """Plain values as JSON can keep them: what is not finite becomes None."""
+    """Plain values as JSON can keep them: what is not finite becomes None, numbers of NumPy those of Python."""
     if isinstance(value, Mapping):
         return {str(key): finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    plain = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain

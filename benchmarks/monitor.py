@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from common import DATA_AND_PARTS, Bench, benchmark, finite, option, table
+from common import DATA_AND_PARTS, Bench, benchmark, option, table
 from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.fitting import fit_from_blocks
 from edp.monitor.monitor_file import load_monitor
@@ -132,7 +132,7 @@ def rates_of(
     """False alarms of each set that is healthy."""
     seconds = QUICK_SECONDS if plan.quick else DURATION_S
     return {
-        group: dict(finite(false_alarm_rate(sum(len(alarms[n]) for n in some), len(some) * seconds / 3600.0)))
+        group: false_alarm_rate(sum(len(alarms[n]) for n in some), len(some) * seconds / 3600.0)
         for group, some in names.items()
         if group != "faulty"
     }
@@ -357,7 +357,7 @@ def main(bench: Bench) -> object:
         found = measure(plan, given.seed, helpers.ordered)
     show(found)
     check(bench, found, plan.hours)
-    return finite(found)
+    return found
 
 
 if __name__ == "__main__":

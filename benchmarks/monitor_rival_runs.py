@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from common import finite, kept
+from common import kept
 from edp.monitor.residuals.base import SideBySide
 from monitor_metrics import false_alarm_rate, judged, summary
 from monitor_rivals import CHARTS, PYOD, Floats, Rival, has_pyod, limit_of, raised, rivals_of
@@ -77,7 +77,7 @@ def rival_results(
         for result in side_by_side(rival_result, jobs):
             results |= result
             say("rival", result)
-        return finite(results)  # type: ignore[no-any-return]
+        return results
 
     if time.monotonic() - BEGAN > plan.until:
         print("rivals: left out, the time is over")

@@ -19,8 +19,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from common import DATA_AND_PARTS, Bench, Verdict, benchmark, option, table, verdict
 from decoys import FAMILIES, Decoy, lay_decoys
 from edp.config.experiment import FeatureSettings, load_experiment
@@ -206,16 +204,7 @@ def main(bench: Bench) -> object:
     bench.check("MAE of the proposal against FG1", errors["proposed"], errors["FG1"], "<= 1.05", trials.unit)
     bench.check("MAE of the proposal against the best random set", errors["proposed"], drawn, "<= 0.9", trials.unit)
     details |= {"trials": trials.to_json(), "importances": importances}
-    return _plain(details)
-
-
-def _plain(value: Any) -> Any:
-    """JSON values; numbers of NumPy as Python's."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value.item() if isinstance(value, np.generic) else value
+    return details
 
 
 if __name__ == "__main__":

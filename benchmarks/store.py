@@ -15,7 +15,6 @@ Memory is what a process holds beside files that the system may drop and read ag
 
 from __future__ import annotations
 
-import json
 import resource
 import subprocess
 import sys
@@ -35,6 +34,7 @@ from edp.evaluation.guard import BEATEN
 from edp.logs.store import read_store
 from edp.logs.store.index import INDEX
 from edp.signals import TABLE_A1
+from edp.storage import read_json, write_json
 from memory import CHANNELS, RATE_HZ, write_logs
 
 GOAL_S_AN_HOUR = 3.0
@@ -85,13 +85,13 @@ def repeated(store: Path, out: Path, times: int) -> Path:
     """A store that lists the recordings of another one so many times, each time under other names."""
     out.mkdir()
     (out / "rows").symlink_to((store / "rows").resolve())
-    index = json.loads((store / INDEX).read_text(encoding="utf-8"))
+    index = read_json(store / INDEX)
     index["recordings"] = [
         {**entry, "name": f"{entry['name']}_{turn}", "log": f"/{turn}/{entry['log']}", "log_key": f"{turn}"}
         for turn in range(times)
         for entry in index["recordings"]
     ]
-    (out / INDEX).write_text(json.dumps(index), encoding="utf-8")
+    write_json(out / INDEX, index)
     return out
 
 

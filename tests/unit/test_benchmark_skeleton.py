@@ -6,6 +6,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
@@ -68,6 +69,22 @@ def test_the_short_form_is_written_only_where_it_is_asked_for(common, tmp_path, 
         assert result["details"] == {"quick": quick}
         assert [one["name"] for one in result["verdicts"]] == ["half of it"]
         assert result["seed"] == (3 if quick else 0)
+
+
+def test_figures_that_are_no_numbers_are_kept_as_null(common, tmp_path):
+    """JSON has no infinity and no NaN, and a run of hours must not end with a message about them."""
+
+    @common.benchmark(common.WORK)
+    def main(bench):
+        found = bench.part("part", lambda: {"none": float("nan"), "whole": np.int64(3)})
+        assert found["none"] is None
+        bench.check("of nothing", 1.0, 0.0, "<= 1", "mm")
+        return {"rows": [(np.float32(0.5), float("inf"), "text")], "part": found["whole"]}
+
+    main(["--out", str(tmp_path), "--work", str(tmp_path)])
+    result = json.loads((tmp_path / f"{Path(__file__).stem}.json").read_text())
+    assert result["details"] == {"rows": [[0.5, None, "text"]], "part": 3}
+    assert result["verdicts"][0]["ratio"] is None
 
 
 def test_a_part_is_read_from_the_working_folder_of_an_earlier_run(common, tmp_path):
