@@ -30,7 +30,7 @@ from edp.stats import (
     run_means,
     thesis_confirm,
 )
-from edp.stats.metrics import COMPOSITE_WEIGHTS
+from edp.stats.metrics import COMPOSITE_WEIGHTS, composite
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -198,12 +198,6 @@ class Rates:
     studies: int
 
 
-def composite(scores: Array) -> Array:
-    """Primary metric of each cell: the composite of the four, eq. 3.41."""
-    weights = np.array([COMPOSITE_WEIGHTS[name] for name in METRICS])
-    return np.asarray(np.tensordot(weights, scores, axes=1))
-
-
 def thesis_design(source: Source, repetition: int) -> tuple[Mask, NDArray[np.int64]]:
     """Cells and splits of the thesis's runs."""
     splits = np.repeat(np.arange(SPLITS), SEEDS)
@@ -225,7 +219,7 @@ def thesis_studies(source: Source, effects: Array, repetition: int) -> dict[str,
     raw = np.array([one.p < ALPHA for one in judged]).reshape(-1, len(METRICS))
     cost = len(splits) * (1 + source.modules)
     found = {THESIS: Outcome(np.array([one.confirmed for one in judged[:: len(METRICS)]]), raw, cost)}
-    single = composite(scores)
+    single = composite(*scores)
     differences = single[1:] - single[0]
     means = run_means(differences, tested).reshape(-1, SPLITS, SEEDS).mean(axis=-1)
     tests = {
@@ -239,7 +233,7 @@ def thesis_studies(source: Source, effects: Array, repetition: int) -> dict[str,
 def sound_studies(source: Source, effects: Array, repetition: int) -> dict[str, Outcome]:
     """One study in our design: the whole decision, and the same without the practical gate."""
     tested = repeated_folds(source.sessions, FOLDS, REPEATS, drawn_as(source, repetition))
-    scores = composite(source.scores(tested, np.arange(len(tested)), effects, repetition))
+    scores = composite(*source.scores(tested, np.arange(len(tested)), effects, repetition))
     names = [str(i) for i in range(source.modules)]
     found = confirm(scores, names, names, tested, Rule(alpha=ALPHA))
     cost = len(tested) + sum(one.runs for one in found)
