@@ -25,6 +25,7 @@ _PUBLIC = {
     "load": f"{_API}.predictor",
     "load_monitor": "edp.monitor.monitor_file",
     "load_study": f"{_API}.scores",
+    "load_twin": "edp.training.twin_bundle",
     "read": f"{_API}.recordings",
     "testing": "",
     "train": f"{_API}.training",

@@ -4,6 +4,7 @@ from edp.monitor.monitor import Monitor as Monitor
 from edp.monitor.monitor_file import load_monitor as load_monitor
 from edp.networks.stream import Stream as Stream
 from edp.recording import Recording as Recording
+from edp.training.twin_bundle import load_twin as load_twin
 from edp.workflows.api.compare import ComparedRuns as ComparedRuns
 from edp.workflows.api.compare import compare as compare
 from edp.workflows.api.predictions import Predictions as Predictions

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from edp.wording import figure
+
 MOST_CHARACTERS = 8_000
 """Of a message: two screens. Names and values in it come from files, which may hold a hundred thousand characters."""
 
@@ -69,7 +71,7 @@ SHOWN_CAUSE = 300
 
 
 def brief(error: BaseException | str, most: int = SHOWN_CAUSE) -> str:
-    """Return the message of an error on one line of bounded length; its type where there is no message.
+    """Return the message of an error on one line of bounded length, or its type if the message is empty.
 
     The end of a long message is kept: the path of a file often comes first, and the reason last.
     """
@@ -84,9 +86,7 @@ def count_of(count: float | str | None, noun: str) -> str:
         count: a number, or its text.
         noun: in the singular; only its last word gets a plural.
     """
-    text = (
-        "–" if count is None else count if isinstance(count, str) else f"{count:,g}" if count % 1 else f"{count:,.0f}"
-    )
+    text = count if isinstance(count, str) else figure(count)
     if text == "1":
         return f"1 {noun}"
     if noun.endswith("xis"):

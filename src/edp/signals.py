@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import shown
+from edp.wording import figure, setting_text
 
 Number = TypeVar("Number", float, NDArray[np.floating])
 
@@ -362,14 +363,9 @@ class ChannelMap:
             number = getattr(self, key)
             if number is not None and not (math.isfinite(number) and abs(number) <= LARGEST):
                 where = f"signal map, channel '{self.name}'"
-                raise ConfigError(f"{where}: {key} = {number:g}; give a finite number of at most {LARGEST:g}")
-
-    def channel(self) -> Channel:
-        """The channel this entry yields; a name outside the vocabulary needs a kind (default generic)."""
-        standard_channel = VOCABULARY.get(self.name)
-        if standard_channel is not None and self.kind in (None, standard_channel.kind):
-            return standard_channel
-        return Channel(self.name, self.kind or Kind.GENERIC, self.description)
+                raise ConfigError(
+                    f"{where}: {key} = {setting_text(number)}; give a finite number of at most {figure(LARGEST)}"
+                )
 
 
 @dataclass(frozen=True)
@@ -412,7 +408,8 @@ class SignalMap:
             value = getattr(self, key)
             if value is not None and not (math.isfinite(value) and _SLOWEST <= value <= _FASTEST):
                 raise ConfigError(
-                    f"signal map: {key} = {value:g}; give a number from {_SLOWEST:g} to {_FASTEST:g}, or leave it out"
+                    f"signal map: {key} = {setting_text(value)}; give a number from {figure(_SLOWEST)} to "
+                    f"{figure(_FASTEST)}, or leave it out"
                 )
         if self.delimiter is not None and (len(self.delimiter) != 1 or self.delimiter in '"\r\n\0'):
             raise ConfigError(

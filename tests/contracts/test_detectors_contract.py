@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from edp.errors import ConfigError, DataError
+from edp.errors import ConfigError, DataError, count_of
 from edp.monitor.calibration import calibrated, hours_between
 from edp.monitor.detectors import (
     DETECTORS,
@@ -195,7 +195,7 @@ def test_a_limit_is_the_lowest_that_keeps_the_promise(spec):
     assert limit.low_hours < hours / max(count, 1) < limit.high_hours
     lower = limit.limit - 1e-3 * abs(limit.limit)
     assert sum(len(alarms(spec.build(2), session[:, None], lower)) for session in sessions) > 4
-    assert f"{count} false alarms in 0.667 h" in limit.sentence()
+    assert f"{count_of(count, 'false alarm')} in 0.667 h" in limit.sentence()
 
 
 def test_hours_that_are_no_multiple_of_the_promise_lie_between():

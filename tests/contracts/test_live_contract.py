@@ -285,7 +285,7 @@ def test_an_option_of_another_source_is_refused_with_the_sources_it_belongs_to(s
     assert all(owner in str(error.value) for owner in owners)
 
 
-OF_ALL = {"run", "monitor", "port", "bind", "save", "record", "rerun", "until-end", "free-s", "json", *SOURCES}
+OF_ALL = {"run", "monitor", "port", "bind", "save", "record", "rerun", "free-s", "json", *SOURCES}
 
 
 def test_every_option_of_the_command_belongs_to_all_sources_or_to_some():

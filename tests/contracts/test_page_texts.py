@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edp.errors import count_of
-from edp.report.common.wording import MISSING, figure, interval, number, setting_text
+from edp.wording import MISSING, figure, interval, number, setting_text
 
 SOURCE = Path(str(resources.files("edp")))
 REPORT = SOURCE / "report"
@@ -21,7 +21,6 @@ ABOUT_EXCAVATORS = ("animation/", "control/", "assets/control.html.jinja", "asse
 MODULES = sorted(str(path.relative_to(REPORT)) for path in REPORT.rglob("*.py"))
 TEMPLATES = sorted(str(path.relative_to(REPORT)) for path in REPORT.rglob("*.jinja"))
 ROUNDED_ELSEWHERE = {
-    "common/wording.py": "holds the helpers",
     "common/picture.py": "numbers on axes, by Matplotlib",
     "monitor/drawing.py": "coordinates of an SVG, and levels that are constants",
     "animation/film.py": "text drawn as pixels",
@@ -75,7 +74,7 @@ def test_the_search_for_words_finds_them():
 
 @pytest.mark.parametrize("name", [name for name in MODULES if name not in ROUNDED_ELSEWHERE])
 def test_pages_format_numbers_by_one_helper(name):
-    """`{x:g}` shows six digits, `{x:.5g}` five: both are for `edp.report.common.wording.figure`."""
+    """`{x:g}` shows six digits, `{x:.5g}` five: both are for `edp.wording.figure`."""
     found = [
         (line, spec)
         for line, spec in fields_of(ast.parse((REPORT / name).read_text(encoding="utf-8")))
@@ -84,11 +83,48 @@ def test_pages_format_numbers_by_one_helper(name):
     assert found == []
 
 
+BARE = re.compile(r"[+,]*(?:\.(?:[5-9]|\d\d|))?[gG]|[+,]*[fFeE]|[+,]*\.(?:[4-9]|\d\d|)[fF]")
+"""Formats that show more than four significant digits, or a power of ten for a number of thousands."""
+BY_THE_READER = r"(?:[+,]*(?:\.\d*)?[gGfFeE%])"
+ROUNDED_OTHERWISE = {
+    "wording.py": "holds the helpers",
+    "export/": "numbers in exported code, which are exact",
+    "testing/": "messages of checks for authors of plug-ins",
+    "report/": "held by the test above",
+    "settings/bounds.py": "bounds, exactly as they are checked",
+    "logs/reference.py": "factors of units, which are exact",
+    "workflows/identify/machine_text.py": "numbers of a machine file, which are read again",
+    "monitor/residuals/balances.py": "names of residuals",
+    "workflows/api/predictions.py": "names of columns",
+}
+"""Modules and folders that write numbers which nobody reads in a terminal."""
+USER_MODULES = sorted(
+    name
+    for path in SOURCE.rglob("*.py")
+    if not (name := str(path.relative_to(SOURCE))).startswith(tuple(ROUNDED_OTHERWISE))
+)
+
+
+@pytest.mark.parametrize("name", USER_MODULES)
+def test_terminal_texts_format_numbers_by_one_helper(name):
+    """Commands round by `edp.wording` alone; messages of other modules may fix up to three decimals."""
+    rule = re.compile(BY_THE_READER) if name.startswith("cli/") else BARE
+    fields = fields_of(ast.parse((SOURCE / name).read_text(encoding="utf-8")))
+    assert [(line, spec) for line, spec in fields if rule.fullmatch(spec)] == []
+
+
 @given(FINITE, st.one_of(st.none(), st.integers(0, 6)), st.booleans())
 def test_numbers_have_four_significant_digits_at_most(value, decimals, signed):
     for text in (number(value, decimals, signed), figure(value)):
         assert long_numbers([text]) == []
         assert len(text) <= 26
+
+
+@given(st.floats(-1e14, 1e14), st.integers(1, 4))
+def test_a_figure_has_as_many_digits_as_asked_for(value, digits):
+    shown = re.sub(r"e.*", "", figure(value, digits))
+    if "." in shown:
+        assert len(re.sub(r"\D", "", shown).lstrip("0")) <= digits
 
 
 @given(st.floats(1e-5, 1e14).flatmap(lambda size: st.sampled_from([size, -size])))

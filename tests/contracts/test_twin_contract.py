@@ -4,18 +4,53 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+import edp
 import edp.networks.twin
+from edp.errors import BundleError, ConfigError
 from edp.networks.twin import TWINS
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.static_map import StaticMap, StaticTwin
 from edp.testing import ContractError, check_spec, check_twin
-from edp.testing.twins import sample_front
+from edp.testing.twins import sample_front, sample_twin
+from edp.training.twin_bundle import TwinBundle, save_twin
 
 
 @pytest.mark.parametrize("name", list(TWINS))
 def test_a_formulation_keeps_the_contract(name):
     check_twin(name)
+
+
+WITH_NETWORK = {"recurrent", "residual"}
+"""Formulations whose numbers are weights of a PyTorch module."""
+
+
+@pytest.mark.parametrize("name", list(TWINS))
+def test_the_network_of_a_loaded_twin_is_what_it_runs_with_or_an_error_that_names_the_kind(name, tmp_path):
+    spec = TWINS[name]()
+    twin, commands, measured = sample_twin(spec)
+    save_twin(TwinBundle(spec, twin), tmp_path / "run" / "twin")
+    model, prefix = edp.load_twin(tmp_path / "run"), twin.prefix_ticks
+    if name not in WITH_NETWORK:
+        with pytest.raises(ConfigError, match=f"of kind '{name}', which has no network"):
+            _ = model.network
+        return
+    assert isinstance(model.network, torch.nn.Module)
+
+    def run():
+        return model.twin.rollout(commands[:, prefix:], model.twin.reset(commands[:, :prefix], measured[:, :prefix]))[0]
+
+    before = run()
+    with torch.no_grad():
+        model.network.out_bias.add_(1.0)
+    assert not np.array_equal(run(), before)
+
+
+def test_loading_a_twin_as_a_predictor_names_the_right_function(tmp_path):
+    save_twin(TwinBundle(spec := TWINS["static"](), sample_twin(spec)[0]), tmp_path / "run" / "twin")
+    with pytest.raises(BundleError, match=r"holds a twin, not a network that predicts; .*edp\.load_twin loads it"):
+        edp.load(tmp_path / "run")
 
 
 @pytest.mark.parametrize("members", [1, 3])

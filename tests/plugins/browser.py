@@ -204,9 +204,8 @@ def check_page(browser: Browser, page: Path, kind: str, own: Iterable[str] = ())
         assert browser.requests() == []
     check_kind(browser, kind)
     words = visible_text(browser)
-    faults += [
-        f"more digits than are known, format it by edp.report.common.wording: {one}" for one in long_numbers(words)
-    ]
+    faults += [f"more digits than are known, format it by edp.wording: {one}" for one in long_numbers(words)]
+    faults += [f"a number without a unit has the unit 1: {one}" for one in words if re.search(r"\[1\]|\(1\)²", one)]
     if kind not in ABOUT_EXCAVATORS:
         faults += [f"a word of an excavator on a page for any machine: {one}" for one in excavator_words(words, own)]
     assert not faults, "\n".join(faults)

@@ -32,6 +32,15 @@
   });
   document.querySelectorAll("table").forEach((table) => {
     if (!table.querySelector("th[scope]")) say("table without headings", table);
+    table.querySelectorAll("thead th").forEach((heading) => {
+      const texts = document.createTreeWalker(heading, NodeFilter.SHOW_TEXT);
+      while (shown(heading) && texts.nextNode()) for (const word of texts.currentNode.data.matchAll(/[^\s-]{2,14}(?=[\s-]|$)/g)) {
+        const range = document.createRange();
+        range.setStart(texts.currentNode, word.index);
+        range.setEnd(texts.currentNode, word.index + word[0].length);
+        if (new Set([...range.getClientRects()].map((line) => Math.round(line.top))).size > 1) say("word of a heading is broken", heading);
+      }
+    });
   });
   document.querySelectorAll(".figure").forEach((figure) => {
     if (figure.querySelectorAll("svg[role=img] path, svg[role=img] rect").length < 3) say("figure without a drawing", figure);

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import edp
 from edp.cli import app
-from edp.report.common.wording import MAX_LABEL, label_by_name, short_labels
+from edp.wording import MAX_LABEL, label_by_name, short_labels
 
 
 @pytest.mark.parametrize("length", [0, 1, 31, 32])

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from edp.report.common.picture import NOT_XML, write_drawings
 from edp.report.common.sheets import Column, Sheet
 from edp.report.common.templates import template
-from edp.report.common.wording import in_cell, in_markdown, printable
 from edp.report.run.page import script_json
+from edp.wording import in_cell, in_markdown, printable
 
 HOSTILE = [
     '=HYPERLINK("http://a.b")',

@@ -12,11 +12,11 @@ from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
 from edp.report import build_report
-from edp.report.common.wording import MISSING
 from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
 from edp.storage import read_json, write_json
 from edp.training import load_bundle
+from edp.wording import MISSING
 from edp.workflows.auto import load_auto, train_auto
 from edp.workflows.auto.candidates import CANDIDATES, Amount, RecurrentTrial, spans_of, tree_plan
 from edp.workflows.auto.promise import Promise, choose

@@ -28,13 +28,15 @@ def house(benchmark):
 def test_rooms_are_few_and_imports_go_down(house):
     # 22 before the room of monitoring, which stands beside that of closed loops: neither knows the other.
     # 23 before the room of the live view: a server that runs on, and knows neither networks nor machines.
-    assert len(house.siblings) <= 24, house.siblings
+    # 24 before `wording`, the one place of figures for readers: messages of every room need it, those of `storage` too.
+    assert len(house.siblings) <= 25, house.siblings
     # 130 before the rooms of closed loops, which imports eight and is imported by three, and of monitoring, which
     # imports three.
     # 141 before the monitor read networks, twins and recordings (seven more rooms), and settings and testing read it.
     # 150 before the live view, which imports errors, signals, storage and report, and is imported by workflows.
     # 155 before options of the command line took their bounds from settings.
-    assert house.arrows <= 156
+    # 156 before numbers in messages of all rooms came from `edp.wording`, which stands below them.
+    assert house.arrows <= 175
     assert house.circles == []
 
 

@@ -1,14 +1,20 @@
 """Channels, kinds, units, names and recordings: the words that every room uses."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edp.errors import ConfigError, DataError, closest
+from edp.logs.read import read_recording
+from edp.logs.source import DataSource
+from edp.logs.units import mapped_channel
 from edp.recording import Recording
 from edp.registry import Registry
+from edp.settings.tree import plain_tree
 from edp.signals import EXTRA_CHANNELS, KINDS, TABLE_A1, UNITS, Channel, ChannelMap, Kind, SignalMap, conversion
+from edp.workflows.live.sources.udp import _conversions
 
 
 def test_table_a1_has_the_24_names_in_its_order():
@@ -65,11 +71,42 @@ def test_report_units_invert_to_si():
 
 
 def test_map_entries_take_the_kind_of_the_vocabulary_or_their_own():
-    assert ChannelMap("CylVels_1", "v").channel() is TABLE_A1["CylVels_1"]
-    assert ChannelMap("Load", "F", kind=Kind.FORCE).channel() == Channel("Load", Kind.FORCE)
-    assert ChannelMap("x", "x").channel().kind is Kind.GENERIC
+    assert mapped_channel(ChannelMap("CylVels_1", "v")) is TABLE_A1["CylVels_1"]
+    assert mapped_channel(ChannelMap("Load", "F", kind=Kind.FORCE)) == Channel("Load", Kind.FORCE)
+    assert mapped_channel(ChannelMap("x", "x")).kind is Kind.GENERIC
     with pytest.raises(ConfigError, match=r"names channel.*twice: a"):
         SignalMap((ChannelMap("a", "x"), ChannelMap("a", "y")))
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_unit_of_a_map_tells_the_kind_that_an_entry_leaves_out(unit, tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("time,F\n" + "".join(f"{0.01 * k:.2f},{k}\n" for k in range(50)))
+    signal_map = SignalMap((ChannelMap("Load", "F", unit=unit),))
+    recording = read_recording(log, signal_map)
+    channel = recording.channels[0]
+    assert channel.kind in UNITS[unit].kinds
+    assert (channel.kind is Kind.GENERIC) == (unit == "1")
+    assert recording.column("Load")[7] == pytest.approx(7 * UNITS[unit].factor + UNITS[unit].offset)
+    # A live row with the same map has the same value.
+    assert _conversions(signal_map)("Load", {"F": 7.0}) == pytest.approx(float(recording.column("Load")[7]))
+
+
+def test_numbers_stay_as_they_are_where_the_map_says_generic_or_the_unit_has_no_kind(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("time,F\n" + "".join(f"{0.01 * k:.2f},{k}\n" for k in range(50)))
+    for entry in (ChannelMap("Load", "F", "kN", Kind.GENERIC), ChannelMap("Load", "F", "kW"), ChannelMap("Load", "F")):
+        recording = read_recording(log, SignalMap((entry,)))
+        assert (recording.channels[0].kind, float(recording.column("Load")[7])) == (Kind.GENERIC, 7.0)
+
+
+def test_models_of_earlier_versions_read_logs_as_they_were_trained():
+    signal_map = SignalMap((ChannelMap("Load", "F", unit="kN"), ChannelMap("CylVels_1", "v", unit="mm/s")))
+    source = DataSource(Path("log.csv"), signal_map)
+    again = DataSource.from_plain(source.to_plain()).signal_map
+    assert [mapped_channel(entry).kind for entry in again.channels] == [Kind.FORCE, Kind.VELOCITY]
+    before = DataSource.from_plain({"path": "log.csv", "map": plain_tree(signal_map)}).signal_map
+    assert [mapped_channel(entry).kind for entry in before.channels] == [Kind.GENERIC, Kind.VELOCITY]
 
 
 def test_closest_names():

@@ -11,6 +11,7 @@ from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
 from edp.cli.settings import SettingsOption
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
+from edp.wording import figure, percent
 
 
 def adapt(
@@ -104,13 +105,15 @@ def replay_tables(facts: dict[str, Any]) -> None:
             if row["horizon"] == horizon:
                 rows.append(_line(row))
         table(f"MAE k = {horizon} ahead, {unit}; by target: without / adapted", heads, rows)
-    out.print(f"taken back in {facts['fallback']:.1%} of the ticks; {facts['taught']:,} ticks taught")
+    out.print(f"taken back in {percent(facts['fallback'])} of the ticks; {facts['taught']:,} ticks taught")
 
 
 def _line(row: dict[str, Any]) -> list[str]:
     base, adapted = (sum(row[of]) / len(row[of]) for of in ("base", "adapted"))
-    when = f"over {row['from_s']:g}" if row["to_s"] is None else f"{row['from_s']:g} to {row['to_s']:g}"
+    when = (
+        f"over {figure(row['from_s'])}" if row["to_s"] is None else f"{figure(row['from_s'])} to {figure(row['to_s'])}"
+    )
     # Nothing to relate to where the error is zero.
-    change = f"{100 * (adapted / base - 1):+.1f} %" if base else "-"
-    pairs = [f"{b:.3g} / {a:.3g}" for b, a in zip(row["base"], row["adapted"], strict=True)]
-    return [when, f"{base:.4g}", f"{adapted:.4g}", change, *pairs]
+    change = percent(adapted / base - 1, signed=True) if base else "-"
+    pairs = [f"{figure(b, 3)} / {figure(a, 3)}" for b, a in zip(row["base"], row["adapted"], strict=True)]
+    return [when, f"{figure(base)}", f"{figure(adapted)}", change, *pairs]

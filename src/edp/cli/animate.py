@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
-from edp.cli.options import MOST_SECONDS, within
+from edp.cli.options import MOST_SECONDS, check_effects, within
 from edp.cli.train import MapOption
 from edp.errors import ConfigError
 from edp.settings.bounds import above, span
@@ -19,6 +19,7 @@ PAGES = (".html", ".htm")
 
 
 def animate(
+    context: typer.Context,
     paths: Annotated[
         list[Path],
         typer.Argument(
@@ -54,8 +55,7 @@ def animate(
     from edp.report.animation.page import scene_of, write_animation
 
     run, log = _run_and_log(paths)
-    if run is None and horizon is not None:
-        raise ConfigError("--horizon is of a run's predictions; give a run before the log: edp animate RUN LOG")
+    check_effects(context, {"horizon": run is not None})
     target = output or log.parent / f"{log.stem or 'log'}.html"
     film = target.suffix.lower() in FILMS
     if not film and target.suffix.lower() not in PAGES:

@@ -10,7 +10,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, out, progress, table
 from edp.cli.settings import SettingsOption
-from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
+from edp.cli.train import DataOption, MapOption, RepairOption, SeriesDisplay, source_if_given
 
 if TYPE_CHECKING:
     from edp.training import TrainingProgress
@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 def compress(
     bundle: Annotated[Path, typer.Argument(help="Run folder of the teacher, or its bundle.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the search; an unfinished search continues.")],
-    data: Annotated[
-        Path | None,
-        typer.Option(help="Log, folder of logs, data-set file, or store; default: those of the run."),
-    ] = None,
+    data: DataOption = [],  # noqa: B006
     budget: Annotated[
         Path | None, typer.Option("--budget", help="Limits of the controller (TOML); by default those of the thesis.")
     ] = None,
@@ -58,7 +55,7 @@ def compress(
     own = [] if budget is None else [{"compress": {"budget": asdict(load_budget(budget))}}]
     spec, others = command_settings("compress", CompressionSearchSpec, config, [*changes, *own], TRAINING_TABLES)
     request = CompressionSearchRequest(spec=spec, again=again, changes=others)
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "compress", "network")
 

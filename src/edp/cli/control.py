@@ -13,6 +13,7 @@ from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
 from edp.cli.options import MOST_LOOPS
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
+from edp.wording import figure, number
 
 TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
 MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
@@ -126,9 +127,10 @@ def tune(
 
     def show() -> None:
         show_verdict(verdict)
-        gains = ", ".join(f"{name} {value:.3g}" for name, value in tuning.content["gains"].items())
+        gains = ", ".join(f"{name} {figure(value, 3)}" for name, value in tuning.content["gains"].items())
         out.print(
-            f"position error of the tip on the plant: {judged['after']:.1f} mm (rms), {judged['before']:.1f} mm before"
+            f"position error of the tip on the plant: {number(judged['after'], 1)} mm (rms), "
+            f"{number(judged['before'], 1)} mm before"
         )
         out.print(f"gains: {gains}")
         out.print(f"next: edp control RUN --config {folder / TUNED}")
@@ -152,10 +154,10 @@ def score_table(content: Mapping[str, Any]) -> None:
     rows = []
     for loop in content["loops"]:
         score = loop["score"]
-        cells = [f"{score[key]:.1f}" for key in ("position_rms_mm", "position_max_mm", "path_rms_mm", "path_max_mm")]
-        arrived = "-" if score["arrived_s"] is None else f"{score['arrived_s']:.2f}"
-        energy = "-" if score["energy_kj"] is None else f"{score['energy_kj']:.0f}"
-        cells += [f"{score['attitude_rms_deg']:.2f}", arrived, energy, f"{score['lever_travel']:.1f}"]
+        cells = [number(score[key], 1) for key in ("position_rms_mm", "position_max_mm", "path_rms_mm", "path_max_mm")]
+        arrived = "-" if score["arrived_s"] is None else number(score["arrived_s"], 2)
+        energy = "-" if score["energy_kj"] is None else number(score["energy_kj"], 0)
+        cells += [number(score["attitude_rms_deg"], 2), arrived, energy, number(score["lever_travel"], 1)]
         rows.append([loop["name"], *cells, sum(score["violations"].values())])
     # Short: the table fits into 80 columns.
     heads = ["tip, mm", "max", "path, mm", "max", "deg", "s", "kJ", "levers", "over"]

@@ -15,6 +15,7 @@ from edp.cli.console import JsonFlag, duration, emit, out
 from edp.cli.options import within
 from edp.settings.bounds import SEED
 from edp.storage.paths import full_path
+from edp.wording import figure
 
 # 180 min in 60 recordings: with 75 min the network's lead over ridge ARX was smaller (docs/findings.md).
 MINUTES = 180.0
@@ -35,7 +36,7 @@ def demo(
 
     began = time.monotonic()
     data, run = folder / f"data_{seed}", folder / f"run_{seed}"
-    _say(as_json, f"1/4 simulate {MINUTES:g} min of machine M22 in free air")
+    _say(as_json, f"1/4 simulate {figure(MINUTES)} min of machine M22 in free air")
     order = SimulationOrder(minutes=MINUTES, recordings=RECORDINGS, seed=seed)
     simulate_command.run(data, order, quiet=as_json)
     _say(as_json, "2/4 train the hybrid TCN-LSTM for 100 ms ahead (k = 10)")

@@ -10,8 +10,9 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.settings import SettingsOption
-from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
+from edp.cli.train import DataOption, MapOption, RepairOption, TrainingDisplay, source_if_given
 from edp.errors import ConfigError
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from edp.evaluation.footprint import Footprint
@@ -25,15 +26,15 @@ def distil(
         int | None,
         typer.Option(help="Width of the student (distil.units): recurrent units, or channels of the first level."),
     ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(help="Log, folder of logs, data-set file, or store; default: those of the run."),
-    ] = None,
+    data: DataOption = [],  # noqa: B006
     teachers: Annotated[list[Path], typer.Option("--teacher", help="A further teacher; may be repeated.")] = [],  # noqa: B006
     further: Annotated[
-        Path | None,
-        typer.Option(help="Recordings without measured targets; the student learns the teachers' predictions on them."),
-    ] = None,
+        list[Path],
+        typer.Option(
+            help="Recordings without measured targets, on which the student learns the teachers' predictions; may be "
+            "repeated."
+        ),
+    ] = [],  # noqa: B006
     config: SettingsOption = None,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting, such as distil.pruned=true or training.epochs=10.")
@@ -61,10 +62,10 @@ def distil(
     request = DistilRequest(
         spec=spec,
         teachers=tuple(map(str, teachers)),
-        further=None if further is None else source_of(further, signal_map, repair),
+        further=source_if_given(further, signal_map, repair),
         changes=others,
     )
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     with progress(as_json) as shown:
         display = TrainingDisplay(shown, Steps(as_json))
         bundle = make(run, request, folder, source, display.on_event)
@@ -83,6 +84,6 @@ def _show(counts: Mapping[str, Footprint], facts: Mapping[str, Any]) -> None:
     rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
     table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
     error = facts["validation_mae"]
-    tail = "" if error is None else f", validation MAE {error:.4g} (report units)"
+    tail = "" if error is None else f", validation MAE {figure(error)} (report units)"
     out.print(f"distilled in {duration(facts['seconds'])}{tail}; bundle in {facts['bundle']}")
     out.print(f"next: edp evaluate {facts['run']}")

@@ -21,6 +21,7 @@ from edp import __version__
 from edp.cli.console import JsonFlag, emit, listing, out
 from edp.errors import EdpError, count_of
 from edp.storage.paths import is_folder_at
+from edp.wording import figure, number
 
 BROKEN = 3
 """Exit code where something is missing or broken that edp cannot do without."""
@@ -78,7 +79,7 @@ def doctor(
     folder: Annotated[Path, typer.Argument(help="Where runs are to be written; its disk is looked at.")] = Path(),
     as_json: JsonFlag = False,
 ) -> None:
-    """Look at versions, optional parts, the sandbox, compilers, disk, memory and threads; say what is missing.
+    """Check versions, optional parts, the sandbox, compilers, disk, memory and threads; print missing parts.
 
     Runs none of the programs it looks for. Ends with exit code 3 where something is broken that edp cannot do without.
 
@@ -159,8 +160,8 @@ def machine(folder: Path) -> list[InstallationCheck]:
 
 def _size(what: str, size: float, least: float, needed_for: str) -> InstallationCheck:
     state = "ok" if size >= least else "missing"
-    advice = "" if size >= least else f"; less than {least / 1e9:g} GB is little"
-    return InstallationCheck(what, state, f"{size / 1e9:,.1f} GB", needed_for + advice)
+    advice = "" if size >= least else f"; less than {figure(least / 1e9)} GB is little"
+    return InstallationCheck(what, state, f"{number(size / 1e9, 1)} GB", needed_for + advice)
 
 
 def reading() -> InstallationCheck:

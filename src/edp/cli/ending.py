@@ -7,6 +7,7 @@ import sys
 from types import FrameType
 
 from edp.storage.memory import free_bytes
+from edp.wording import figure
 
 _stopped_by: list[int] = []
 """Signals that asked this process to end."""
@@ -54,6 +55,7 @@ def memory_message(error: BaseException) -> str:
     reason = " ".join(str(error).split())[:SHOWN_REASON] or "an allocation failed"
     less = ADVICE.get(command, "fewer or shorter recordings, or a smaller network")
     return (
-        f"edp {doing}: not enough memory ({reason}); {free_bytes() / 1e9:,.2g} GB are free now. Take {less}, or raise "
+        f"edp {doing}: not enough memory ({reason}); {figure(free_bytes() / 1e9, 2)} GB are free now. Take {less}, or "
+        "raise "
         "the limit of this process; what was finished is on disk"
     )

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
-from edp.cli.options import MOST_HOURS, MOST_MINUTES, within
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.options import MOST_HOURS, MOST_MINUTES, check_effects, within
+from edp.cli.train import DataOption, MapOption, RepairOption, source_if_given
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
-from edp.errors import ConfigError
 from edp.settings.bounds import above, span
+from edp.wording import figure, number, percent, setting_text
 
 if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 
 def evaluate(
+    context: typer.Context,
     run: Annotated[Path, typer.Argument(help="Run folder of edp train or edp twin.")],
-    data: Annotated[Path | None, typer.Option(help="Other recordings to judge on; default: the held-out ones.")] = None,
+    data: DataOption = [],  # noqa: B006
     baselines: Annotated[
         str | None, typer.Option(help="Comma-separated names, 'all' or 'none'; default: those of the settings.")
     ] = None,
@@ -65,18 +66,16 @@ def evaluate(
     """
     from edp.training.twin_bundle import holds_twin
 
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     workforce = workforce_of(workers, cluster, open_cluster)
-    if minutes is not None and not workforce.alone:
-        raise ConfigError("--minutes bounds what one process does; leave it out with --workers and --cluster")
-    if holds_twin(run):
-        plain = baselines is None and not channel_importance and minutes is None and at_most is None
-        refuse_for_a_twin(run, workforce.alone, plain)
+    names = None if baselines is None else baseline_names(baselines)
+    is_twin = holds_twin(run)
+    of_networks = ("baselines", "at_most", "channel_importance", "workers", "cluster")
+    effects = {"predictor": is_twin, "minutes": not is_twin and names != [] and workforce.alone}
+    check_effects(context, effects | dict.fromkeys(of_networks, not is_twin))
+    if is_twin:
         evaluate_twin_run(run, source, predictor, as_json)
         return
-    if predictor is not None:
-        raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
-    names = None if baselines is None else baseline_names(baselines)
     from edp.evaluation.guard import network_verdict
     from edp.report.run.choice import promise_line, read_choice
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
@@ -107,27 +106,6 @@ def evaluate(
     end_with(verdict)
 
 
-def refuse_for_a_twin(run: Path, alone: bool, plain: bool) -> None:
-    """Refuse what a twin's evaluation does not have: more than one process, and options of networks' evaluations.
-
-    Args:
-        run: folder of the twin.
-        alone: whether one process works.
-        plain: whether none of these options is given.
-
-    Raises:
-        ConfigError: one of both is not so.
-    """
-    if not alone:
-        raise ConfigError(f"'{run}' holds a twin, which one process judges; leave --workers and --cluster out")
-    if not plain:
-        raise ConfigError(
-            f"'{run}' holds a twin, which has no --baselines, --minutes, --at-most or --channel-importance; leave "
-            "them out: "
-            "its floors are those of its settings, judge.floors"
-        )
-
-
 def show_scores(scores: dict[str, Any], sentences: Sequence[str], minutes: float | None) -> None:
     """Print the tables of an evaluation, what is to be said of it, and what the time was too short for."""
     score_table(scores)
@@ -139,7 +117,9 @@ def show_scores(scores: dict[str, Any], sentences: Sequence[str], minutes: float
         out.print(f"judged on {scores['drawn']['what']}; leave --at-most out for all")
     if scores.get("left_out"):
         left = ", ".join(map(str, scores["left_out"]))
-        out.print(f"left out after --minutes {minutes:g}: {left}; give the command without it to judge them, too")
+        out.print(
+            f"left out after --minutes {setting_text(minutes)}: {left}; give the command without it to judge them, too"
+        )
 
 
 def baseline_names(text: str) -> list[str]:
@@ -235,10 +215,15 @@ def importance_table(importances: ChannelImportances) -> None:
     for horizon, error in importances.error.items():
         rows = []
         for row in importances.ranked(int(horizon)):
-            bounds = f"{row.renewed.low:.3g} to {row.renewed.high:.3g}"
-            figures = [f"{row.renewed.mean:.3g}", bounds, f"{row.exchanged.mean:.3g}", f"{row.explained:.0%}"]
+            bounds = f"{figure(row.renewed.low, 3)} to {figure(row.renewed.high, 3)}"
+            figures = [
+                f"{figure(row.renewed.mean, 3)}",
+                bounds,
+                f"{figure(row.exchanged.mean, 3)}",
+                percent(row.explained),
+            ]
             rows.append([", ".join(row.members), *figures])
-        title = f"growth of the error at k = {horizon} (MAE {error['mean']:.4g} {unit}) without the channel, {unit}"
+        title = f"growth of the error at k = {horizon} (MAE {figure(error['mean'])} {unit}) without the channel, {unit}"
         table(title, ["channel", "its own", "95 %", "with all it shares", "explained by others"], rows)
 
 
@@ -257,17 +242,17 @@ def score_table(scores: dict[str, Any]) -> None:
         rows = []
         for model in scores["models"].values():
             s = model["overall"][str(horizon)]["mean"]
-            r2 = "-" if s["r2"] is None else f"{s['r2']:.4f}"
-            figures = [f"{s[key]:.4g}" for key in (MEASURE, "mae", "p95", "p99", "composite")]
+            r2 = "-" if s["r2"] is None else number(s["r2"], 4)
+            figures = [figure(s[key]) for key in (MEASURE, "mae", "p95", "p99", "composite")]
             rows.append((s[MEASURE], [model["label"], *figures, r2]))
         rows.sort(key=lambda row: row[0])
-        ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
+        ahead = f"{number(1e3 * horizon / rate, 0)} ms ahead (k = {horizon})"
         heads = ["model", MEASURE_NAME, "MAE", "P95", "P99", "composite", "R2"]
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
     interval_rows(scores, unit)
     for name, model in scores["models"].items():
         for target, integral_scores in model.get("integrated", {}).items():
-            out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g} {unit} s")
+            out.print(f"free run of the integral of {target}, {name}: RMSE {figure(integral_scores['rmse'])} {unit} s")
 
 
 def by_situation_table(scores: dict[str, Any]) -> None:
@@ -292,23 +277,23 @@ def _tables_by_output(scores: dict[str, Any], rate: float) -> None:
             model["label"]: [model["overall"][str(horizon)][t["name"]][MEASURE] for t in targets]
             for model in scores["models"].values()
         }
-        ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
-        rows = [[label, *(f"{value:.4g}" for value in values)] for label, values in errors.items()]
+        ahead = f"{number(1e3 * horizon / rate, 0)} ms ahead (k = {horizon})"
+        rows = [[label, *(figure(value) for value in values)] for label, values in errors.items()]
         table(f"{ahead}, {MEASURE_NAME} of each output", heads, rows)
     for name, model in scores["models"].items():
         for target, integral_scores in model.get("integrated", {}).items():
-            out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g}")
+            out.print(f"free run of the integral of {target}, {name}: RMSE {figure(integral_scores['rmse'])}")
 
 
 def interval_rows(scores: dict[str, Any], unit: str) -> None:
     """Print how much of the truth the network's intervals hold, where it states any."""
     intervals = scores["models"]["network"].get("intervals", {})
     rows = [
-        [f"k = {horizon}", f"{row['coverage']:.1%}", f"{row['covered']['mean']:.1%}", f"{row['width']['mean']:.4g}"]
+        [f"k = {horizon}", percent(row["coverage"]), percent(row["covered"]["mean"]), f"{figure(row['width']['mean'])}"]
         for horizon, entries in intervals.items()
         for row in entries
     ]
     if rows:
         table(f"intervals of the network, mean over outputs, {unit}", ["ahead", "meant", "holds", "mean width"], rows)
     for horizon, score in scores["models"]["network"].get("weighted_interval_score", {}).items():
-        out.print(f"weighted interval score, k = {horizon}: {score['mean']:.4g} {unit} (a point: its MAE)")
+        out.print(f"weighted interval score, k = {horizon}: {figure(score['mean'])} {unit} (a point: its MAE)")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, waiting
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.train import MapOption, RepairOption, source_if_given
 from edp.errors import ConfigError
 from edp.storage.paths import full_path, is_file_at
 
@@ -41,9 +41,11 @@ def export(
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
     ] = None,
     w8a16: Annotated[
-        Path | None,
-        typer.Option(help="Of a twin: logs on which it is brought into W8A16, for forms around the C code."),
-    ] = None,
+        list[Path],
+        typer.Option(
+            help="Of a twin: logs on which it is brought into W8A16, for forms around the C code; may be repeated."
+        ),
+    ] = [],  # noqa: B006
     twin: Annotated[
         Path | None,
         typer.Option("--twin", help="For --to follower: the run of a grey box of the machine as it was."),
@@ -64,7 +66,7 @@ def export(
     from edp.workflows.export_forms import ExportOrder, export_run
 
     options = dict(map(_option, changes or []))
-    calibration = None if w8a16 is None else source_of(w8a16, signal_map, repair)
+    calibration = source_if_given(w8a16, signal_map, repair)
     order = ExportOrder(
         run=bundle, to=to, folder=folder, name=name, options=options, twin=twin, calibration=calibration
     )

@@ -13,6 +13,7 @@ from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from edp.report.transfer.facts import Transfer
@@ -122,7 +123,7 @@ def _finetune_fleet(
         content = finetune_fleet(workforce, bundle, store, order, folder, on_machine)
 
     def show() -> None:
-        rows = [(name, *(f"{error:.4g}" for error in errors)) for name, *errors in errors_by_machine(content)]
+        rows = [(name, *(figure(error) for error in errors)) for name, *errors in errors_by_machine(content)]
         unit = content["unit"]
         heads = ["machine", f"before [{unit}]", f"full fine-tune [{unit}]", f"its delta [{unit}]"]
         table(f"mean absolute error, k = {content['horizon']}, ends of the recordings", heads, rows)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.wording import number
 
 if TYPE_CHECKING:
     from edp.evaluation.controller import Budget
@@ -73,8 +74,9 @@ def _of_monitor(file: Path, limits: Budget, as_json: bool) -> None:
         table(file.name, ["network", "numbers", "parameters", "runs", "every, ticks", "MACs"], rows)
         chain = counts.chain
         out.print(
-            f"behind the residuals, in double precision: {chain.mean:,.0f} cycles a tick of a Cortex-M4F on average, "
-            f"{chain.most:,.0f} in the longest; state {counts.state_bytes:,} bytes"
+            f"behind the residuals, in double precision: {number(chain.mean, 0)} cycles a tick of a Cortex-M4F on "
+            "average, "
+            f"{number(chain.most, 0)} in the longest; state {counts.state_bytes:,} bytes"
         )
         out.print()
         cycles = [(core.label, *counts.cycles[key]) for key, core in CORES.items()]

@@ -10,6 +10,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.errors import count_of
+from edp.wording import figure
 
 MODELS = ("twin", "persistence")
 """In the scores, in the order of the table's columns."""
@@ -64,13 +65,15 @@ def forecast(
                 [
                     name,
                     row["twin"].get("units", {}).get(name, unit),
-                    *(f"{row[m]['by_channel'][name]:.3g}" for m in MODELS),
+                    *(figure(row[m]["by_channel"][name], 3) for m in MODELS),
                 ]
                 for name in row["twin"]["by_channel"]
             ]
-            title = f"{row['seconds']:g} s ahead, commands held: mean absolute error at {row['moments']:,} moments"
+            title = (
+                f"{figure(row['seconds'])} s ahead, commands held: mean absolute error at {row['moments']:,} moments"
+            )
             table(title, ["", "unit", "twin", "present value held"], errors)
-        out.print(f"gain of the observer: {result.gain:g}")
+        out.print(f"gain of the observer: {figure(result.gain)}")
         out.print(f"{count_of(len(result.files), 'log')} in {folder}, each with {', '.join(result.channels)}")
         out.print(f"next: edp train {folder} --set task.features=all --out runs/ahead")
 

@@ -11,6 +11,7 @@ from edp.cli.console import JsonFlag, emit, out, progress, table
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.twin import FitDisplay, score_table
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from edp.workflows.identify import Identified
@@ -77,7 +78,7 @@ def number_table(result: Identified) -> None:
     rows = []
     for row in result.rows:
         interval = row.interval("kept: not told by the logs")
-        rows.append([row.label, row.unit, f"{row.base:.4g}", f"{row.value:.4g}", interval])
+        rows.append([row.label, row.unit, figure(row.base), figure(row.value), interval])
     told_count = sum(row.is_told for row in result.rows)
     rough = sum(row.excited for row in result.rows) - told_count
     table(

@@ -12,6 +12,7 @@ import typer
 from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress
 from edp.cli.quality import LogDisplay
 from edp.errors import ConfigError, count_of
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,7 +30,7 @@ _NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
 
 
 def init(
-    logs: Annotated[Path, typer.Argument(help="A log, or a folder of logs, of any columns.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Logs and folders of logs, of any columns.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder to write map.toml and settings.toml into.")] = Path(),
     yes: Annotated[bool, typer.Option("--yes", help="Write the files without asking.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,
@@ -77,7 +78,7 @@ def init(
 def show_proposal(proposal: LogsProposal) -> None:
     """Print what each column is taken for, within 80 columns, and what else a person should know."""
     look, clock = proposal.proposal.look, proposal.proposal.clock
-    rate = "unknown rate" if clock.rate_hz is None else f"{clock.rate_hz:.5g} Hz"
+    rate = "unknown rate" if clock.rate_hz is None else f"{figure(clock.rate_hz)} Hz"
     count = len(proposal.group.paths)
     out.print(f"{count_of(count, 'log')} with these columns; {look.path.name}: {look.rows:,} rows, {rate}")
     # What never moves last: logs of ROS hold more of it than fits.

@@ -15,6 +15,7 @@ from edp.cli.train import LogsArgument, MapOption, shell_words
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import DataError, EdpError, count_of
 from edp.storage.paths import full_path, is_file_at
+from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from edp.data.coverage import Coverage
@@ -168,14 +169,14 @@ def show_coverage(coverage: Coverage, whole: bool = True) -> None:
     rows: list[tuple[Any, ...]] = []
     if coverage.singular:
         lags = max(coverage.singular)
-        rows.append((f"smallest singular value, {lags} lags", f"{coverage.singular[lags]:.3g}", "white noise: 1"))
+        rows.append((f"smallest singular value, {lags} lags", figure(coverage.singular[lags], 3), "white noise: 1"))
     if coverage.spectrum is not None:
         for name, flat, drop in zip(coverage.spectrum.names, coverage.spectrum.flat_to_hz, coverage.spectrum.drop_db):
             rows.append(
                 (
                     f"{name}: flat within 10 dB to",
-                    f"{flat:.2g} Hz",
-                    f"{drop:.0f} dB down at {coverage.spectrum.used_hz:.2g} Hz",
+                    f"{figure(flat, 2)} Hz",
+                    f"{number(drop, 0)} dB down at {figure(coverage.spectrum.used_hz, 2)} Hz",
                 )
             )
     if coverage.occupancy is not None:
@@ -186,14 +187,21 @@ def show_coverage(coverage: Coverage, whole: bool = True) -> None:
         )
     if coverage.distance is not None:
         far = coverage.distance
-        rows.append(("test to train, median", f"{far.test[0]:.3g}", f"train to train {far.train[0]:.3g}"))
+        rows.append(("test to train, median", figure(far.test[0], 3), f"train to train {figure(far.train[0], 3)}"))
         rows.append(("test farther than 95 % of train", _share(far.beyond), "5 % where both are alike"))
     table(
-        f"coverage: {count_of(coverage.recordings, 'recording')}, {coverage.hours:.2f} h", ["", "value", "note"], rows
+        f"coverage: {count_of(coverage.recordings, 'recording')}, {number(coverage.hours, 2)} h",
+        ["", "value", "note"],
+        rows,
     )
     out.print()
     judged = [
-        (w.name, f"{w.value:.3g} {w.unit}", f"{'>=' if w.at_least else '<='} {w.bound:g} {w.unit}", _verdict(w.met))
+        (
+            w.name,
+            f"{figure(w.value, 3)} {w.unit}",
+            f"{'>=' if w.at_least else '<='} {figure(w.bound)} {w.unit}",
+            _verdict(w.met),
+        )
         for w in wanted(coverage)
     ]
     if judged:
@@ -216,7 +224,7 @@ def _show_all_coverage(coverage: Coverage) -> None:
     counts = coverage.events if any(e.count is not None for e in coverage.events) or moves else ()
     counted = [(e.name, _count(e.count), _share(e.share), e.note) for e in counts]
     pairs = [
-        (f"{j.group}: {j.x}", j.y, _share(j.filled), f"{j.correlation:.2f}", f"{j.information:.2f}")
+        (f"{j.group}: {j.x}", j.y, _share(j.filled), number(j.correlation, 2), number(j.information, 2))
         for j in coverage.joints
     ]
     tables: list[tuple[str, list[str], Any]] = [
@@ -236,7 +244,7 @@ def _verdict(met: bool) -> str:
 
 
 def _share(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f} %"
+    return "-" if value is None else percent(value)
 
 
 def _count(value: int | None) -> str:

@@ -84,7 +84,7 @@ def live(
     of_sources = {
         "map": signal_map, "machine": machine, "rate": rate, "seed": seed, "speed": speed, "excitation": excitation,
         "fault": fault or None, "controller": controller, "twin": twin, "plant": plant, "predictor": predictor,
-        "yes": yes or None, "udp-bind": udp_bind,
+        "yes": yes or None, "udp-bind": udp_bind, "until-end": until_end or None,
     }  # fmt: skip
     check_options(name, (option for option, entry in of_sources.items() if entry is not None))
     ask_for_fmus(yes, plant)

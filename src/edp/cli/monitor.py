@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
+from edp.cli.options import check_effects
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.workforce import WorkersOption
-from edp.errors import count_of
+from edp.errors import ConfigError, count_of
 from edp.storage.paths import full_path
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from edp.workflows.monitor import FittedMonitor
@@ -34,10 +36,13 @@ app = typer.Typer(
 
 @app.command("fit")
 def fit(
+    context: typer.Context,
     arguments: Annotated[
         list[Path],
         typer.Argument(
-            metavar="[RUN]... HEALTHY_LOGS", help="Run folders of this machine, if any; last, healthy logs."
+            metavar="[RUN]... LOGS...",
+            help="Run folders of this machine, if any, and healthy logs: logs and folders of logs; or one data-set "
+            "file (.toml), or one store.",
         ),
     ],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the monitor.")],
@@ -69,14 +74,20 @@ def fit(
 
     Example: `edp monitor fit runs/m22 logs/healthy --out monitors/m22`
     """
-    from edp.config.monitor import load_monitor_experiment
+    from edp.config.monitor import load_monitor_experiment, trains_networks
     from edp.workflows.monitor import fit_monitor
+    from edp.workflows.monitor.fit_monitor import holds_model
 
     options: dict[str, Any] = {} if hours is None else {"hours_per_false_alarm": hours}
     options |= {} if minutes is None else {"minutes": minutes}
     options |= {} if machine is None else {"dictionary": {"machine": machine}}
     experiment = load_monitor_experiment(config, changes, options)
-    *runs, logs = arguments
+    check_effects(context, {"minutes": trains_networks(experiment)})
+    runs = [path for path in arguments if holds_model(path)]
+    logs = [path for path in arguments if path not in runs]
+    if not logs:
+        raise ConfigError("edp monitor fit: got run folders alone, expected healthy logs; name them after the runs")
+    source = source_of(logs, signal_map, repair)
     began = time.monotonic()
     with progress(as_json) as shown:
         bar, steps = shown.add_task("monitor", total=None, note="reading recordings"), Steps(as_json)
@@ -85,7 +96,7 @@ def fit(
             shown.update(bar, note=text)
             steps.say(f"monitor: {text}", force=True)
 
-        fitted = fit_monitor(runs, source_of(logs, signal_map, repair), experiment, folder, note, workers)
+        fitted = fit_monitor(runs, source, experiment, folder, note, workers)
     monitor = fitted.monitor
     facts: dict[str, Any] = {
         "monitor": str(folder),
@@ -171,8 +182,8 @@ def run(
         rows = [
             [
                 first.recording,
-                f"{first.raised_s:g}",
-                f"{first.since_s:g}",
+                figure(first.raised_s),
+                figure(first.since_s),
                 first.severity,
                 1 + len(again),
                 first.sentence,
@@ -186,7 +197,7 @@ def run(
         if len(rows) > MOST_SHOWN:
             out.print(f"and {len(rows) - MOST_SHOWN:,} more")
         count = f"{len(watched.alarms):,} alarms" if watched.alarms else "no alarm"
-        out.print(f"{count} in {watched.hours:.3g} h; {watched.monitor.limit.sentence()}")
+        out.print(f"{count} in {figure(watched.hours, 3)} h; {watched.monitor.limit.sentence()}")
         for line in watched.silence:
             out.print(line)
         if target is not None:

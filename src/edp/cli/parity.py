@@ -9,18 +9,24 @@ import typer
 
 from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
-from edp.cli.options import MOST_TICKS
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.options import MOST_TICKS, check_effects
+from edp.cli.train import MapOption, RepairOption, source_if_given
+from edp.wording import figure, number
 
 if TYPE_CHECKING:
     from edp.workflows.parity import Row
 
 
 def parity(
+    context: typer.Context,
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp quantise or edp twin.")],
     data: Annotated[
-        Path | None, typer.Option(help="Log whose first ticks are the reference recording; default: random inputs.")
-    ] = None,
+        list[Path],
+        typer.Option(
+            help="Logs and folders of logs whose first ticks, in equal parts, are the reference recording; may be "
+            "repeated. Default: random inputs."
+        ),
+    ] = [],  # noqa: B006
     ticks: Annotated[
         int | None,
         typer.Option(
@@ -56,10 +62,11 @@ def parity(
     from edp.workflows.deployment import load_exported
     from edp.workflows.parity import compare, from_own_run, golden_case, recorded_case
 
+    check_effects(context, {"interpreters": not forms or any(form.startswith("onnx_") for form in forms)})
     if not (yes or from_own_run(bundle)):
         _ask(bundle)
     loaded = load_exported(bundle)
-    source = None if data is None else source_of(data, signal_map, repair)
+    source = source_if_given(data, signal_map, repair)
     case = golden_case(loaded, ticks) if source is None else recorded_case(loaded, source, ticks)
 
     def tell(row: Row) -> None:
@@ -91,7 +98,14 @@ def _ask(bundle: Path) -> None:
 def _show(rows: list[Row], ticks: int) -> None:
     shown = [row for row in rows if row.largest is not None]
     cells = [
-        (row.title, row.verdict, f"{row.largest:.3g}", f"{row.mean:.2g}", row.tolerance, f"{row.microseconds:,.1f}")
+        (
+            row.title,
+            row.verdict,
+            figure(row.largest, 3),
+            figure(row.mean, 2),
+            row.tolerance,
+            number(row.microseconds, 1),
+        )
         for row in shown
     ]
     heads = ["form", "verdict", "largest", "mean", "allowed", "µs a tick"]

@@ -8,12 +8,14 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.options import check_effects
 from edp.cli.settings import SettingsOption
 from edp.cli.train import LogsArgument, MapOption, RepairOption, TrainingDisplay, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 
 
 def pretrain(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     method: Annotated[str, typer.Option(help="joint, codes, fomaml, maml or reptile.")] = "joint",
@@ -41,9 +43,10 @@ def pretrain(
     """
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.config.experiment import load_experiment
-    from edp.workflows.pretraining import MetaSpec, Pretrain
+    from edp.workflows.pretraining import PRETRAININGS, MetaSpec, Pretrain
     from edp.workflows.pretraining import pretrain as make
 
+    check_effects(context, {"changes.pretrain": PRETRAININGS[method].episodic})
     meta, _ = command_settings("pretrain", MetaSpec, config, changes, TRAINING_TABLES)
     order = Pretrain(method=method, meta=meta, start=start)
     # Other splits are refused; the default makes the usual call short.

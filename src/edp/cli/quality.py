@@ -13,6 +13,7 @@ from edp.cli.console import Steps, count_text, out, table
 from edp.cli.options import MOST_HOURS, within
 from edp.errors import count_of
 from edp.settings.bounds import above
+from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -58,11 +59,14 @@ def show_report(report: QualityReport) -> None:
     """Print one recording's facts, a row for each channel, and all findings."""
     out.print(report.name, style="bold", end="")
     out.print(
-        f": {report.duration_s:.1f} s, {report.rate_hz:g} Hz, {report.samples:,} samples, verdict: {report.verdict}"
+        f": {number(report.duration_s, 1)} s, {figure(report.rate_hz)} Hz, {report.samples:,} samples, verdict: "
+        f"{report.verdict}"
     )
     for clock in report.clocks:
-        gaps = f"{count_of(clock.gaps, 'gap')}, longest {clock.longest_gap_s:g} s" if clock.gaps else "no gaps"
-        out.print(f"  time of '{clock.name}': {clock.rate_hz:g} Hz, jitter {clock.jitter:.2g} of a step, {gaps}")
+        gaps = f"{count_of(clock.gaps, 'gap')}, longest {figure(clock.longest_gap_s)} s" if clock.gaps else "no gaps"
+        out.print(
+            f"  time of '{clock.name}': {figure(clock.rate_hz)} Hz, jitter {figure(clock.jitter, 2)} of a step, {gaps}"
+        )
     if report.channels:
         rows = [(c.name, c.unit, *map(_short, (c.min, c.max, c.mean, c.std)), c.missing) for c in report.channels]
         table("", ["channel", "unit", "min", "max", "mean", "std", "missing"], rows)
@@ -70,8 +74,8 @@ def show_report(report: QualityReport) -> None:
         table(
             "", ["channel", "unit", "step", "noise", "SNR, dB", "new, Hz", "stuck, s", "at ends", "verdict"],
             [
-                (c.name, c.unit, _short(c.step), _short(c.noise, 3), _short(c.snr_db, 3), f"{c.new_hz:.4g}",
-                 f"{c.stuck_s:.3g}", f"{100 * c.at_ends:.1f} %", c.verdict)
+                (c.name, c.unit, _short(c.step), _short(c.noise, 3), _short(c.snr_db, 3), f"{figure(c.new_hz)}",
+                 f"{figure(c.stuck_s, 3)}", percent(c.at_ends), c.verdict)
                 for c in report.channels
             ],
         )  # fmt: skip
@@ -85,7 +89,13 @@ def show_lines(quality: DataQuality) -> None:
     rows = []
     for report in quality.reports:
         counts = [sum(f.severity == severity for f in report.findings) for severity in ("error", "warning", "note")]
-        figures = [f"{report.duration_s:,.1f}", f"{report.rate_hz:g}", len(report.channels), *counts, report.verdict]
+        figures = [
+            number(report.duration_s, 1),
+            figure(report.rate_hz),
+            len(report.channels),
+            *counts,
+            report.verdict,
+        ]
         rows.append([report.name, *figures])
     table("", ["log", "s", "Hz", "channels", "errors", "warnings", "notes", "verdict"], rows)
     out.print()
@@ -140,4 +150,4 @@ def verdict_text(quality: DataQuality) -> str:
 
 
 def _short(value: float | None, digits: int = 4) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
+    return "-" if value is None or not math.isfinite(value) else figure(value, digits)

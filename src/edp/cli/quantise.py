@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.wording import number, percent
 
 
 def quantise(
@@ -27,9 +28,9 @@ def quantise(
     result = make(run, folder, ticks)
 
     def show() -> None:
-        change = 100.0 * (result["integer"] / result["float"] - 1.0)
+        change = percent(result["integer"] / result["float"] - 1.0, signed=True)
         out.print(
-            f"error on the validation part: {change:+.2f} % against float32; constants {result['bytes']:,.0f} bytes"
+            f"error on the validation part: {change} against float32; constants {number(result['bytes'], 0)} bytes"
         )
         out.print(f"next: edp evaluate {folder}, edp export {folder} --to c --out firmware/predictor")
 

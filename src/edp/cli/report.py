@@ -8,10 +8,12 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.cli.options import check_effects
 from edp.storage.paths import full_path
 
 
 def report(
+    context: typer.Context,
     run: Annotated[Path, typer.Argument(help="Run folder of edp train or edp twin.")],
     output: Annotated[Path | None, typer.Option("--out", help="The page; default: report.html in the run.")] = None,
     title: Annotated[str | None, typer.Option(help="Title of the page.")] = None,
@@ -27,17 +29,14 @@ def report(
 
     Example: `edp report runs/first`
     """
-    from edp.errors import ConfigError
     from edp.report import build_report, build_twin_report, headline, holds_free_runs, read_facts
     from edp.report.run.facts import main_horizon
     from edp.report.run.outputs import judged_line
     from edp.report.run.predictability import limit_line
 
-    if holds_free_runs(run):
-        if limit is not None:
-            raise ConfigError(f"--limit: '{run}' holds a twin, which looks no fixed time ahead; leave it out")
-        if budget is not None:
-            raise ConfigError(f"--budget: '{run}' holds a twin, whose page has no footprint; use edp footprint")
+    is_twin = holds_free_runs(run)
+    check_effects(context, {"limit": not is_twin, "budget": not is_twin})
+    if is_twin:
         page = build_twin_report(run, output, title)
         emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {full_path(page)}"))
         return

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listing, out, progress, table
+from edp.cli.options import TRIAL_TABLES, check_effects
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
 from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import count_of
+from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -36,6 +38,7 @@ TOLD_SHARE = 0.005
 
 
 def screen(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Folder for page, pictures, feature sets and figures.")],
     targets: Annotated[str, typer.Option(help="Channels to predict: a,b. Default: the velocities.")] = "",
@@ -83,6 +86,7 @@ def screen(
     from edp.workflows.feature_selection.select import SelectionOrder
     from edp.workflows.feature_selection.trials import TrialSpec
 
+    check_effects(context, {f"changes.{table}": trials for table in TRIAL_TABLES})
     asked = {"targets": _names(targets) or None, "horizon": horizon}
     layers: list[Change] = [*changes, {"screen": {key: value for key, value in asked.items() if value is not None}}]
     spec, others = command_settings("screen", ScreeningSpec, config, layers, ("trials", *TRAINING_TABLES))
@@ -164,13 +168,13 @@ class ScreeningDisplay:
         gained, elapsed = share - first_share, now - began
         tail = left_text(elapsed / gained * (1.0 - share)) if gained >= TOLD_SHARE else ""
         self.shown.update(self.bars[what], completed=share, note=note)
-        self.steps.say(f"{what}: {note}, {100 * share:.0f} %{tail}")
+        self.steps.say(f"{what}: {note}, {percent(share)}{tail}")
 
 
 def show_selection(selection: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
     screening = selection.screening
-    rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in screening.proposal.choices if c.keep]
+    rows = [(c.channel, number(c.score, 2), c.reason) for c in screening.proposal.choices if c.keep]
     listing(
         f"keep: {len(rows)} of {count_of(len(screening.channels), 'channel')}",
         ["channel", "score", "why"],
@@ -188,7 +192,8 @@ def show_selection(selection: Selection) -> None:
     _show_lags(selection)
     window = screening.proposal.window
     out.print(
-        f"memory: W = {window} samples ({1e3 * window / screening.rate_hz:g} ms): {screening.proposal.window_reason}"
+        f"memory: W = {window} samples ({figure(1e3 * window / screening.rate_hz)} ms): "
+        f"{screening.proposal.window_reason}"
     )
     for note in (*screening.proposal.notes, *selection.notes):
         out.print(f"note: {note}")
@@ -214,8 +219,8 @@ def _show_trials(selection: Selection) -> None:
     if trials is None:
         return
     ahead = list(trials.persistence)
-    rows = [(t.name, len(t.channels), t.parameters, *(f"{t.error[h]:.3f}" for h in ahead)) for t in trials.trials]
-    rows.append(("persistence", "-", "-", *(f"{trials.persistence[h]:.3f}" for h in ahead)))
+    rows = [(t.name, len(t.channels), t.parameters, *(number(t.error[h], 3) for h in ahead)) for t in trials.trials]
+    rows.append(("persistence", "-", "-", *(number(trials.persistence[h], 3) for h in ahead)))
     headings = ["feature set", "channels", "parameters", *(f"MAE {h} ahead, {trials.unit}" for h in ahead)]
     out.print()
     table("held-out error of one network on each set", headings, rows)

@@ -11,8 +11,10 @@ import typer
 from typer.core import TyperGroup
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.options import check_effects
+from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
 from edp.errors import count_of
+from edp.wording import number
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -52,9 +54,8 @@ app = typer.Typer(
 
 @app.command(DEFAULT)
 def run(
-    data: Annotated[
-        Path, typer.Argument(help="A folder of logs, data-set file (.toml), or store; each log is a session.")
-    ],
+    context: typer.Context,
+    data: LogsArgument,
     study: Annotated[Path, typer.Option("--study", help="Folder of the study; an unfinished study continues.")],
     preset: Annotated[str, typer.Option(help="Extent of the search: quick, standard or thesis.")] = "quick",
     config: Annotated[
@@ -66,7 +67,11 @@ def run(
     ] = [],  # noqa: B006
     phase: Annotated[str | None, typer.Option(help="Last phase to run; default: all.")] = None,
     budget: Annotated[
-        Path | None, typer.Option(help="Limits of the controller (TOML) for phase 6; by default those of the thesis.")
+        Path | None,
+        typer.Option(
+            help="Limits of the controller (TOML) for phase 6, to which a study is bound from its first phase on; by "
+            "default those of the thesis."
+        ),
     ] = None,
     workers: Annotated[int, typer.Option(help="Parallel trainings; 0: one for each core.")] = 0,
     cluster: Annotated[str, typer.Option(help="Address of a Ray cluster for the trainings, or auto.")] = "",
@@ -85,6 +90,8 @@ def run(
 ) -> None:
     """Search for the network: from which features and backbone to which modules, each step tested.
 
+    Each log is a session; too few logs are divided into sessions.
+
     Stop it at any moment (Ctrl-C, or a power failure): the same command continues, and repeats no training.
 
     Example: `edp search logs/ --study studies/first --preset quick`
@@ -97,6 +104,7 @@ def run(
     # JSON quotes the path as TOML wants it.
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
+    check_effects(context, {"budget": plan.spec.compression.on})
     resources = Resources(
         workers=workers,
         threads=threads,
@@ -241,7 +249,7 @@ def _show(result: SearchResult, page: Path) -> None:
         return
     if result.networks:
         out.print(f"next: {_deploying(result)}")
-    data, word = result.source.path, "or" if result.networks else "next"
+    data, word = shell_words(result.source.paths), "or" if result.networks else "next"
     out.print(f"{word}: edp train {data} --config {result.teacher} --out runs/teacher (frozen sessions stay frozen)")
 
 
@@ -257,7 +265,9 @@ def _deploying(result: SearchResult) -> str:
 def _show_status(progress: dict[str, Any]) -> None:
     counts = progress["counts"]
     running = f"process {progress['holder']}" if progress["holder"] else "nobody now"
-    out.print(f"{progress['data']['path']}: {progress['data']['sessions']} sessions, {progress['data']['hours']:.2f} h")
+    out.print(
+        f"{progress['data']['path']}: {progress['data']['sessions']} sessions, {number(progress['data']['hours'], 2)} h"
+    )
     out.print(f"mode {progress['mode']}, {progress['state']}, coordinated by {running}; written {progress['updated']}")
     rows = [
         (

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, out, progress, table
+from edp.cli.options import check_effects
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import count_of
+from edp.wording import figure, number
 
 if TYPE_CHECKING:
     from edp.sim.data_set import Simulated, SimulationOrder
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 
 def simulate(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Folder for the logs; an unfinished data set continues.")],
     scenario: Annotated[
         Path | None,
@@ -86,6 +89,7 @@ def simulate(
     from edp.sim.faults import fault_text, parse_fault
     from edp.sim.scenario_file import limit_settings
 
+    check_effects(context, {"changes.limit": limit})
     order = SimulationOrder.of(
         scenario,
         _note,
@@ -114,7 +118,7 @@ def simulate(
     def show() -> None:
         if limit_facts is not None:
             limit_table(limit_facts)
-        out.print(f"{count_of(len(paths), 'recording')} of {what_simulated}, {order.minutes:g} min, in {folder}")
+        out.print(f"{count_of(len(paths), 'recording')} of {what_simulated}, {figure(order.minutes)} min, in {folder}")
         for text in facts.get("faults", ()):
             out.print(f"fault: {text}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
@@ -143,7 +147,7 @@ def run(
             done = counts["kept"] + counts["new"]
             # Recordings that were there before took no time, and say nothing about the others.
             left = elapsed / max(1, counts["new"]) * (order.recordings - done)
-            note = f"{counts['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
+            note = f"{number(counts['seconds'] / max(1e-9, elapsed), 0)} simulated s per s"
             shown.update(bar, advance=1, note=note)
             steps.say(f"simulate: recordings {count_text(round(done), order.recordings)}, {note}{left_text(left)}")
 
@@ -179,9 +183,19 @@ def limit_table(limit: dict[str, Any]) -> None:
     rows = []
     for n, samples in enumerate(limit["horizons"]):
         unknown, commands_known = limit["commands_unknown"], limit["commands_known"]
-        spread = f"{unknown['low'][n][-1]:.2f}-{unknown['high'][n][-1]:.2f}"
-        row = [f"{samples} ({1000 * samples / limit['rate_hz']:g} ms)", *(f"{v:.2f}" for v in unknown["mae"][n])]
-        rows.append([*row, spread, f"{commands_known['mae'][n][-1]:.2f}", f"{limit['persistence']['mae'][n][-1]:.2f}"])
+        spread = f"{number(unknown['low'][n][-1], 2)}-{number(unknown['high'][n][-1], 2)}"
+        row = [
+            f"{samples} ({figure(1000 * samples / limit['rate_hz'])} ms)",
+            *(number(v, 2) for v in unknown["mae"][n]),
+        ]
+        rows.append(
+            [
+                *row,
+                spread,
+                number(commands_known["mae"][n][-1], 2),
+                number(limit["persistence"]["mae"][n][-1], 2),
+            ]
+        )
     title = (
         f"Least mean absolute error of any predictor, {limit['unit']} "
         f"({limit['moments']} moments of {count_of(limit['recordings'], 'recording')}, {limit['branches']} futures "

@@ -8,6 +8,7 @@ from pathlib import Path
 from edp.cli.console import err
 from edp.sandbox import layers, sandbox
 from edp.storage.memory import readable
+from edp.wording import number
 
 # Each line takes twice as long: a slow log is told often at first, and never floods a terminal.
 _AGAIN = 2.0
@@ -27,7 +28,7 @@ class SlowLogs:
         if path != self.path or seconds < self.next_s / _AGAIN:
             self.path, self.next_s = path, 0.0
         if seconds >= self.next_s:
-            err.print(f"reading '{path.name}' ({seconds:.0f} s, {readable(size)})")
+            err.print(f"reading '{path.name}' ({number(seconds, 0)} s, {readable(size)})")
             self.next_s = _AGAIN * seconds
 
 

@@ -13,6 +13,7 @@ from edp.cli.inspect import FAULTY
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 from edp.errors import count_of
+from edp.wording import number
 
 if TYPE_CHECKING:
     from edp.logs.store import StoreIndex, StoreProgress
@@ -113,9 +114,9 @@ def _show(index: StoreIndex, folder: Path, as_json: bool) -> None:
     def show() -> None:
         rows = [
             ("recordings", f"{len(index.recordings):,}"),
-            ("hours", f"{index.hours():.2f}"),
+            ("hours", number(index.hours(), 2)),
             ("channels", f"{len(facts['channels'])}"),
-            ("size", f"{size / 1e6:,.1f} MB in {count_of(len(index.files), 'file')}"),
+            ("size", f"{number(size / 1e6, 1)} MB in {count_of(len(index.files), 'file')}"),
         ]
         table(f"store {folder}", ["", ""], rows)
         if index.refused:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
-from edp.cli.options import MOST_WORKERS
+from edp.cli.options import MOST_WORKERS, check_effects
 from edp.errors import ConfigError
+from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -31,6 +32,14 @@ LogsArgument = Annotated[
         help="Logs and folders of logs; or one data-set file (.toml), or one store.",
     ),
 ]
+DataOption = Annotated[
+    list[Path],
+    typer.Option(
+        "--data",
+        help="Other recordings: logs and folders of logs, a data-set file, or a store; may be repeated. Default: those "
+        "of the run.",
+    ),
+]
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
     list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
@@ -38,6 +47,7 @@ RepairOption = Annotated[
 
 
 def train(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
@@ -72,12 +82,11 @@ def train(
 
     source = source_of(data, signal_map, repair)
     preset = preset or usual_preset(config, changes)
+    check_effects(context, {"minutes": preset == AUTO, "workers": preset == AUTO})
     if preset == AUTO:
         own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
         _train_auto(source, folder, config, [*changes, *own], workers, as_json)
         return
-    if minutes is not None:
-        raise ConfigError(f"--minutes came with the preset '{preset}'; only the preset auto has a budget: leave it out")
     bundle, best = run(data, folder, config, preset, changes, source, as_json)
     facts = {
         "run": str(folder),
@@ -88,7 +97,7 @@ def train(
     }
 
     def show() -> None:
-        tail = "" if best is None else f", validation MAE {best:.4g} (report units)"
+        tail = "" if best is None else f", validation MAE {figure(best)} (report units)"
         out.print(f"trained in {duration(bundle.provenance['seconds'])}{tail}; bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
@@ -103,7 +112,7 @@ def _train_auto(
 
     settings = load_auto(config, changes)
     if not quiet:
-        limit = f"{settings.auto.minutes:g} min"
+        limit = f"{figure(settings.auto.minutes)} min"
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
     with progress(quiet) as shown:
         display = TrainingDisplay(shown, Steps(quiet))
@@ -127,9 +136,9 @@ def _promise_table(facts: dict[str, Any]) -> None:
     rows = []
     for name, one in facts["candidates"].items():
         mark = "*" if name == facts["chosen"] else ""
-        share = f"{100 * math.exp(facts['excess'][name] - facts['excess'][facts['chosen']]) - 100:+.1f} %"
+        share = percent(math.expm1(facts["excess"][name] - facts["excess"][facts["chosen"]]), signed=True)
         rows.append([f"{one['label']} {mark}".strip(), f"{one['parameters']:,}", duration(one["seconds"]), share])
-    title = f"error on left-out data against the model that is kept (*), within {facts['minutes']:g} min"
+    title = f"error on left-out data against the model that is kept (*), within {figure(facts['minutes'])} min"
     table(title, ["model", "parameters", "trained in", "error"], rows)
 
 
@@ -141,7 +150,11 @@ def _expected_table(facts: dict[str, Any]) -> None:
     horizon = max(promised, key=int)
     expected = [promised[horizon], interval["low"][horizon], interval["high"][horizon]]
     rows = [
-        [target, *(f"{values[target]:.4g}" for values in expected), f"{skill['promise'][horizon][target]:.2f}"]
+        [
+            target,
+            *(figure(values[target]) for values in expected),
+            number(skill["promise"][horizon][target], 2),
+        ]
         for target in list(promised[horizon])[:MOST_EXPECTED]
     ]
     beside = "persistence's" if skill["against"] == "persistence" else "the linear model's"
@@ -175,10 +188,14 @@ def shell_words(paths: Iterable[Path]) -> str:
     return shlex.join(str(path) for path in paths)
 
 
+def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource | None:
+    """Return a data source from command-line options; None if no path was given."""
+    return source_of(data, signal_map, repair) if data else None
+
+
 def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
     """A data source from command-line options."""
     from edp.config.experiment import build
-    from edp.errors import ConfigError
     from edp.logs.repair import Repair
     from edp.logs.source import DataSource
 
@@ -210,10 +227,10 @@ class TrainingDisplay:
         """Show one event."""
         if event.row is not None and event.row["best"]:
             self.best = event.row["validation_mae"]
-        score = "" if self.best is None else f", validation MAE {self.best:.4g}"
+        score = "" if self.best is None else f", validation MAE {figure(self.best)}"
         stage = "refit, " if event.refit else ""
         epoch = count_text(event.epoch, event.epochs, "/")
-        note = f"{self.model}{stage}epoch {epoch}, {event.targets_per_s:,.0f} targets/s{score}"
+        note = f"{self.model}{stage}epoch {epoch}, {number(event.targets_per_s, 0)} targets/s{score}"
         self.shown.update(self.bar, completed=event.share, note=note)
         self.steps.say(f"train: {note}{left_text(event.seconds_left)}", force=event.row is not None)
 

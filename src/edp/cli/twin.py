@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_text, out, progress, table
-from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, within
+from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, check_effects, within
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
 from edp.settings.bounds import MIN_MINUTES, above, span
 from edp.storage.paths import full_path, is_file_at
+from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 
 def twin(
+    context: typer.Context,
     data: LogsArgument,
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
@@ -54,12 +56,17 @@ def twin(
 
     Example: `edp twin data/m22 --out runs/twin`
     """
-    from edp.config.twin import load_twin_experiment, with_budget
+    from edp.config.twin import has_choice, load_twin_experiment, trains_several, with_budget
     from edp.evaluation.guard import twin_verdict
     from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
 
     experiment = load_twin_experiment(config, changes)
+    effects = {
+        "minutes": has_choice(experiment) and start is None,
+        "workers": trains_several(experiment) or start is not None,
+    }
+    check_effects(context, {name: effect and not experiment.ground for name, effect in effects.items()})
     if minutes is not None:
         experiment = with_budget(experiment, minutes)
     with progress(as_json) as shown:
@@ -150,7 +157,7 @@ def rollout(
             out.print(beyond_sentence(result.beyond), style="bold")
         error_table(result.scores)
         if result.coverage is not None and result.calibrated_s is not None:
-            promise = f"{result.coverage:.0%} up to {result.calibrated_s:g} s"
+            promise = f"{percent(result.coverage)} up to {figure(result.calibrated_s)} s"
             out.print(f"intervals in _twin_low and _twin_high are meant to hold {promise}")
         if file is not None:
             out.print(f"{result.recording.samples:,} ticks in {file}")
@@ -167,7 +174,7 @@ def candidate_table(candidates: list[dict[str, Any]]) -> None:
     rows = [
         [
             ("* " if row["chosen"] else "  ") + row["label"],
-            "-" if row["error"] is None else f"{row['error']:.3f}",
+            "-" if row["error"] is None else number(row["error"], 3),
             duration(row["seconds"]),
         ]
         for row in candidates
@@ -190,12 +197,12 @@ def score_table(models: dict[str, Any]) -> None:
     velocity, strokes = first["velocity_mae"], first["stroke_error"]
     rows = [[_with_unit("velocity", velocity), *(_number(one["velocity_mae"]["mean"]) for one in models.values())]]
     for k, row in enumerate(strokes):
-        name = _with_unit(f"stroke after {row['at_s']:g} s", row)
+        name = _with_unit(f"stroke after {figure(row['at_s'])} s", row)
         rows.append([name, *(_number(one["stroke_error"][k]["mean"]) for one in models.values())])
     rows.append(["pressure, deviations", *(_number(one["pressure_nrmse"]["mean"]) for one in models.values())])
-    rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in models.values())])
+    rows.append(["diverged runs", *(percent(one["diverged"]) for one in models.values())])
     out.print(
-        f"{count_of(first['runs'], 'free run')} of {first['seconds']:g} s on commands alone, mean over actuators "
+        f"{count_of(first['runs'], 'free run')} of {figure(first['seconds'])} s on commands alone, mean over actuators "
         "and runs:"
     )
     # A column a model: with a column a time it would be too wide for a terminal of 80.
@@ -206,7 +213,9 @@ def actuator_tables(models: dict[str, Any]) -> None:
     """Print a table an actuator: errors of its velocity and of its stroke by time, a row a model."""
     first = next(iter(models.values()))
     strokes = first["stroke_error"]
-    out.print(f"{count_of(first['runs'], 'free run')} of {first['seconds']:g} s on commands alone, mean over runs:")
+    out.print(
+        f"{count_of(first['runs'], 'free run')} of {figure(first['seconds'])} s on commands alone, mean over runs:"
+    )
     places = zip(first["velocity_mae"]["by_channel"], strokes[0]["by_channel"], strict=True)
     for velocity, stroke in places:
         unit, length = first["velocity_mae"]["units"][velocity], strokes[0].get("units", {}).get(stroke, "")
@@ -214,8 +223,8 @@ def actuator_tables(models: dict[str, Any]) -> None:
         rows = [[f"velocity, {unit}", *(_number(one["velocity_mae"]["by_channel"][velocity]) for one in every)]]
         for k, row in enumerate(strokes):
             errors = (one["stroke_error"][k]["by_channel"][stroke] for one in every)
-            rows.append([f"after {row['at_s']:g} s, {length}", *map(_number, errors)])
-        rows.append(["diverged runs", *(f"{one['diverged']:.1%}" for one in every)])
+            rows.append([f"after {figure(row['at_s'])} s, {length}", *map(_number, errors)])
+        rows.append(["diverged runs", *(percent(one["diverged"]) for one in every)])
         table(f"{velocity}: its MAE, and the error of {stroke} by time", ["", *models], rows)
     if first["pressure_nrmse"]["mean"] is not None:
         listed = ", ".join(f"{name} {_number(one['pressure_nrmse']['mean'])}" for name, one in models.items())
@@ -225,7 +234,7 @@ def actuator_tables(models: dict[str, Any]) -> None:
 def error_table(scores: dict[str, Any]) -> None:
     """Print the errors of one run: a row a time with the error of each stroke, then velocities and pressures."""
     strokes = scores["stroke_error"]
-    rows = [[f"{row['at_s']:g} s", *map(_number, row["by_channel"].values())] for row in strokes]
+    rows = [[f"{figure(row['at_s'])} s", *map(_number, row["by_channel"].values())] for row in strokes]
     unit = "" if strokes[0]["unit"] is None else f", {strokes[0]['unit']}"
     units = strokes[0].get("units", {})
     heads = [f"{name}, {units[name]}" if name in units else name for name in strokes[0]["by_channel"]]
@@ -247,8 +256,8 @@ def coverage_table(scores: dict[str, Any]) -> None:
     if intervals is None or not intervals["at"]:
         return
     parts = [part for part in ("velocities", "strokes", "pressures") if part in intervals["at"][0]]
-    rows = [[f"{row['at_s']:g} s", *(f"{row[part]['share']:.1%}" for part in parts)] for row in intervals["at"]]
-    table(f"share of free runs in intervals meant to hold {intervals['coverage']:.0%}", ["", *parts], rows)
+    rows = [[f"{figure(row['at_s'])} s", *(percent(row[part]["share"]) for part in parts)] for row in intervals["at"]]
+    table(f"share of free runs in intervals meant to hold {percent(intervals['coverage'])}", ["", *parts], rows)
 
 
 def situation_table(scores: dict[str, Any]) -> None:
@@ -256,7 +265,7 @@ def situation_table(scores: dict[str, Any]) -> None:
     rows = []
     for name, row in scores["situations"].items():
         strokes = row.get("stroke_error", {"mean": None})
-        cells = [f"{row['share']:.1%}", *map(_number, (row["velocity_mae"]["mean"], strokes["mean"]))]
+        cells = [percent(row["share"]), *map(_number, (row["velocity_mae"]["mean"], strokes["mean"]))]
         rows.append([name.replace("_", " "), *cells, _number(row["pressure_nrmse"]["mean"])])
     heads = ["", "share of the time", _with_unit("velocity", scores["velocity_mae"]), "stroke", "pressure (NRMSE)"]
     table("errors by what the actuators did", heads, rows)
@@ -269,14 +278,15 @@ def ahead_table(scores: dict[str, Any]) -> None:
         velocity = ahead["velocity_mae"]
         unit = "" if velocity["unit"] is None else f" {velocity['unit']}"
         out.print(
-            f"{ahead['seconds']:g} s ahead, told the commands: MAE of velocities {_number(velocity['mean'])}{unit}"
+            f"{figure(ahead['seconds'])} s ahead, told the commands: MAE of velocities "
+            f"{_number(velocity['mean'])}{unit}"
         )
     if beside is not None:
         rows = [
             [part, row["predictor"]["unit"] or "", _number(row["twin"]["mean"]), _number(row["predictor"]["mean"])]
             for part, row in beside["errors"].items()
         ]
-        title = f"MAE {beside['seconds']:g} s ahead at the same {beside['moments']:,} moments"
+        title = f"MAE {figure(beside['seconds'])} s ahead at the same {beside['moments']:,} moments"
         table(title, ["", "unit", "twin, told the commands", beside["label"]], rows)
         if beside["trained_on"]:
             out.print(f"the predictor was trained on {len(beside['trained_on'])} of these recordings: it is flattered")
@@ -288,7 +298,7 @@ def _with_unit(text: str, row: dict[str, Any]) -> str:
 
 def _number(value: float | None) -> str:
     # Mixed units have no mean; the JSON has each channel.
-    return "-" if value is None else f"{value:.3g}"
+    return "-" if value is None else figure(value, 3)
 
 
 class FitDisplay:
@@ -305,9 +315,9 @@ class FitDisplay:
 
     def on_event(self, event: FreeRunProgress) -> None:
         """How far it is."""
-        error = "" if event.validation is None else f", free-run error {event.validation:.3g} deviations"
+        error = "" if event.validation is None else f", free-run error {figure(event.validation, 3)} deviations"
         # A fit that goes on beyond its plan has no time left to state.
         left = "" if event.update >= event.updates else left_text(event.seconds_left)
-        note = f"update {count_text(event.update, event.updates, '/')}, runs of {event.length_s:g} s{error}"
+        note = f"update {count_text(event.update, event.updates, '/')}, runs of {figure(event.length_s)} s{error}"
         self.shown.update(self.bar, completed=event.update / max(1, event.updates), note=note)
         self.steps.say(f"{self.what}: {note}{left}")

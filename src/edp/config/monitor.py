@@ -13,6 +13,7 @@ from edp.monitor.detectors import DETECTORS
 from edp.monitor.fitting import ChainSpec
 from edp.monitor.residuals import RESIDUALS, ResidualSpec
 from edp.monitor.residuals.balances import BalancesSpec
+from edp.monitor.residuals.committees import CommitteeOptions
 from edp.monitor.residuals.flow_balances import FlowBalancesSpec
 from edp.monitor.residuals.look_ahead import LookAheadSpec
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
@@ -20,6 +21,11 @@ from edp.settings.bounds import MIN_MINUTES, MOST_NAMES, SEED, above, between, c
 from edp.settings.tree import SettingsTree, Table
 
 MONITOR_SETTINGS = SettingsTree({"residuals": RESIDUALS, "detector": DETECTORS}, what="settings")
+
+
+def trains_networks(experiment: MonitorExperiment) -> bool:
+    """Return whether settings have residuals that train networks, whose time `MonitorExperiment.minutes` bounds."""
+    return any(isinstance(part, CommitteeOptions) for part in experiment.residuals)
 
 
 def default_residuals() -> tuple[ResidualSpec, ...]:

@@ -58,6 +58,11 @@ class TwinExperiment:
             )
 
 
+def trains_several(experiment: TwinExperiment) -> bool:
+    """Return whether several models are trained: the candidates of a choice, or networks that are averaged."""
+    return has_choice(experiment) or getattr(experiment.twin, "members", 1) > 1
+
+
 def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str] = ()) -> TwinExperiment:
     """Settings from a TOML file, changed by ``key.path=value`` overrides, over the defaults of the specs.
 
@@ -68,17 +73,19 @@ def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str
 
 
 def with_budget(experiment: TwinExperiment, minutes: float) -> TwinExperiment:
-    """The settings with a bound on the counted processor time of a choice.
+    """Return the settings with a bound on the processor time of a choice; unchanged where nothing is chosen.
 
     Raises:
-        ConfigError: they name a formulation, or the bound is no number of minutes.
+        ConfigError: the bound is out of range.
     """
     if not isinstance(experiment.twin, AutoTwin):
-        raise ConfigError(
-            f"--minutes came with twin.kind = '{KINDS.name_of(experiment.twin)}'; only a choice among formulations has "
-            "a budget: leave it out, or twin.kind"
-        )
+        return experiment
     return replace(experiment, twin=replace(experiment.twin, minutes=minutes))
+
+
+def has_choice(experiment: TwinExperiment) -> bool:
+    """Return whether settings leave the formulation to a choice."""
+    return isinstance(experiment.twin, AutoTwin)
 
 
 def twin_toml(experiment: TwinExperiment) -> str:

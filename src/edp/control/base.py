@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -21,6 +21,7 @@ from edp.control.plant import interface_of as interface_of
 from edp.control.reference import TipReference
 from edp.errors import ConfigError, EdpError
 from edp.registry import Registry
+from edp.wording import figure
 
 Array = NDArray[np.float64]
 MOST_EVENTS = 1_000
@@ -154,7 +155,8 @@ class Controller(ABC):
         """
         if reference.rate_hz != self.plant.rate_hz:
             raise ConfigError(
-                f"the reference has {reference.rate_hz:g} Hz, {self.plant.source} {self.plant.rate_hz:g} Hz; give both "
+                f"the reference has {figure(reference.rate_hz)} Hz, {self.plant.source} {figure(self.plant.rate_hz)} "
+                "Hz; give both "
                 "the same rate"
             )
         measured = np.asarray(observation, float)[self._columns]
@@ -243,6 +245,17 @@ class ControllerSpec(Protocol):
             ConfigError: the plant or the models lack what it needs, or the limits contradict it.
         """
         ...
+
+
+def unused_models(needs: Sequence[str], available: Collection[str]) -> list[str]:
+    """Return the available models that a controller does not use.
+
+    Args:
+        needs: see `ControllerSpec`; of ``a or b`` the first that is available is used.
+        available: names of models.
+    """
+    used = {next((name for name in need.split(" or ") if name in available), "") for need in needs}
+    return sorted(set(available) - used)
 
 
 CONTROLLERS: Registry[type] = Registry("controller")

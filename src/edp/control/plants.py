@@ -15,6 +15,7 @@ from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
 from edp.training.twin_bundle import STROKES, TwinBundle, load_twin
+from edp.wording import figure, setting_text
 
 FMU = ".fmu"
 SAME_STROKE = 0.01
@@ -92,5 +93,7 @@ def of_rate(twin: Twin, what: str, rate_hz: float) -> Twin:
     """
     own = twin.channels.rate_hz
     if own != rate_hz:
-        raise ConfigError(f"{what} has {own:g} Hz, the loops {rate_hz:g} Hz; set rate_hz = {own:g}")
+        raise ConfigError(
+            f"{what} has {figure(own)} Hz, the loops {figure(rate_hz)} Hz; set rate_hz = {setting_text(own)}"
+        )
     return twin

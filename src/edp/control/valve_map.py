@@ -17,6 +17,7 @@ from edp.control.limits import LoopLimits
 from edp.control.plant import VELOCITIES, PlantInterface
 from edp.control.reference import TipReference
 from edp.errors import ConfigError
+from edp.wording import setting_text
 
 Array = NDArray[np.float64]
 LEVELS = (*np.arange(0.06, 0.32, 0.02).round(2).tolist(), 0.36, 0.42, 0.5, 0.6, 0.75, 1.0)
@@ -80,7 +81,8 @@ def check_levers(valves: ValveMap, reference: TipReference, limits: LoopLimits) 
             # At full levers the reference was held to the cylinder's top speed when it was drawn.
             if abs(ends[axis]) < 1.0 and asked > max(MOVES_M_S, fastest / NEARLY):
                 raise ConfigError(
-                    f"limits: {name} = {ends[axis]:g} of the {cylinder} gives {fastest:.3f} m/s, its reference asks "
+                    f"limits: {name} = {setting_text(ends[axis])} of the {cylinder} gives {fastest:.3f} m/s, its "
+                    "reference asks "
                     f"for {asked:.3f}; allow more, or choose a slower task (task.speed_m_s)"
                 )
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from edp.data.splits import ByBlocks, ByRecording, ByTime, Stretch
 from edp.errors import DataError
 from edp.recording import Recording
+from edp.wording import figure
 
 LEAST_OF_SHARE = 0.25
 """Of what the share of a part stands for: of 300 s and 4 s a draw of whole recordings let the 4 s train."""
@@ -161,7 +162,8 @@ def blocks_where_time_is_uneven(
         return None
     ticks = "1 tick" if span == 1 else f"{span} ticks"
     return blocks, (
-        f"the end, which would test, moves unlike the rest (changes of {name} in {ticks} are {ratio:.2g} times as "
+        f"the end, which would test, moves unlike the rest (changes of {name} in {ticks} are {figure(ratio, 2)} times "
+        "as "
         "large)"
     )
 

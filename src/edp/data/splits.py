@@ -16,6 +16,7 @@ from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
 from edp.registry import Registry
 from edp.settings.bounds import MOST_NAMES, SEED, above, below, check_bounds, integer, shown, span
+from edp.wording import figure, setting_text
 
 PARTS = ("train", "validation", "test")
 PART = below(0.0, 1.0)
@@ -218,7 +219,8 @@ class ByBlocks:
             size = round(self.block_s * recording.rate_hz)
             if size <= 2 * gap:
                 raise ConfigError(
-                    f"split: block_s = {self.block_s:g} gives blocks of {size} samples, no more than a gap of {gap} "
+                    f"split: block_s = {setting_text(self.block_s)} gives blocks of {size} samples, no more than a "
+                    f"gap of {gap} "
                     "(window plus horizon) at each end; use longer blocks"
                 )
             starts = list(range(0, max(1, recording.samples - size // 2), size))
@@ -323,7 +325,7 @@ class ByMachine:
         if not matching:
             known_masses = [float(mass) for mass in masses.values() if mass is not None]
             span = (
-                f"they go from {min(known_masses):g} to {max(known_masses):g} t"
+                f"they go from {figure(min(known_masses))} to {figure(max(known_masses))} t"
                 if known_masses
                 else "no recording says its mass"
             )

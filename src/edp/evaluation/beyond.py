@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.wording import figure
 
 MARGIN = 0.02
 """Share of a command's range by which it may leave that range: noise of its sensor."""
@@ -75,8 +76,9 @@ def beyond_sentence(beyond: Mapping[str, Mapping[str, float]]) -> str:
     if not beyond:
         return ""
     listed = ", ".join(
-        f"{name} ({row['share']:.2g} of the ticks, {row['least']:.3g} to {row['largest']:.3g}; learned from "
-        f"{row['low']:.3g} to {row['high']:.3g})"
+        f"{name} ({figure(row['share'], 2)} of the ticks, {figure(row['least'], 3)} to {figure(row['largest'], 3)}; "
+        "learned from "
+        f"{figure(row['low'], 3)} to {figure(row['high'], 3)})"
         for name, row in sorted(beyond.items(), key=lambda pair: -pair[1]["share"])
     )
     return f"commands beyond all that taught the twin: {listed}; intervals promise nothing there"

@@ -14,6 +14,7 @@ from edp.errors import ConfigError, DataError
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
+from edp.wording import figure
 
 # From shorter than a move of the operator to longer than any memory found (docs/findings.md, carried for a minute).
 CONTEXTS_S = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
@@ -99,8 +100,9 @@ def context_errors(
     measurable = [s for s in asked_seconds if round(s * rate) <= longest]
     if not measurable:
         raise DataError(
-            f"the longest recording allows a context of {max(0, longest) / rate:g} s before a block of {BLOCK_S:g} s; "
-            f"the shortest that was asked for is {asked_seconds[0]:g} s: give longer recordings"
+            f"the longest recording allows a context of {figure(max(0, longest) / rate)} s before a block of "
+            f"{figure(BLOCK_S)} s; "
+            f"the shortest that was asked for is {figure(asked_seconds[0])} s: give longer recordings"
         )
     first = max(1, round(measurable[-1] * rate))
     # All contexts share their blocks: the longest one decides where the first block may be.

@@ -90,7 +90,7 @@ class Budget:
         ConfigError: an unknown core, or a limit below 1.
     """
 
-    name: str = "thesis 3.5.2: 180 MHz, 4 ms of a 10 ms task"
+    name: str = "default controller: 180 MHz, 4 ms of a 10 ms task"
     core: str = "cortex_m4f"
     cycles: int = 720_000
     parameter_bytes: int = 100_000

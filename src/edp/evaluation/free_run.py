@@ -16,6 +16,7 @@ from edp.errors import DataError
 from edp.evaluation.free_run_parts import by_channel, by_horizon, by_name, nrmse_by_channel, situations
 from edp.networks.twin import FreeRunIntervals, Twin, TwinScales, calibrate, even_starts, starts_within
 from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
+from edp.wording import figure
 
 Array = NDArray[np.float32]
 MOST_SECONDS = 86_400.0
@@ -191,7 +192,8 @@ def _run_ticks(channels: TwinChannels, prefix: int, series: Sequence[Series], se
     ticks = min(round(seconds * rate), longest - prefix - 1)
     if ticks < 1:
         raise DataError(
-            f"the longest recording has {longest} ticks ({longest / rate:g} s); the twin needs {prefix} measured ones "
+            f"the longest recording has {longest} ticks ({figure(longest / rate)} s); the twin needs {prefix} "
+            "measured ones "
             "and two more to be judged: give longer recordings"
         )
     return prefix + ticks + 1
@@ -263,8 +265,8 @@ def free_run_scores(
         "seconds": runs.truth.shape[1] / channels.rate_hz,
         **_errors(runs, spec.at_s),
         "by_horizon": by_horizon(channels, runs.answers - runs.truth, runs.stroke_errors),
-        "by_recording": by_name(runs.names, lambda of: _summary(runs.only(of))),
-        "by_driving": by_name(driving.tolist(), lambda of: _summary(runs.only(of))) if driving.all() else {},
+        "by_recording": by_name(runs.names, lambda of: _summary(runs.only(of), spec.at_s)),
+        "by_driving": by_name(driving.tolist(), lambda of: _summary(runs.only(of), spec.at_s)) if driving.all() else {},
         "situations": situations(channels, runs.answers, runs.truth, runs.low, runs.high),
     }
     return scores if intervals is None else scores | {"intervals": coverage_of(runs, spec, intervals)}
@@ -305,9 +307,10 @@ def _errors(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def _summary(runs: FreeRuns) -> dict[str, Any]:
-    """The errors over whole runs, and those of the strokes at their end."""
-    return {"runs": len(runs.names), **_errors(runs, (runs.truth.shape[1] / runs.channels.rate_hz,))}
+def _summary(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
+    """Return the errors over whole runs, those of the strokes at some times within them, and at their end."""
+    end = runs.truth.shape[1] / runs.channels.rate_hz
+    return {"runs": len(runs.names), **_errors(runs, (*(at for at in at_s if at < end), end))}
 
 
 def _ticks(runs: FreeRuns, at_s: Sequence[float]) -> list[tuple[float, int]]:

@@ -6,19 +6,24 @@ was made from):
 * *worse*: the reference has less error; the exit code is `BEATEN`;
 * *better*: the model has less error, and the 95 % interval over recordings excludes zero;
 * *not distinguishable*: the model has less error, but the interval holds zero, or the recordings are too few for one.
+
+Recordings are the independent units of every comparison; stretches of one recording count as one. The gains of a
+controller are compared on references, each with a seed of its own, which take the place of recordings.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
+from edp.errors import count_of
 from edp.stats.resampled import paired_t
+from edp.wording import figure, percent, percent_interval
 
 NETWORK = "network"
 TWIN = "twin"
@@ -39,7 +44,7 @@ LEAST = 1e-3
 BEATEN = 6
 """Exit code of the outcome *worse*."""
 FEWEST = 3
-"""Recordings from which an interval is stated."""
+"""Recordings (or references) from which an interval is stated."""
 
 
 class ErrorOutcome(StrEnum):
@@ -59,7 +64,8 @@ def outcome_of(change: float, high: float | None) -> ErrorOutcome:
     """
     if change > LEAST:
         return ErrorOutcome.WORSE
-    return ErrorOutcome.BETTER if high is not None and high < 0.0 else ErrorOutcome.OPEN
+    better = change < -LEAST and high is not None and high < 0.0
+    return ErrorOutcome.BETTER if better else ErrorOutcome.OPEN
 
 
 @dataclass(frozen=True)
@@ -74,8 +80,9 @@ class ErrorVerdict:
         judged: what is judged.
         advice: what to do where it is worse.
         interval: 95 % interval, over recordings, of the relative change of the model's error; None for too few.
-        recordings: number of recordings that were compared.
+        recordings: number of recordings, or other units, that were compared.
         ground: on what both were compared, in the plural.
+        unit: what the interval is over, in the singular.
     """
 
     label: str
@@ -86,6 +93,7 @@ class ErrorVerdict:
     interval: tuple[float, float] | None = None
     recordings: int = 0
     ground: str = "held-out recordings"
+    unit: str = "recording"
 
     @property
     def change(self) -> float:
@@ -107,21 +115,18 @@ class ErrorVerdict:
         if self.outcome is ErrorOutcome.WORSE:
             where = f" (on {', '.join(self.outputs)})" if self.outputs else ""
             return (
-                f"On the {self.ground} {self.label} has {100 * self.less:.1f} % less error than the "
+                f"On the {self.ground} {self.label} has {percent(self.less)} less error than the "
                 f"{self.judged}{where}: do not use this {self.judged}; {self.advice}."
             )
-        gain = f"{max(0.0, -100 * self.change):.1f} % less error"
+        gain = f"{percent(max(0.0, -self.change))} less error"
         who, other = f"On the {self.ground} the {self.judged}", f"{self.label}, the best of the others"
         if self.interval is None:
             count = self.recordings
-            why = (
-                f"{count} recording{'s are' if count > 1 else ' is'} too few for an interval"
-                if count
-                else "no interval"
-            )
+            few = f"{count_of(count, self.unit)} {'are' if count > 1 else 'is'} too few for an interval"
+            why = few if count else "no interval"
             return f"{who} has {gain} than {other} ({why}: chance is not excluded)."
-        low, high = (f"{100 * end:+.1f}" for end in self.interval)
-        reach = f"95 % interval of the change over {self.recordings} recordings: {low} to {high} %"
+        units = count_of(self.recordings, self.unit)
+        reach = f"95 % interval of the change over {units}: {percent_interval(*self.interval)}"
         if self.outcome is ErrorOutcome.BETTER:
             return f"{who} has {gain} than {other} ({reach})."
         return f"{who} is not distinguishable from {other}: {gain} ({reach})."
@@ -145,7 +150,59 @@ BEFORE_TUNING = ErrorVerdict(
     "tuned controller",
     "keep the gains as they were, or give more --trials and --loops",
     ground="references that tuned nothing",
+    unit="reference",
 )
+
+
+@dataclass(frozen=True)
+class ErrorRatios:
+    """Logarithms of the error of what is judged over that of one reference.
+
+    Attributes:
+        label: how tables call the reference.
+        by_output: over all recordings, of each output: a value for each horizon or time that both have.
+        by_recording: mean over outputs and times of each recording; see `by_recording`.
+    """
+
+    label: str
+    by_output: Mapping[str, Sequence[float]]
+    by_recording: Mapping[str, float]
+
+
+def by_recording(logs: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Return the mean of each recording from the logarithms of its stretches.
+
+    Args:
+        logs: by recording, or by stretch of one, such as ``name[100:200]``; stretches share the day, the driver and
+            the oil, so that they are one unit.
+    """
+    pooled: dict[str, list[float]] = {}
+    for name, values in logs.items():
+        finite = [value for value in values if math.isfinite(value)]
+        if finite:
+            pooled.setdefault(name.partition("[")[0], []).append(sum(finite) / len(finite))
+    return {name: sum(values) / len(values) for name, values in pooled.items()}
+
+
+def best_verdict(ratios: Iterable[ErrorRatios], template: ErrorVerdict) -> ErrorVerdict | None:
+    """Return the verdict against the reference with the least error; None without a reference.
+
+    Args:
+        ratios: of each reference.
+        template: what is judged, the advice and the ground.
+    """
+    worst: tuple[float, ErrorVerdict] | None = None
+    for one in ratios:
+        values = [value for logs in one.by_output.values() for value in logs]
+        if values:
+            # Logarithms: halving one output's error and doubling another's cancel out.
+            mean, logs = sum(values) / len(values), list(one.by_recording.values())
+            lost = tuple(name for name, of in one.by_output.items() if of and sum(of) > LEAST * len(of))
+            if worst is None or mean > worst[0]:
+                interval, less = _interval(logs, mean), 1.0 - math.exp(-mean)
+                verdict = replace(template, label=one.label, less=less, outputs=lost, interval=interval)
+                worst = mean, replace(verdict, recordings=len(logs))
+    return None if worst is None else worst[1]
 
 
 def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> ErrorVerdict | None:
@@ -162,25 +219,17 @@ def network_verdict(scores: Mapping[str, Any], minutes: float | None = None) -> 
     if NETWORK not in models:
         return None
     unit = "minute" if minutes == 1 else "minutes"
-    advice = ADVICE if minutes is None else f"give it more than {minutes:g} {unit} (--minutes), or more recordings"
-    better = []
+    advice = (
+        ADVICE if minutes is None else f"give it more than {figure(minutes)} {unit} (--minutes), or more recordings"
+    )
+    horizons, targets = scores["task"]["horizons"], [target["name"] for target in scores["targets"]]
+    ratios = []
     for name, model in models.items():
-        if name == NETWORK:
-            continue
-        by_target = {
-            target["name"]: _logarithm(models[NETWORK], model, target["name"], scores["task"]["horizons"])
-            for target in scores["targets"]
-        }
-        finite = [value for value in by_target.values() if math.isfinite(value)]
-        if finite:
-            mean = sum(finite) / len(finite)
-            lost = tuple(target for target, value in by_target.items() if value > LEAST)
-            logs = _by_recording(models[NETWORK], model, scores)
-            interval = _interval(logs, mean)
-            label, less = str(model["label"]), 1.0 - math.exp(-mean)
-            better.append((mean, ErrorVerdict(label, less, lost, NETWORK, advice, interval, len(logs))))
-    # Logarithms: halving one target's error and doubling another's cancel out.
-    return max(better, key=lambda entry: entry[0], default=(0.0, None))[1]
+        if name != NETWORK:
+            by_target = {target: _logarithm(models[NETWORK], model, target, horizons) for target in targets}
+            finite = {target: [value] for target, value in by_target.items() if math.isfinite(value)}
+            ratios.append(ErrorRatios(str(model["label"]), finite, _by_recording(models[NETWORK], model, scores)))
+    return best_verdict(ratios, ErrorVerdict("", 0.0, (), NETWORK, advice))
 
 
 def beaten_by(scores: Mapping[str, Any], minutes: float | None = None) -> ErrorVerdict | None:
@@ -192,22 +241,19 @@ def _if_worse(verdict: ErrorVerdict | None) -> ErrorVerdict | None:
     return verdict if verdict is not None and verdict.outcome is ErrorOutcome.WORSE else None
 
 
-def _by_recording(network: Mapping[str, Any], model: Mapping[str, Any], scores: Mapping[str, Any]) -> list[float]:
-    """Logarithms of the ratio of errors, one per recording that both have."""
+def _by_recording(network: Mapping[str, Any], model: Mapping[str, Any], scores: Mapping[str, Any]) -> dict[str, float]:
+    """Logarithms of the ratio of errors of the recordings that both have."""
     ours, theirs = network.get("recordings", {}), model.get("recordings", {})
-    logs = []
+    logs = {}
     for name in ours:
         pair = ({"overall": ours[name]}, {"overall": theirs.get(name, {})})
-        values = [_logarithm(*pair, target["name"], scores["task"]["horizons"]) for target in scores["targets"]]
-        finite = [value for value in values if math.isfinite(value)]
-        if finite:
-            logs.append(sum(finite) / len(finite))
-    return logs
+        logs[name] = [_logarithm(*pair, target["name"], scores["task"]["horizons"]) for target in scores["targets"]]
+    return by_recording(logs)
 
 
 def _interval(logs: list[float], mean: float) -> tuple[float, float] | None:
     """95 % interval of the relative change over recordings, the pooled change included; None for too few."""
-    if len(logs) < FEWEST or len(set(logs)) < 2:
+    if len(logs) < FEWEST:
         return None
     ends = paired_t(np.array(logs)).interval()
     # Long recordings count for more in the pooled error than in the mean over recordings: the wider statement holds.
@@ -282,20 +328,33 @@ def machine_verdict(models: Mapping[str, Any]) -> ErrorVerdict | None:
 
 
 def _verdict_on_free_runs(models: Mapping[str, Any], judged: str, what: str, advice: str) -> ErrorVerdict | None:
-    own, better = _free_run_errors(models[judged]), []
-    for name, scores in models.items():
-        theirs = _free_run_errors(scores)
-        by_actuator = {
-            actuator: [math.log(a / b) for a, b in zip(errors, theirs[actuator], strict=True) if a > 0 and b > 0]
-            for actuator, errors in own.items()
-            if name != judged
-        }
-        ratios = [ratio for actuator in by_actuator.values() for ratio in actuator]
-        if ratios:
-            lost = tuple(name for name, logs in by_actuator.items() if sum(logs) > LEAST * len(logs))
-            mean = sum(ratios) / len(ratios)
-            better.append((mean, ErrorVerdict(name, 1.0 - math.exp(-mean), lost, what, advice)))
-    return max(better, key=lambda entry: entry[0], default=(0.0, None))[1]
+    own = models[judged]
+    ratios = [
+        ErrorRatios(name, _free_run_logs(own, scores), by_recording(_free_run_logs_by_recording(own, scores)))
+        for name, scores in models.items()
+        if name != judged
+    ]
+    return best_verdict(ratios, ErrorVerdict("", 0.0, (), what, advice))
+
+
+def _free_run_logs(own: Mapping[str, Any], scores: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Logarithms of the ratio of errors of each actuator, at the times that both have; without errors of zero."""
+    ours, theirs = _free_run_errors(own), _free_run_errors(scores)
+    return {
+        actuator: [math.log(errors[at] / theirs[actuator][at]) for at in errors
+                   if errors[at] > 0 < theirs[actuator].get(at, 0.0)]
+        for actuator, errors in ours.items()
+    }  # fmt: skip
+
+
+def _free_run_logs_by_recording(own: Mapping[str, Any], scores: Mapping[str, Any]) -> dict[str, list[float]]:
+    """The same of each recording, over all actuators."""
+    theirs = scores.get("by_recording", {})
+    return {
+        name: [value for logs in _free_run_logs(summary, theirs[name]).values() for value in logs]
+        for name, summary in own.get("by_recording", {}).items()
+        if name in theirs
+    }
 
 
 def adaptation_verdict(facts: Mapping[str, Any]) -> ErrorVerdict:
@@ -307,26 +366,31 @@ def adaptation_verdict(facts: Mapping[str, Any]) -> ErrorVerdict:
     return change_verdict(facts["change"], facts["change_by_recording"], UNADAPTED)
 
 
-def tuning_verdict(judged: Mapping[str, float]) -> ErrorVerdict:
+def tuning_verdict(judged: Mapping[str, Any]) -> ErrorVerdict:
     """Return the verdict on tuned gains against the gains before, on the plant.
 
     Args:
-        judged: position errors of the tip, ``before`` and ``after``.
+        judged: position errors of the tip, ``before`` and ``after``, and both of each reference in ``by_reference``.
     """
-    change = judged["after"] / judged["before"] - 1.0 if judged["before"] > 0 < judged["after"] else 0.0
-    return change_verdict(change, {}, BEFORE_TUNING)
+    by_reference = {name: _relative_change(pair) for name, pair in judged.get("by_reference", {}).items()}
+    return change_verdict(_relative_change(judged), by_reference, BEFORE_TUNING)
 
 
-def change_verdict(change: float, by_recording: Mapping[str, float], reference: ErrorVerdict) -> ErrorVerdict:
+def _relative_change(judged: Mapping[str, Any]) -> float:
+    before, after = float(judged["before"]), float(judged["after"])
+    return after / before - 1.0 if before > 0 < after else 0.0
+
+
+def change_verdict(change: float, by_unit: Mapping[str, float], reference: ErrorVerdict) -> ErrorVerdict:
     """Return the verdict on something made from its reference, whose errors are known relative to that reference.
 
     Args:
         change: error over that of the reference, less one, over all recordings.
-        by_recording: the same of each recording.
+        by_unit: the same of each recording, or of each reference of a controller.
         reference: a verdict with the label of the reference, what is judged, the advice and the ground.
     """
     mean = math.log1p(change)
-    logs = [math.log1p(one) for one in by_recording.values()]
+    logs = [math.log1p(one) for one in by_unit.values()]
     return replace(reference, less=1.0 - math.exp(-mean), interval=_interval(logs, mean), recordings=len(logs))
 
 
@@ -340,16 +404,19 @@ def free_run_error(scores: Mapping[str, Any], reference: Mapping[str, Any]) -> f
     Returns:
         The geometric mean, over actuators, of the ratios of velocity errors and of stroke errors at each time.
     """
-    pairs = zip(_free_run_errors(scores).values(), _free_run_errors(reference).values(), strict=True)
-    ratios = [math.log(a / b) for ours, theirs in pairs for a, b in zip(ours, theirs, strict=True) if a > 0 and b > 0]
+    ratios = [value for logs in _free_run_logs(scores, reference).values() for value in logs]
     return math.exp(sum(ratios) / len(ratios)) if ratios else 1.0
 
 
-def _free_run_errors(scores: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Of each actuator the error of its velocity, then of its stroke at each time."""
-    rows = [scores["velocity_mae"], *scores["stroke_error"]]
-    columns = zip(*(row["by_channel"].values() for row in rows), strict=True)
-    return dict(zip(scores["velocity_mae"]["by_channel"], map(list, columns), strict=True))
+def _free_run_errors(scores: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+    """Of each actuator the error of its velocity (time 0), and of its stroke by time."""
+    rows = [(0.0, scores["velocity_mae"]), *((row["at_s"], row) for row in scores["stroke_error"])]
+    columns = zip(*(row["by_channel"].values() for _, row in rows), strict=True)
+    times = [at for at, _ in rows]
+    return {
+        actuator: dict(zip(times, column, strict=True))
+        for actuator, column in zip(scores["velocity_mae"]["by_channel"], columns, strict=True)
+    }
 
 
 def _logarithm(network: Mapping[str, Any], model: Mapping[str, Any], target: str, horizons: list[int]) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from edp.errors import ConfigError
 from edp.logs.quality.checks import Finding
 from edp.recording import STRETCH_S, Recording, spread_recordings
+from edp.wording import figure, setting_text
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,10 @@ class Drawn:
     @property
     def what(self) -> str:
         """The same in words."""
-        return f"{self.hours:.3g} of {self.of_hours:,.4g} h: {self.stretches:,} evenly spread stretch(es) of them"
+        return (
+            f"{figure(self.hours, 3)} of {figure(self.of_hours)} h: {self.stretches:,} evenly spread stretch(es) of "
+            "them"
+        )
 
 
 def checked_hours(hours: float) -> float:
@@ -37,7 +41,7 @@ def checked_hours(hours: float) -> float:
         ConfigError: not a positive, finite number.
     """
     if not 0.0 < hours < float("inf"):
-        raise ConfigError(f"--at-most {hours:g}: a positive number of hours must hold")
+        raise ConfigError(f"--at-most {setting_text(hours)}: a positive number of hours must hold")
     return hours
 
 

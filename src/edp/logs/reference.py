@@ -18,6 +18,7 @@ from edp.signals import (
     Channel,
     Kind,
 )
+from edp.wording import figure
 
 _MEANING: Mapping[Kind, str] = {
     Kind.VELOCITY: "of a cylinder or another axis that moves straight",
@@ -100,14 +101,14 @@ def _words(names: Iterable[str]) -> str:
 def _kinds() -> Iterable[list[str]]:
     for kind, facts in KINDS.items():
         low, high = facts.plausible
-        limits = "any" if kind is Kind.GENERIC else f"{low:g} to {high:g}"
+        limits = "any" if kind is Kind.GENERIC else f"{figure(low)} to {figure(high)}"
         yield [f"`{kind}`", f"`{facts.si_unit}`", f"`{facts.report_unit}`", limits, _MEANING[kind]]
 
 
 def _units() -> Iterable[list[str]]:
     for name, unit in UNITS.items():
         spelt = [alias for alias, usual in ALIASES.items() if usual == name]
-        offset = f"{unit.offset:g}" if unit.offset else ""
+        offset = figure(unit.offset) if unit.offset else ""
         yield [f"`{name}`", _words(unit.kinds), f"{unit.factor:.10g}", offset, _words(spelt)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,10 +26,12 @@ from edp.logs.store.building import StoredLog, StoreProgress, build_store
 from edp.logs.store.index import StoreIndex, is_store, read_index
 from edp.logs.store.opening import read_store
 from edp.logs.store.remote import is_remote_store, local_store
+from edp.logs.units import with_kinds, without_derived_kinds
 from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
 from edp.storage.paths import full_path, is_file_at
+from edp.wording import figure, setting_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +62,10 @@ class DataSetSettings:
     recordings: tuple[RecordingEntry, ...] = ()
     map: str | SignalMap | None = None
     repair: Repair = field(default_factory=Repair)
+
+
+_LONGEST_STEM = 120
+"""Characters of a log's name in the name of a folder; file systems allow 255 bytes."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +102,18 @@ class DataSource:
 
     @staticmethod
     def of(
-        path: str | Path | Sequence[Path], map_file: str | Path | None = None, repair: Repair | None = None
+        path: str | Path | Sequence[str | Path], map_file: str | Path | None = None, repair: Repair | None = None
     ) -> DataSource:
-        """Return a source from one path or several."""
-        first, *more = [Path(path)] if isinstance(path, str | Path) else path
+        """Return a source from one path or several.
+
+        Raises:
+            ConfigError: there is no path, or paths that cannot be read together.
+        """
+        paths = [Path(entry) for entry in ([path] if isinstance(path, str | Path) else path)]
+        if not paths:
+            raise ConfigError("logs: got an empty list of paths, expected at least one; give a log or a folder of logs")
         signal_map = None if map_file is None else load_signal_map(map_file)
-        return DataSource(first, signal_map, repair, more=tuple(more))
+        return DataSource(paths[0], signal_map, repair, more=tuple(paths[1:]))
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -111,6 +124,18 @@ class DataSource:
     def label(self) -> str:
         """Description of the source for results and messages."""
         return str(self.path) if not self.more else f"{self.path} and {len(self.more)} more"
+
+    @property
+    def short_name(self) -> str:
+        """Name for titles and folders: the stem of the path; of several paths with their number and a hash of all."""
+        stem = self.path.stem if self.address else full_path(self.path).stem
+        stem = stem[:_LONGEST_STEM]
+        if not self.more:
+            return stem
+        # A set: the order of the paths names no other logs.
+        every = "\0".join(sorted({str(full_path(path)) for path in self.paths}))
+        digest = hashlib.blake2b(every.encode(errors="surrogateescape"), digest_size=4).hexdigest()
+        return f"{stem}_and_{len(self.more)}_more_{digest}"
 
     @property
     def stored(self) -> bool:
@@ -130,7 +155,8 @@ class DataSource:
         """What provenance keeps, to read the same data again."""
         plain: dict[str, Any] = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
-            plain["map"] = plain_tree(self.signal_map)
+            # Kinds that units tell are written out: an entry without one was read by an earlier version.
+            plain["map"] = plain_tree(with_kinds(self.signal_map))
         if self.repair is not None:
             plain["repair"] = plain_tree(self.repair)
         if self.at_most_h is not None:
@@ -142,7 +168,7 @@ class DataSource:
     @staticmethod
     def from_plain(plain: dict[str, Any]) -> DataSource:
         """The source that `to_plain` described."""
-        signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
+        signal_map = without_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
         more = tuple(Path(path) for path in plain.get("more", ()))
         return DataSource(Path(plain["path"]), signal_map, repair, plain.get("at_most_h"), more)
@@ -259,8 +285,9 @@ class DataSource:
             )
         if self.at_most_h is not None:
             raise ConfigError(
-                f"--at-most {self.at_most_h:g} came with '{self.path}', which is no store; read the logs once with "
-                "`edp store build LOGS --out STORE`, and give this command the store"
+                f"--at-most {setting_text(self.at_most_h)} came with '{self.path}', which is no store; read the logs "
+                "once "
+                "with `edp store build LOGS --out STORE`, and give this command the store"
             )
 
     def check_store_options(self) -> None:
@@ -376,7 +403,7 @@ def _check_listed(recordings: list[Recording], path: Path) -> None:
     rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
     # A thousandth, as `edp.logs.read.RATE_TOLERANCE`.
     if max(rates) > 1.001 * min(rates):
-        shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
+        shown = ", ".join(f"{name} {figure(rate)} Hz" for rate, name in rates.items())
         raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
 
 

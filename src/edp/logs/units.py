@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+from dataclasses import replace
 
 from edp.errors import ConfigError, DataError
 from edp.settings.bounds import shown
-from edp.signals import TIME_UNITS, UNITS, Kind, Unit, conversion
+from edp.signals import TIME_UNITS, UNITS, VOCABULARY, Channel, ChannelMap, Kind, SignalMap, Unit, conversion
 
 ALIASES = {
     "m/s²": "m/s^2",
@@ -112,6 +113,37 @@ def kind_of_unit(stated: str | None) -> Kind:
     """The first kind that a unit measures; generic where it says nothing."""
     unit = UNITS.get(normalise_unit(stated) or "1")
     return Kind.GENERIC if unit is None or Kind.GENERIC in unit.kinds else unit.kinds[0]
+
+
+def mapped_channel(entry: ChannelMap) -> Channel:
+    """Return the channel of an entry of a signal map.
+
+    The kind is the stated one, else that of the vocabulary, else that of the stated unit (`kind_of_unit`: bar is a
+    pressure, not a pilot pressure), else generic.
+    """
+    standard_channel = VOCABULARY.get(entry.name)
+    if standard_channel is not None and entry.kind in (None, standard_channel.kind):
+        return standard_channel
+    return Channel(entry.name, entry.kind or kind_of_unit(entry.unit), entry.description)
+
+
+def with_kinds(signal_map: SignalMap) -> SignalMap:
+    """Return a map whose entries state the kinds that their units tell."""
+    return replace(signal_map, channels=tuple(map(_with_kind, signal_map.channels)))
+
+
+def without_derived_kinds(signal_map: SignalMap) -> SignalMap:
+    """Return a map of an earlier version: it read a channel without a kind as plain numbers, whatever the unit."""
+    entries = (
+        replace(entry, kind=Kind.GENERIC) if _with_kind(entry) != entry else entry for entry in signal_map.channels
+    )
+    return replace(signal_map, channels=tuple(entries))
+
+
+def _with_kind(entry: ChannelMap) -> ChannelMap:
+    kind = mapped_channel(entry).kind
+    is_derived = entry.kind is None and entry.name not in VOCABULARY and kind is not Kind.GENERIC
+    return replace(entry, kind=kind) if is_derived else entry
 
 
 def unit_for(stated: str | None, kind: Kind, where: str) -> Unit:

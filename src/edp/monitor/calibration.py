@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from edp.errors import ConfigError, DataError
+from edp.errors import ConfigError, DataError, count_of
 from edp.monitor.detectors.base import DetectorSpec, alarms, statistics
 from edp.settings.bounds import above, shown
+from edp.wording import figure
 
 Array = NDArray[np.float64]
 CONFIDENCE = 0.95
@@ -46,10 +47,11 @@ class AlarmLimit:
 
     def sentence(self) -> str:
         """For a report."""
-        high = "any time" if math.isinf(self.high_hours) else f"{self.high_hours:.3g} h"
+        high = "any time" if math.isinf(self.high_hours) else f"{figure(self.high_hours, 3)} h"
         return (
-            f"{self.alarms} false alarms in {self.hours:.3g} h of healthy sessions: one in {self.low_hours:.3g} h to "
-            f"{high} ({100 * CONFIDENCE:g} %), asked for one in {self.promised_hours:.3g} h"
+            f"{count_of(self.alarms, 'false alarm')} in {figure(self.hours, 3)} h of healthy sessions: one in "
+            f"{figure(self.low_hours, 3)} h to "
+            f"{high} ({figure(100 * CONFIDENCE)} %), asked for one in {figure(self.promised_hours, 3)} h"
         )
 
 
@@ -96,8 +98,10 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
     part = max(hours / promised_hours - 1.0 - allowed, 0.0)
     if allowed < 0:
         raise ConfigError(
-            f"calibration: {hours:.3g} h of healthy sessions are too few for one false alarm in {promised_hours:.3g} "
-            f"h; they support one in {hours:.3g} h: ask for that, or bring {promised_hours - hours:.3g} h more"
+            f"calibration: {figure(hours, 3)} h of healthy sessions are too few for one false alarm in "
+            f"{figure(promised_hours, 3)} "
+            f"h; they support one in {figure(hours, 3)} h: ask for that, or bring {figure(promised_hours - hours, 3)} "
+            "h more"
         )
     whole = [session for session in sessions if len(session)]
     peaks = [_range(spec, session) for session in whole]

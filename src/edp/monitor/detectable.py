@@ -16,6 +16,7 @@ from edp.monitor.fitting import FittedChain
 from edp.monitor.monitor import Monitor
 from edp.recording import Recording
 from edp.signals import KINDS, Channel
+from edp.wording import figure
 
 FOUND_SHARE = 0.8
 """Fraction of the trials in which a change of the stated size must be found."""
@@ -105,7 +106,7 @@ class FoundSize:
     def amount(self) -> str:
         """Return the smallest size found, else the largest that was tried, with its unit."""
         size = self.largest if self.size is None else self.size
-        return f"{size:.3g}" if self.unit == "1" else f"{size:.3g} {self.unit}"
+        return figure(size, 3) if self.unit == "1" else f"{figure(size, 3)} {self.unit}"
 
     def sentence(self) -> str:
         """Return the finding in words."""
@@ -113,7 +114,7 @@ class FoundSize:
         what = f"a {self.change} of {self.channel} by {self.amount()}"
         if self.within_s is None:
             return f"{what}, the largest tried, is found in {share} only"
-        return f"{what} is found within {self.within_s:.3g} s in {share}"
+        return f"{what} is found within {figure(self.within_s, 3)} s in {share}"
 
 
 @dataclass(frozen=True)
@@ -240,7 +241,9 @@ def _delays(
     for segment, sign in itertools.product(segments, injection.signs):
         onset, column = round(ONSET * segment.samples), segment.index(name)
         values = segment.values.copy()
-        values[:, column] = injection.apply(values[:, column], onset, sign * size, segment.rate_hz)
+        # A logger shows degrees Celsius: a scale acts on them, not on kelvin.
+        zero = np.float32(KINDS[segment.channels[column].kind].from_report(0.0))
+        values[:, column] = zero + injection.apply(values[:, column] - zero, onset, sign * size, segment.rate_hz)
         began = onset / segment.rate_hz
         raised = [alarm.raised_s for alarm in _alarms(monitor, replace(segment, values=values))]
         later = [at - began for at in raised if at > began]
@@ -281,7 +284,7 @@ def promise_lines(sizes: Sequence[FoundSize]) -> list[str]:
     """Return sentences about the detectable changes, with the best and the worst channels first."""
     if not sizes:
         return ["what it finds was not measured: no healthy segment outside of the limits is free of alarms"]
-    minutes = f"with {sizes[0].minutes:.3g} healthy minutes"
+    minutes = f"with {figure(sizes[0].minutes, 3)} healthy minutes"
     lines = []
     for rows in _by_change(sizes):
         more = [f"and {len(rows) - _SHOWN} more channels (--json)"] if len(rows) > _SHOWN else []
@@ -305,7 +308,8 @@ def effort_line(provenance: Mapping[str, Any]) -> str:
     if measured >= planned:
         return ""
     return (
-        f"the trials of what it finds ended early, after {seconds:.3g} s of processor time: {measured} of {planned} "
+        f"the trials of what it finds ended early, after {figure(seconds, 3)} s of processor time: {measured} of "
+        f"{planned} "
         "changes of channels were measured"
     )
 
@@ -327,7 +331,7 @@ def unseen_line(sizes: Sequence[FoundSize]) -> str:
         )
         parts.append(f"a {rows[0].change} {named}{', and others' if len(rows) > _SHOWN else ''}")
     return (
-        f"with {sizes[0].minutes:.3g} healthy minutes {'; '.join(parts)} would not have been found in "
+        f"with {figure(sizes[0].minutes, 3)} healthy minutes {'; '.join(parts)} would not have been found in "
         f"{FOUND_SHARE:.0%} of trials"
     )
 
@@ -371,6 +375,7 @@ def outside_line(monitor: Monitor, rows: Any) -> str:
     if ratio[worst] <= limit:
         return ""
     return (
-        f"{monitor.summary_names[worst]} lies outside of its healthy range: its mean is {ratio[worst]:.2g} times the "
+        f"{monitor.summary_names[worst]} lies outside of its healthy range: its mean is {figure(ratio[worst], 2)} "
+        "times the "
         "largest of a healthy session"
     )

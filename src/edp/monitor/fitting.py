@@ -163,9 +163,8 @@ def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], session
     """
     _check_sessions(spec, len(sessions))
     block = block_ticks(spec.block_s, sessions)
-    settle = _settle_blocks(spec, sessions, block)
     points = operating_numbers(channels, sessions, block)
-    lengths = [session.samples // block - settle for session in sessions]
+    lengths = watched_blocks(spec, sessions)
     folds = min(spec.folds, len(sessions))
     for fold in (NO_FOLD, *range(folds)):
         left_out = set(_left_out(fold, len(sessions), folds))
@@ -173,6 +172,13 @@ def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], session
         check_blocks(sum(others), points)
         for watch in spec.watches:
             check_rows(watch, others, sessions[0].rate_hz / block)
+
+
+def watched_blocks(spec: ChainSpec, sessions: Sequence[Recording]) -> list[int]:
+    """Return the number of blocks of each session that are watched, those at the start left out."""
+    block = block_ticks(spec.block_s, sessions)
+    settle = _settle_blocks(spec, sessions, block)
+    return [max(0, session.samples // block - settle) for session in sessions]
 
 
 def _check_sessions(spec: ChainSpec, count: int) -> None:

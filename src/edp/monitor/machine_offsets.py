@@ -16,6 +16,7 @@ from edp.monitor.chain import MonitorChain
 from edp.monitor.residuals.base import ResidualSource
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.session_blocks import SessionBlocks
+from edp.wording import figure
 
 Array = NDArray[np.float64]
 FIRST_S = 120.0
@@ -67,8 +68,9 @@ def other_machine(
     if len(least) < LEAST_AXES or min(least) <= OFF:
         return ""
     return (
-        f"balances of flow of all {len(least)} axes are off from its start on, by {min(least):.2g} to "
-        f"{max(least):.2g} healthy deviations: this is another machine of its kind, or a fault that all axes share, "
+        f"balances of flow of all {len(least)} axes are off from its start on, by {figure(min(least), 2)} to "
+        f"{figure(max(least), 2)} healthy deviations: this is another machine of its kind, or a fault that all axes "
+        "share, "
         "such as in the return line; fit a monitor to this machine, or one for a series (edp monitor fit --set "
         "chain.tolerance=0.01)"
     )

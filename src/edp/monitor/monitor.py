@@ -22,6 +22,7 @@ from edp.monitor.residuals.base import ResidualSource, Rows, SourceState, rows_o
 from edp.recording import Recording
 from edp.settings.bounds import shown
 from edp.signals import Channel
+from edp.wording import figure, number
 
 Array = NDArray[np.float64]
 PIECE = 4096
@@ -275,7 +276,8 @@ class Monitor:
         # A thousandth: loggers state the same rate with different digits.
         if abs(recording.rate_hz - self.rate_hz) > 1e-3 * self.rate_hz:
             raise DataError(
-                f"recording '{recording.name}' has {recording.rate_hz:g} Hz, the monitor {self.rate_hz:g} Hz; set "
+                f"recording '{recording.name}' has {figure(recording.rate_hz)} Hz, the monitor {figure(self.rate_hz)} "
+                "Hz; set "
                 "rate_hz in the signal map"
             )
         lacking = tuple(name for name in self.inputs if name not in recording.channel_names)
@@ -313,7 +315,8 @@ class Monitor:
             worst = names[int(far.argmax())]
             raise DataError(
                 f"recording '{recording.name}' is not of the monitor's machine: {len(beyond)} of {len(names)} "
-                f"channels, '{worst}' most of all, lie more than {OTHER_MACHINE:g} deviations from healthy sessions; "
+                f"channels, '{worst}' most of all, lie more than {figure(OTHER_MACHINE)} deviations from healthy "
+                "sessions; "
                 "check units and signs in the signal map, or fit a monitor for this machine"
             )
 
@@ -390,6 +393,7 @@ def _sentence(alarm: MonitorAlarm) -> str:
     name, size = alarm.evidence[0] if alarm.evidence else ("nothing", 0.0)
     where = f"{alarm.recording}: " if alarm.recording else ""
     return (
-        f"{where}not healthy since {alarm.since_s:g} s, raised at {alarm.raised_s:g} s: '{name}' deviates most, by "
-        f"{size:+.2g} healthy deviations on average"
+        f"{where}not healthy since {figure(alarm.since_s)} s, raised at {figure(alarm.raised_s)} s: '{name}' deviates "
+        "most, by "
+        f"{number(size, signed=True)} healthy deviations on average"
     )

@@ -94,7 +94,7 @@ Instruction = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Condition:
-    """Test of one argument of a call: its low 32 bits, masked, must equal one of some values.
+    """Test of one argument of a call: the masked low 32 bits are compared with a set of values.
 
     The kernel reads process ids, flags and commands as 32 bits, so higher bits change nothing.
 

@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import stdtr
+from scipy.special import ndtr, stdtr
 
 from edp.errors import DataError
 
@@ -75,5 +75,16 @@ def lower_p(mean: Array, error: Array, df: float) -> tuple[Array, Array]:
     mean, error = np.asarray(mean, dtype=np.float64), np.asarray(error, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         statistic = np.where(error > 0.0, mean / error, np.where(mean == 0.0, 0.0, np.copysign(np.inf, mean)))
-    p = np.where(error > 0.0, stdtr(df, statistic), np.where(mean < 0.0, 0.0, 1.0))
+    p = np.where(error > 0.0, _below(statistic, df), np.where(mean < 0.0, 0.0, 1.0))
     return statistic, p
+
+
+def two_sided_p(statistic: Array, df: float) -> Array:
+    """Return the two-sided p-value of a statistic from `lower_p`; 1 for a statistic of zero."""
+    # Twice the smaller tail of `lower_p` would be 0 for differences that are all zero, whose one-sided p-value is 1.
+    return np.asarray(2.0 * _below(-np.abs(statistic), df))
+
+
+def _below(statistic: Array, df: float) -> Array:
+    """Return the distribution function of Student's t; the normal one for infinite degrees of freedom."""
+    return np.asarray(ndtr(statistic) if np.isinf(df) else stdtr(df, statistic))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtri, stdtrit
 
 from edp.errors import DataError
-from edp.stats.checks import Array, lower_p, tested_cells
+from edp.stats.checks import Array, lower_p, tested_cells, two_sided_p
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +29,11 @@ class MeanTest:
     statistic: Array
     df: float
     p: Array
+
+    @property
+    def two_sided(self) -> Array:
+        """Two-sided p-value; 1 for a mean of zero, also where all differences are zero."""
+        return two_sided_p(self.statistic, self.df)
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Two-sided interval of the mean at `level`."""

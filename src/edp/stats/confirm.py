@@ -17,6 +17,7 @@ from edp.stats.multiple import adjust_registered
 from edp.stats.paired import fill_worst, run_means
 from edp.stats.race import INTERIM_ANALYSES, InterimAnalysis, race
 from edp.stats.resampled import paired_t, resampled_t
+from edp.wording import figure, percent, percent_interval
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +145,7 @@ def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rul
     difference = module - baseline
     reference = float(baseline[mask].mean())
     if reference <= 0.0:
-        raise DataError(f"the baseline's mean score is {reference:.4g}; shares need a score above zero")
+        raise DataError(f"the baseline's mean score is {figure(reference)}; shares need a score above zero")
     test = clustered_t(difference, mask)
     low, high = (float(bound) / reference for bound in test.interval(rule.level))
     change = float(test.mean) / reference
@@ -160,7 +161,8 @@ def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rul
     reason = _reason((change, low, high), adjusted, dropped, float(test.p), rule)
     if confirmed and resampled >= rule.alpha:
         reason += (
-            f"; the corrected resampled t-test does not agree (p {resampled:.2g}): if the module depends on what all "
+            f"; the corrected resampled t-test does not agree (p {figure(resampled, 2)}): if the module depends on "
+            "what all "
             "training sets share, more sessions are needed"
         )
     return ModuleEvidence(
@@ -184,14 +186,15 @@ def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rul
 
 def _reason(change: tuple[float, float, float], adjusted: float, dropped: int, p: float, rule: Rule) -> str:
     """Why a module is in or out, with the figures."""
-    middle, low, high = (100.0 * share for share in change)
-    figures = f"{middle:+.2f} % ({low:+.2f} to {high:+.2f} %)"
+    middle, low, high = change
+    figures = f"{percent(middle, signed=True)} ({percent_interval(low, high)})"
     if dropped:
-        return f"dropped after {dropped} runs: {figures}, p {p:.2g}, no sign of an improvement"
+        return f"dropped after {dropped} runs: {figures}, p {figure(p, 2)}, no sign of an improvement"
     if adjusted >= rule.alpha:
-        return f"{figures}, but adjusted p {adjusted:.2g} is not below {rule.alpha:g}"
-    if middle > -100.0 * rule.least_gain:
+        return f"{figures}, but adjusted p {figure(adjusted, 2)} is not below {figure(rule.alpha)}"
+    if middle > -rule.least_gain:
         return (
-            f"{figures}: significant (adjusted p {adjusted:.2g}), but below the {100 * rule.least_gain:g} % asked for"
+            f"{figures}: significant (adjusted p {figure(adjusted, 2)}), but below the "
+            f"{figure(100 * rule.least_gain)} % asked for"
         )
-    return f"{figures}, adjusted p {adjusted:.2g}"
+    return f"{figures}, adjusted p {figure(adjusted, 2)}"

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtr
 
 from edp.errors import DataError
-from edp.stats.checks import finite
+from edp.stats.checks import finite, lower_p
 
 PASS_AT = 0.30
 """Largest one-sided p-value with which a module passes the screening: it is to lose few true modules, not to
@@ -86,14 +85,18 @@ def main_effects(
         )
     inverse = np.linalg.inv(design.T @ design)
     coefficients = inverse @ (design.T @ y)
+    # Scores that are all the same leave rounding in the coefficients and in the residuals.
+    dust = 1e-13 * float(np.abs(y).max())
+    coefficients = np.where(np.abs(coefficients) > dust, coefficients, 0.0)
     noise = float(np.square(y - design @ coefficients).sum()) / free
+    noise = noise if noise > dust**2 else 0.0
     chosen = slice(1, 1 + len(factors))
     effect, spread = coefficients[chosen], np.diag(inverse)[chosen]
     error = np.sqrt(noise * spread)
     # The rise of the residual sum without the factor, so that factors that change seldom are not favoured.
     explained = np.square(effect) / spread
     total = float(explained.sum())
-    p = stdtr(free, np.divide(effect, error, out=np.zeros_like(effect), where=error > 0.0))
+    _, p = lower_p(effect, error, free)
     return tuple(
         MainEffect(
             factor=name,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
 
 from edp.errors import DataError
 from edp.stats.checks import Array, finite, lower_p
@@ -72,7 +71,6 @@ def mixed_model(module: ArrayLike, baseline: ArrayLike) -> MixedModel:
     # A variance cannot be negative: without the split's part all mean squares estimate the residual.
     residual = np.where(split > 0.0, residual, (within + between) / (2 * cells - 2))
     error = np.sqrt(2.0 * residual / cells)
-    statistic, _ = lower_p(b1, error, np.inf)
-    p = np.where(error > 0.0, ndtr(statistic), np.where(b1 < 0.0, 0.0, 1.0))
+    statistic, p = lower_p(b1, error, np.inf)
     effect = MeanTest(np.asarray(b1), np.asarray(error), statistic, np.inf, p)
     return MixedModel(np.asarray(b0), effect, np.maximum(split, 0.0), np.asarray(residual))

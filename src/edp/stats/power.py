@@ -13,6 +13,7 @@ from edp.errors import ConfigError
 from edp.stats.checks import Array, tested_mask
 from edp.stats.clustered import clustered_t
 from edp.stats.variance import PairedVariance
+from edp.wording import figure
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def plan_runs(
         text = f"at least {needed} sessions are needed" if needed else "10,000 sessions would not do"
         reason = (
             f"no number of runs suffices: with {sessions} sessions the power cannot exceed {limit:.2f}, since the "
-            f"module's effect differs between sessions (sd {math.sqrt(variance.session):.3g}); {text}"
+            f"module's effect differs between sessions (sd {figure(math.sqrt(variance.session), 3)}); {text}"
         )
         return ConfirmationPlan(None, limit, limit, needed, reason)
     # Whole repeats only: a part of one would judge some sessions more often than others.

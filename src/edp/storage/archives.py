@@ -256,7 +256,7 @@ class ZipReader:
                 raise self._refused(f"has an entry '{printable(folder)}' that is a file and a folder")
 
     def _check_places(self, entries: Iterable[ArchiveEntry], directory_at: int) -> None:
-        """Refuse entries that share bytes with another one or with the directory: one byte would unpack many times."""
+        """Refuse entries that overlap another entry or the directory: one byte would unpack many times."""
         free_from = 0
         for entry in sorted(entries, key=lambda each: each.at):
             _, end = self._data_at(entry)

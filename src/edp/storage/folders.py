@@ -23,7 +23,7 @@ MARKS = {
 
 
 def kind_of(folder: str | Path) -> str | None:
-    """Return the kind of an EDP folder, one of `MARKS`; None for an absent, empty or foreign folder.
+    """Return the kind of an EDP folder (a key in `MARKS`); None for an absent, empty or foreign folder.
 
     Raises:
         StorageError: the folder cannot be looked into.

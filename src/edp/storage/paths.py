@@ -103,7 +103,7 @@ def is_link_at(path: str | Path) -> bool:
 
 
 def size_at(path: str | Path) -> int:
-    """Return the size of a regular file in bytes; -1 for a link, a folder or a missing path.
+    """Return the size of a regular file in bytes, or -1 for links, folders and missing paths.
 
     Raises:
         StorageError: the path cannot be looked at.

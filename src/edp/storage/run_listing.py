@@ -17,6 +17,7 @@ from edp.storage.locks import held_by
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_link_at, status_of
 from edp.storage.reading import parse_json, read_text, read_toml
 from edp.storage.seals import unsealed
+from edp.wording import figure
 
 MOST_FOLDERS = 20_000
 """Folders that are looked into: more is a whole disk."""
@@ -200,4 +201,4 @@ def _score(scores: Mapping[str, Any]) -> str:
     unit = str(targets[0]["unit"])
     of_unit = "" if unit == "1" else f" {unit}"
     more = "" if shared else f" ({name}; {len(targets)} outputs)"
-    return f"{error:.4g}{of_unit} at k = {horizon}{more}"
+    return f"{figure(error)}{of_unit} at k = {horizon}{more}"

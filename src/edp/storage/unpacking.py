@@ -60,7 +60,7 @@ def unpack_start(data: bytes, count: int) -> bytes:
 
 
 class DamagedError(Exception):
-    """Packed data that are damaged or cut off."""
+    """Packed data that are damaged or incomplete."""
 
 
 def unpack_raw(data: bytes, limit: int) -> bytes:

@@ -35,6 +35,7 @@ from edp.storage.headers import ARRAYS_BYTES, read_header
 from edp.storage.paths import entries_of, is_entry_at
 from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
+from edp.wording import figure
 
 SCHEMA = 8
 INTEGER_SCHEMA = 9
@@ -248,7 +249,9 @@ def _bundle_folder(folder: str | Path) -> Path:
     # Both the run folder and the bundle in it are accepted.
     path = path / "bundle" if is_entry_at(path / "bundle" / HEADER) else path
     if is_entry_at(path / "twin" / "twin.json"):
-        raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
+        raise BundleError(
+            f"'{path}' holds a twin, not a network that predicts; edp rollout runs it, edp.load_twin loads it"
+        )
     if not is_entry_at(path / HEADER):
         missing = f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote"
         raise BundleError(unfinished_text(path) or missing)
@@ -308,7 +311,7 @@ def _check_channels(header: Mapping[str, Any], task: Task, inputs: Sequence[Chan
         if entry["unit"] != channel.unit:
             raise ValueError(f"input '{channel.name}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
     if not (math.isfinite(task.rate_hz) and 0.0 < task.rate_hz <= MOST_RATE_HZ):
-        raise ValueError(f"its rate_hz is {task.rate_hz}; above 0 and at most {MOST_RATE_HZ:g} must hold")
+        raise ValueError(f"its rate_hz is {task.rate_hz}; above 0 and at most {figure(MOST_RATE_HZ)} must hold")
 
 
 def _text(value: Any) -> str:

@@ -42,6 +42,7 @@ from edp.storage.runs import KeyedRun
 from edp.training.blas import one_blas_thread
 from edp.training.checkpoint import FILE, Progress, Weights, damaged, load_checkpoint, save_checkpoint
 from edp.training.optimizers import OptimizerSpec, Soap
+from edp.wording import figure, setting_text
 
 Array = NDArray[np.float32]
 MOST_LENGTH_S = 600.0
@@ -116,7 +117,8 @@ class FreeRunSpec:
             )
         if self.measured_share + self.mixed_share >= 1.0:
             raise ConfigError(
-                f"free runs: measured_share = {self.measured_share:g} and mixed_share = {self.mixed_share:g} leave no "
+                f"free runs: measured_share = {setting_text(self.measured_share)} and mixed_share = "
+                f"{setting_text(self.mixed_share)} leave no "
                 "lane that runs free; a sum below 1 must hold"
             )
 
@@ -173,7 +175,8 @@ class FreeRunSampler:
         if not usable:
             rate = twin.channels.rate_hz
             raise DataError(
-                f"no stretch is longer than prefix and free run, {(twin.prefix_ticks + longest) / rate:g} s; give "
+                f"no stretch is longer than prefix and free run, {figure((twin.prefix_ticks + longest) / rate)} s; "
+                "give "
                 "longer recordings, or shorter free runs (training.lengths_s)"
             )
         self.commands = np.concatenate([twin.drive(part.inputs) for part in usable])
@@ -247,7 +250,9 @@ def _fitted(
     rate, network = twin.channels.rate_hz, twin.network
     lengths = [max(1, round(length * rate)) for length in spec.lengths_s]
     if max(lengths) + twin.prefix_ticks > MOST_TICKS:
-        raise ConfigError(f"free runs: {max(spec.lengths_s):g} s at {rate:g} Hz are more than {MOST_TICKS:,} ticks")
+        raise ConfigError(
+            f"free runs: {figure(max(spec.lengths_s))} s at {figure(rate)} Hz are more than {MOST_TICKS:,} ticks"
+        )
     ticks = np.repeat(lengths, spec.updates)
     sampler = FreeRunSampler(twin, train, max(lengths))
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * rate), spec.lanes)

@@ -16,6 +16,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import BundleError, ConfigError, ExportError
 from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinPlant, TwinScales, TwinSpec
 from edp.networks.twin.grey.ground import GROUNDS, GroundLaw, check_grounded
+from edp.networks.twin.recurrent_cell import CellWeights
 from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel, Kind
@@ -66,6 +67,24 @@ class TwinBundle:
     scores: Mapping[str, Any] = field(default_factory=dict)
     intervals: FreeRunIntervals | None = None
     ground: GroundLaw | None = None
+
+    @property
+    def network(self) -> CellWeights:
+        """The network of the twin as a PyTorch module (`torch.nn.Module`): the weights with which `twin` runs.
+
+        Inputs and outputs of the module are scaled numbers; `twin` scales, bounds and integrates around it.
+
+        Raises:
+            ConfigError: the formulation has no network; its numbers are NumPy arrays (`Twin.arrays`).
+        """
+        network = getattr(self.twin, "network", None)
+        if not isinstance(network, CellWeights):
+            kind = TWINS.name_of(self.spec)
+            raise ConfigError(
+                f"this twin is of kind '{kind}', which has no network: its numbers are NumPy arrays, in twin.arrays(); "
+                "kinds with a network are 'recurrent' and 'residual'"
+            )
+        return network
 
 
 def plant_bundle(bundle: TwinBundle) -> Bundle:

@@ -20,6 +20,7 @@ from edp.logs.proposal.propose import ColumnGuess, MapProposal, propose_map
 from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
+from edp.logs.source import DataSource
 from edp.signals import Kind
 from edp.storage import make_folder, write_bytes
 from edp.storage.folders import check_kind
@@ -51,7 +52,7 @@ class LogsProposal:
     """What `propose` found.
 
     Attributes:
-        source: what was asked about.
+        source: the logs and folders that were asked about.
         group: the logs that belong together.
         others: further logs, with other columns.
         broken: logs that cannot be read, each with the reason.
@@ -64,7 +65,7 @@ class LogsProposal:
         recordings: number of recordings that the commands read.
     """
 
-    source: Path
+    source: DataSource
     group: LogGroup
     others: tuple[LogGroup, ...]
     broken: dict[Path, str]
@@ -112,7 +113,7 @@ class LogsProposal:
         repair = "".join(f" --repair {one}" for one in self.repairs)
         if DATA in self.files:
             return _quoted(folder / DATA), "", repair
-        return _quoted(self.source), f" --map {_quoted(folder / MAP)}", repair
+        return shlex.join(map(str, self.source.paths)), f" --map {_quoted(folder / MAP)}", repair
 
 
 def _untold_inputs(proposal: MapProposal) -> tuple[str, ...]:
@@ -127,20 +128,23 @@ def _quoted(path: Path) -> str:
     return shlex.quote(str(path))
 
 
-def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = None) -> LogsProposal:
+def propose(
+    path: str | Path | Sequence[str | Path], on_log: Callable[[Path, int, int], None] | None = None
+) -> LogsProposal:
     """Look at logs and propose a map and settings; nothing is written.
 
     Args:
-        path: a log, or a folder of logs.
+        path: a log or a folder of logs, or several of them.
         on_log: called with the path of each log before it is looked at, its number from 1, and how many there are.
 
     Raises:
         DataError: no log there can be read, or nothing in it can be predicted.
     """
-    source = Path(path)
-    if source.suffix.lower() == ".toml":
-        raise ConfigError(f"'{source}' is a data-set file; give the log or the folder of logs that it is to describe")
-    paths, copies = _without_copies(find_recordings(source))
+    source = DataSource.of(path)
+    for one in source.paths:
+        if one.suffix.lower() == ".toml":
+            raise ConfigError(f"'{one}' is a data-set file; give the log or the folder of logs that it is to describe")
+    paths, copies = _without_copies(list(dict.fromkeys(file for one in source.paths for file in find_recordings(one))))
     groups, broken = group_logs(paths, on_log)
     experiments, others = part_experiments(groups[0]), tuple(groups[1:])
     group = groups[0] if experiments is None else experiments.group
@@ -153,7 +157,11 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
     notes = [*_notes(group, others, broken, proposal), *timing.notes, *_of_copies(copies)]
     targets, more = choose_targets(proposal)
     chosen = {guess.column for guess in proposal.columns if guess.channel in targets}
-    notes += [*more, *pace_notes(proposal.look, proposal.clock, chosen), *beside_notes(source, paths)]
+    notes += [
+        *more,
+        *pace_notes(proposal.look, proposal.clock, chosen),
+        *(note for one in source.paths for note in beside_notes(one, paths)),
+    ]
     channels = [guess.channel for guess in proposal.of_role("reference", "command", "measured")]
     if len(channels) > MOST_FEATURES:
         notes.append(
@@ -167,7 +175,7 @@ def propose(path: str | Path, on_log: Callable[[Path, int, int], None] | None = 
         why = [*why, *_of_experiments(experiments, tests)]
     notes += why
     files = {
-        MAP: toml_text(map_table(proposal.signal_map), remarks_of(source, proposal)),
+        MAP: toml_text(map_table(proposal.signal_map), remarks_of(source.paths, proposal)),
         SETTINGS: settings_text(proposal, channels, targets, split),
     }
     repairs, apart = timing.shared, timing.apart
@@ -317,7 +325,7 @@ def _side_by_side(proposal: MapProposal) -> dict[str, dict[str, ColumnGuess]]:
 
 
 def _of_pairs(
-    source: Path,
+    source: DataSource,
     group: LogGroup,
     others: tuple[LogGroup, ...],
     broken: dict[Path, str],

@@ -55,9 +55,9 @@ def _usual_kind(name: str) -> Kind | None:
     return None if channel is None else channel.kind
 
 
-def remarks_of(source: Path, proposal: MapProposal) -> list[str]:
+def remarks_of(paths: Sequence[Path], proposal: MapProposal) -> list[str]:
     """Comments on top of a map: where it comes from and what is to be checked."""
-    lines = [f"Proposed by edp init for {source.name}. To be checked:"]
+    lines = [f"Proposed by edp init for {', '.join(path.name for path in paths)}. To be checked:"]
     checked = [guess for guess in proposal.columns if guess.check and guess.channel]
     lines += [f"  {guess.channel}: {guess.role}, {guess.sureness}; {guess.check}" for guess in checked]
     if proposal.clock.check:

@@ -271,7 +271,7 @@ def evaluate(
     if source is not None:
         # Content by name and digest: the same file changed is another judgement.
         judged += [part for recording in others or () for part in (recording.name, recording.digest)]
-        target = make_folder(folder / f"on_{source.path.stem}")
+        target = make_folder(folder / f"on_{source.short_name}")
     data, drawn = judged_data(bundle, data, others, at_most_h)
     judged += [part.name for part in data.test] if drawn else []
     chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
@@ -353,7 +353,7 @@ def channel_importance(
     target = folder
     data, _ = judged_data(bundle, data, other_recordings(source, provenance), at_most_h)
     if source is not None:
-        target = make_folder(folder / f"on_{source.path.stem}")
+        target = make_folder(folder / f"on_{source.short_name}")
     if spec is None:
         groups = collinear([part.inputs for part in data.train])
         spec = ChannelImportanceSpec(groups=tuple(tuple(data.task.inputs[i] for i in group) for group in groups))

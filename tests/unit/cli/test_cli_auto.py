@@ -41,7 +41,7 @@ def test_settings_of_a_network_take_the_preset_standard(edp, logs, tmp_path, sma
 def test_minutes_are_of_the_preset_auto_alone(edp, logs, tmp_path):
     ended = edp("train", logs, "--out", tmp_path / "run", "--preset", "quick", "--minutes", "3")
     assert ended.code == 1
-    assert "only the preset auto has a budget" in ended.err
+    assert "--minutes: it has no effect without the preset auto" in ended.err
     assert not (tmp_path / "run").exists()
 
 
@@ -57,7 +57,7 @@ def test_a_network_that_loses_says_so_first_and_by_its_exit_code(edp, trained):
     write_json(file, scores)
     lost = edp(*few)
     assert lost.code == 6
-    assert lost.out.startswith("On the held-out recordings Persistence has 50.0 % less error")
+    assert lost.out.startswith("On the held-out recordings Persistence has 50 % less error")
     assert edp(*few, "--json").json["beaten_by"] == "Persistence"
     for targets in scores["models"]["network"]["overall"].values():
         for metrics in targets.values():

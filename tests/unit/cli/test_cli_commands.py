@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from edp import __version__
@@ -11,8 +12,11 @@ from edp.cli import app, demo
 from edp.cli import train as train_command
 from edp.cli.console import duration
 from edp.logs import read_recording
+from edp.logs.source import DataSource
 from edp.signals import TABLE_A1
 from edp.storage import read_json
+from edp.training import load_bundle
+from edp.workflows.parity import recorded_case
 
 LIMIT = [w for s in ("moments=4", "branches=4", "horizons=[1,10]") for w in ("--set", f"limit.{s}")]
 COMMANDS = [command.name for command in app.registered_commands]
@@ -174,6 +178,20 @@ def test_other_recordings_can_be_judged(edp, logs, trained):
     found = edp("evaluate", trained, "--data", logs / "drive_1.parquet", "--baselines", "persistence", "--json").json
     assert found["folder"] == str(trained / "on_drive_1")
     assert (trained / "on_drive_1" / "scores.json").is_file()
+
+
+def test_several_logs_are_judged_together_in_a_folder_of_their_own(edp, logs, trained):
+    two = ("--data", logs / "drive_1.parquet", "--data", logs / "drive_2.parquet")
+    found = edp("evaluate", trained, *two, "--baselines", "persistence", "--json").json
+    assert found["folder"].startswith(str(trained / "on_drive_1_and_1_more_"))
+    assert set(found["models"]["network"]["recordings"]) == {"drive_1", "drive_2"}
+
+
+def test_the_reference_recording_of_parity_is_a_part_of_each_log(logs, trained):
+    bundle, paths = load_bundle(trained), [logs / "drive_1.parquet", logs / "drive_2.parquet"]
+    case = recorded_case(bundle, DataSource.of(paths), 61)
+    parts = [recorded_case(bundle, DataSource.of(path), ticks) for path, ticks in zip(paths, (31, 30), strict=True)]
+    assert np.array_equal(case.inputs, np.concatenate([part.inputs for part in parts]))
 
 
 def test_the_importance_of_channels_is_reported(edp, logs, trained):

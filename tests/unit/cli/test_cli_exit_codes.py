@@ -1,6 +1,7 @@
 """One rule for headline, first line and exit code: stated in docs/commands.md and in `edp.evaluation.guard`."""
 
 import ast
+import math
 import re
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from edp.evaluation.guard import (
     ErrorOutcome,
     ErrorVerdict,
     adaptation_verdict,
+    by_recording,
     machine_verdict,
     network_verdict,
     outcome_of,
@@ -59,13 +61,18 @@ def test_every_command_of_the_tree_is_declared_once():
     assert sorted(declared) == sorted(TREE)
 
 
-def free_runs(ratio, judged):
-    """Scores of free runs with error 1 of what is judged, and of one floor."""
+def free_runs(ratios, judged):
+    """Scores of free runs with error 1 of what is judged in each recording, and `ratios` of one floor."""
 
-    def scored(error):
-        return {"velocity_mae": {"by_channel": {"v": error}}, "stroke_error": [{"by_channel": {"v": error}}]}
+    def summary(error):
+        strokes = [{"at_s": at, "by_channel": {"v": error}} for at in (1.0, 10.0)]
+        return {"velocity_mae": {"by_channel": {"v": error}}, "stroke_error": strokes}
 
-    return {judged: scored(1.0), "Static map": scored(ratio)}
+    def scored(errors):
+        by_recording = {f"r{i}": summary(error) for i, error in enumerate(errors)}
+        return summary(sum(errors) / len(errors)) | {"by_recording": by_recording}
+
+    return {judged: scored([1.0] * len(ratios)), "Static map": scored(ratios)}
 
 
 def adapted(*ratios):
@@ -79,23 +86,33 @@ class Methods:
 
     horizons, methods, content = (1,), {"tuned": {"label": "Tuned"}, "direct": {"label": "Direct"}}, {"method": "tuned"}
 
-    def __init__(self, ratio):
-        self.ratio = ratio
+    def __init__(self, ratios):
+        self.ratios = ratios
 
     def score(self, name, horizon):
-        return {"mae": 1.0 if name == "tuned" else self.ratio}
+        return {"mae": 1.0 if name == "tuned" else sum(self.ratios) / len(self.ratios)}
+
+    def recordings(self, name, horizon):
+        return {f"r{i}": 1.0 if name == "tuned" else ratio for i, ratio in enumerate(self.ratios)}
+
+
+def tuned(*ratios):
+    """Position errors of 1 after tuning on each reference, and `ratios` before."""
+    by_reference = {f"grade {i}": {"before": ratio, "after": 1.0} for i, ratio in enumerate(ratios)}
+    return {"before": sum(ratios) / len(ratios), "after": 1.0, "by_reference": by_reference}
 
 
 VERDICTS = {
     "evaluate": lambda *ratios: network_verdict(scores(*ratios)),
-    "twin": lambda *ratios: twin_verdict(free_runs(ratios[0], "twin")),
-    "identify": lambda *ratios: machine_verdict(free_runs(ratios[0], MACHINE)),
-    "finetune": lambda *ratios: transfer_verdict(Methods(ratios[0])),
+    "twin": lambda *ratios: twin_verdict(free_runs(ratios, "twin")),
+    "identify": lambda *ratios: machine_verdict(free_runs(ratios, MACHINE)),
+    "finetune": lambda *ratios: transfer_verdict(Methods(ratios)),
     "adapt": lambda *ratios: adaptation_verdict(adapted(*ratios)),
     "replay": lambda *ratios: adaptation_verdict(adapted(*ratios)),
-    "tune": lambda *ratios: tuning_verdict({"before": ratios[0], "after": 1.0}),
+    "tune": lambda *ratios: tuning_verdict(tuned(*ratios)),
 }
-WITH_INTERVALS = {"evaluate", "adapt", "replay"}
+UNITS = dict.fromkeys(JUDGING, "recordings") | {"tune": "references"}
+"""What the interval of each command is over."""
 CASES = {
     ErrorOutcome.WORSE: (0.5, 0.6, 0.7, 0.55),
     ErrorOutcome.BETTER: (1.5, 1.6, 1.7, 1.55),
@@ -111,15 +128,14 @@ def test_every_judging_command_has_a_verdict_function_here():
 @pytest.mark.parametrize("outcome", list(ErrorOutcome))
 def test_exit_code_first_line_and_headline_agree(command, outcome, capsys):
     verdict = VERDICTS[command](*CASES[outcome])
-    # Scores without recordings of their own have no interval, so that they never show a gain for certain.
-    expected = ErrorOutcome.OPEN if outcome is ErrorOutcome.BETTER and command not in WITH_INTERVALS else outcome
-    assert verdict.outcome is expected
+    assert verdict.outcome is outcome
+    assert ("do not use" in verdict.sentence()) or f"over 4 {UNITS[command]}: " in verdict.sentence()
     show_verdict(verdict)
     first = " ".join(capsys.readouterr().out.split())
     assert first == verdict.sentence()
     page = verdict.headline("Figures.")
     assert page.startswith(first)
-    worse = expected is ErrorOutcome.WORSE
+    worse = outcome is ErrorOutcome.WORSE
     assert ("do not use" in first) is ("Figures." not in page) is (verdict_facts(verdict)["beaten_by"] is not None)
     assert ("do not use" in first) is worse
     if worse:
@@ -129,6 +145,35 @@ def test_exit_code_first_line_and_headline_agree(command, outcome, capsys):
     else:
         end_with(verdict)
         assert verdict.exit_code == 0
+
+
+@pytest.mark.parametrize("command", sorted(JUDGING))
+def test_equal_errors_are_not_distinguishable(command):
+    verdict = VERDICTS[command](1.0, 1.0, 1.0, 1.0)
+    assert verdict.outcome is ErrorOutcome.OPEN
+    assert "0.0 % less error (95 % interval of the change over 4" in verdict.sentence()
+    # Rounding and threads make differences of this size.
+    assert VERDICTS[command](*[1.0 + 1e-6] * 4).outcome is ErrorOutcome.OPEN
+
+
+@pytest.mark.parametrize("command", sorted(JUDGING))
+def test_too_few_units_are_named(command):
+    verdict = VERDICTS[command](1.5, 1.6)
+    assert verdict.outcome is ErrorOutcome.OPEN
+    assert f"2 {UNITS[command]} are too few for an interval: chance is not excluded" in verdict.sentence()
+
+
+def test_stretches_of_one_recording_are_one_unit():
+    logs = {"a[0:10]": [0.2], "a[20:30]": [0.4], "b": [1.0, math.nan], "c": [math.nan]}
+    assert by_recording(logs) == pytest.approx({"a": 0.3, "b": 1.0})
+
+
+def test_scores_of_earlier_versions_without_recordings_have_no_interval():
+    old = free_runs((1.5, 1.6, 1.7), "twin")
+    for model in old.values():
+        del model["by_recording"]
+    assert "no interval: chance is not excluded" in twin_verdict(old).sentence()
+    assert "no interval" in tuning_verdict({"before": 2.0, "after": 1.0}).sentence()
 
 
 def test_pages_take_their_headline_from_the_verdict():
@@ -189,6 +234,7 @@ def test_better_needs_an_interval_that_excludes_zero():
     assert outcome_of(-0.38, 1.14) is ErrorOutcome.OPEN
     assert outcome_of(-0.38, None) is ErrorOutcome.OPEN
     assert outcome_of(-0.38, -0.01) is ErrorOutcome.BETTER
+    assert outcome_of(-1e-6, -1e-7) is ErrorOutcome.OPEN
     assert outcome_of(0.02, 0.5) is ErrorOutcome.WORSE
     assert ErrorVerdict("x", 1.0, ()).outcome is ErrorOutcome.WORSE
 

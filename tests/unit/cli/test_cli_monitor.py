@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -154,10 +155,26 @@ def test_what_is_remarked_of_logs_stands_on_the_page_and_a_damaged_remark_is_ref
         assert "run the monitor again" in " ".join(ended.err.split())
 
 
-def test_logs_in_two_folders_are_told_to_be_put_into_one(edp, healthy, tmp_path):
-    ended = edp("monitor", "fit", healthy, healthy, "--out", tmp_path / "m")
+def test_logs_in_two_folders_are_read_together(edp, healthy, tmp_path):
+    paths = sorted(healthy.iterdir())
+    halves = [tmp_path / name for name in ("monday", "tuesday")]
+    for half, chosen in zip(halves, (paths[::2], paths[1::2]), strict=True):
+        half.mkdir()
+        for path in chosen:
+            shutil.copy(path, half)
+    ended = edp("monitor", "fit", *halves, "--out", tmp_path / "m", "--hours-per-false-alarm", 0.06, "--minutes", 0.05)
+    assert ended.code == 0, ended.err
+    together = load_monitor(tmp_path / "m")
+    assert together.provenance["sessions"] == len(paths)
+
+
+def test_run_folders_without_logs_are_refused(edp, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{}")
+    ended = edp("monitor", "fit", tmp_path / "run", "--out", tmp_path / "m")
     assert ended.code == 1
-    assert "put them into one folder" in " ".join(ended.err.split())
+    assert "got run folders alone, expected healthy logs" in " ".join(ended.err.split())
+    assert not (tmp_path / "m").exists()
 
 
 def test_bad_input_is_one_message(edp, fitted, healthy, tmp_path):

@@ -1,5 +1,6 @@
 """Options that have no effect without, or beside, another one: refused before anything is read, in every command."""
 
+import shlex
 import sys
 
 import pytest
@@ -7,7 +8,9 @@ from typer.main import get_command
 
 from edp.cli import app
 from edp.cli.console import run_app
-from edp.cli.options import EXCLUDED, OWNERS
+from edp.cli.options import DEPENDENT, EXCLUDED, OWNERS, TRIAL_TABLES
+from edp.config.commands import TRAINING_TABLES
+from edp.control.controllers import CONTROLLERS
 
 
 def leaves(node, words=()):
@@ -41,20 +44,33 @@ def edp(tmp_path, monkeypatch, capsys):
     return run
 
 
+VALUES = {"delta_kb": "16", "units": "16", "repair": "nan=hold", "split": "time", "most": "5"}
+"""Values of parameters that take no path."""
+
+
 def called(command, *names):
     """A command line with what the command asks for and the parameters of these names."""
     words = command.split()
     for name, parameter in COMMANDS[command].items():
         option = parameter.param_type_name == "option"
         if parameter.required or name in names:
-            words += [parameter.opts[0]] if option else []
+            words += [option_word(parameter)] if option else []
             if not getattr(parameter, "is_flag", False):
-                words.append({"delta_kb": "16", "units": "16", "repair": "nan=hold"}.get(name, "there"))
+                words.append(
+                    {"delta_kb": "16", "units": "16", "repair": "nan=hold", "split": "time", "most": "5"}.get(
+                        name, "there"
+                    )
+                )
     return words
 
 
+def option_word(parameter):
+    """The switch that changes the default, or the option."""
+    return parameter.secondary_opts[0] if parameter.default is True else parameter.opts[0]
+
+
 def word(command, name):
-    return COMMANDS[command][name].opts[0]
+    return option_word(COMMANDS[command][name])
 
 
 def test_rules_name_parameters_of_commands():
@@ -85,6 +101,85 @@ def test_an_option_beside_one_that_takes_its_effect_is_refused(command, name, ot
     assert code == 1
     assert f"error: {word(command, other)}: it has no effect beside {word(command, name)}" in err
     assert left == []
+
+
+FREE_RUNS = {"twin/twin.json": "{}", "free_run.json": "{}"}
+LINES = {
+    ("animate", "horizon"): "animate there --horizon 3",
+    **{
+        ("evaluate", name): f"evaluate twin_run {option}"
+        for name, option in {
+            "baselines": "--baselines ridge",
+            "minutes": "--minutes 5",
+            "at_most": "--at-most 2",
+            "channel_importance": "--channel-importance",
+            "workers": "--workers 2",
+            "cluster": "--cluster there:1",
+        }.items()
+    },
+    ("evaluate", "predictor"): "evaluate run --predictor there",
+    ("monitor fit", "minutes"): """monitor fit there --out new --minutes 3 --set 'residuals=[{kind="balances"}]'""",
+    ("parity", "interpreters"): "parity run --form c --onnxruntime there",
+    ("pretrain", "changes.pretrain"): "pretrain there --out new --set pretrain.shots=4",
+    ("report", "limit"): "report twin_run --limit there",
+    ("report", "budget"): "report twin_run --budget there",
+    **{("screen", f"changes.{table}"): f"screen there --out new --set {table}.any=1" for table in TRIAL_TABLES},
+    ("search run", "budget"): "search there --study new --budget budget.toml --set search.compression.on=false",
+    ("simulate", "changes.limit"): "simulate new --set limit.moments=60",
+    ("train", "minutes"): "train there --out new --preset quick --minutes 5",
+    ("train", "workers"): "train there --out new --preset quick --workers 2",
+    ("twin", "minutes"): "twin there --out new --set twin.kind=recurrent --minutes 5",
+    ("twin", "workers"): "twin there --out new --set twin.kind=static --workers 2",
+}
+"""A command line for each option of `DEPENDENT`, with settings or files by which it has no effect."""
+MORE_LINES = [
+    (("evaluate", "minutes"), "evaluate run --minutes 5 --workers 2"),
+    (("evaluate", "minutes"), "evaluate run --minutes 5 --baselines none"),
+    (("simulate", "changes.limit"), "simulate new --set seed=3 --set limit={moments=4}"),
+    (("train", "workers"), "train there --out new --workers 2 --set training.epochs=3"),
+    (("twin", "minutes"), "twin there --out new --start there --minutes 5"),
+    (("twin", "workers"), "twin there --out new --set ground=drag --start there --workers 2"),
+    (("twin", "workers"), "twin there --out new --set twin.kind=greybox --workers 2"),
+]
+
+
+def test_every_dependent_option_has_a_command_line():
+    assert set(LINES) == set(DEPENDENT)
+    assert {"trials", *TRAINING_TABLES} == set(TRIAL_TABLES)
+
+
+@pytest.mark.parametrize(("option", "line"), [*LINES.items(), *MORE_LINES])
+def test_an_option_without_effect_by_settings_or_files_is_refused(option, line, edp, tmp_path):
+    for name, content in FREE_RUNS.items():
+        file = tmp_path / "twin_run" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(content)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "budget.toml").write_text("")
+    (command, name), words = option, shlex.split(line)
+    code, err, left = edp(*words)
+    parameter, _, table = name.partition(".")
+    said = f"{word(command, parameter)} {table}" if table else f"{word(command, parameter)}: it"
+    assert code == 1
+    assert f"error: {said}" in err
+    assert f"it has no effect without {DEPENDENT[option]}; leave" in err
+    assert err.count("error:") == 1
+    assert left == ["budget.toml", "run", "twin_run"]
+
+
+@pytest.mark.parametrize("kind", list(CONTROLLERS))
+@pytest.mark.parametrize("command", ["control new", "tune new", "live --loop grade"])
+def test_a_model_that_no_part_of_the_controller_uses_is_refused(kind, command, edp):
+    """Every registered controller: each model that it does not need, and the second of two alternatives."""
+    needs = " ".join(CONTROLLERS[kind].needs).split()
+    unused = [[f"--{name}", "there"] for name in ("twin", "predictor") if name not in needs]
+    if "or" in needs:
+        unused.append(["--predictor", "there", "--twin", "there"])
+    for words in unused:
+        code, err, left = edp(*command.split(), "--controller", kind, *words)
+        assert code == 1
+        assert f"error: {words[-2]}: it has no effect with the controller '{kind}'" in err
+        assert left == []
 
 
 def test_a_map_and_repairs_belong_to_logs_in_every_command():

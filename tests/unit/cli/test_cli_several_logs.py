@@ -11,32 +11,51 @@ from typer.testing import CliRunner
 from edp.cli import app
 from edp.errors import ConfigError
 from edp.logs.source import DataSource
+from edp.workflows.api.recordings import read
 
 ONE_LOG = {
     ("rollout", "log"): "one log is run along",
-    ("init", "logs"): "one log or folder is described, whose path the proposed commands repeat",
-    ("search", "run", "data"): "a study belongs to one folder",
+    ("live", "log"): "one log is played",
 }
-"""Arguments of one path, each with the reason; any other argument of logs takes several."""
-LOGS = {"data", "logs", "log", "recordings"}
+"""Parameters of one path, each with the reason; any other parameter of logs takes several."""
+LOGS = {"data", "logs", "log", "arguments", "paths", "further", "w8a16"}
 
 
-def _arguments(group, path=()):
+def _commands(group, path=()):
     for name, command in sorted(group.commands.items()):
         here = (*path, name)
         if hasattr(command, "commands"):
-            yield from _arguments(command, here)
-            continue
-        for parameter in command.params:
-            if parameter.param_type_name == "argument" and parameter.name in LOGS:
-                yield (*here, parameter.name), parameter
+            yield from _commands(command, here)
+        else:
+            yield here, command.params
 
 
-def test_every_argument_of_logs_takes_several_paths():
-    several = {where: parameter.nargs == -1 for where, parameter in _arguments(typer.main.get_command(app))}
-    assert len(several) >= 10
+EVERY = dict(_commands(typer.main.get_command(app)))
+
+
+def _takes_several(parameter):
+    return parameter.nargs == -1 or getattr(parameter, "multiple", False)
+
+
+def test_every_argument_and_option_of_logs_takes_several_paths():
+    several = {
+        (*command, parameter.name): _takes_several(parameter)
+        for command, parameters in EVERY.items()
+        for parameter in parameters
+        if parameter.name in LOGS
+    }
+    assert len(several) >= 20
     one = {where for where, many in several.items() if not many}
     assert one == set(ONE_LOG)
+
+
+def test_every_command_with_a_map_takes_several_logs():
+    """A later command may name its logs otherwise, but a map belongs to logs."""
+    for command, parameters in EVERY.items():
+        names = {parameter.name for parameter in parameters}
+        if "signal_map" in names and not any((*command, name) in ONE_LOG for name in names):
+            several = [parameter.name for parameter in parameters if _takes_several(parameter)]
+            assert set(several) & LOGS, (command, several)
 
 
 @pytest.fixture
@@ -72,3 +91,35 @@ def test_a_data_set_file_or_a_store_comes_alone(logs):
         DataSource.of([logs / "a", logs / "set.toml"])
     with pytest.raises(ConfigError, match="came with 1 other path"):
         DataSource.of([Path("s3://bucket/logs"), logs / "a"])
+
+
+def test_an_empty_list_of_paths_is_refused():
+    with pytest.raises(ConfigError, match="got an empty list of paths"):
+        DataSource.of([])
+    with pytest.raises(ConfigError, match="got an empty list of paths"):
+        read([])
+
+
+def test_recordings_of_several_paths_are_read_in_python(logs):
+    together = read([logs / "a", str(logs / "b" / "three.csv")])
+    assert together.recording_names == ("one", "two", "three")
+    assert together.source.paths == (logs / "a", logs / "b" / "three.csv")
+
+
+def test_all_paths_count_in_the_name_of_a_source(logs):
+    a, b = logs / "a", logs / "b"
+    assert DataSource.of(a / "one.csv").short_name == "one"
+    assert DataSource.of([a, b]).short_name.startswith("a_and_1_more_")
+    names = [DataSource.of(paths).short_name for paths in (a, [a, b], [a, b / "three.csv"], [a / "one.csv", b])]
+    assert len(set(names)) == len(names)
+    assert DataSource.of([a, b]).short_name[1:] == DataSource.of([b, a]).short_name[1:]
+    assert len(DataSource.of(logs / ("n" * 200)).short_name) < 150
+
+
+def test_a_map_is_proposed_for_several_logs(logs):
+    chosen = [str(logs / "a" / "one.csv"), str(logs / "b")]
+    result = CliRunner().invoke(app, ["init", *chosen, "--out", str(logs / "described"), "--yes", "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert [Path(path).stem for path in found["logs"]] == ["one", "three"]
+    assert all(path in command for path in chosen for command in found["next"][:2])

@@ -127,7 +127,7 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
 
 
 def test_a_budget_is_that_of_a_choice(edp, logs, tmp_path):
-    assert "only a choice among formulations has a budget" in " ".join(
+    assert "--minutes: it has no effect without a choice among formulations" in " ".join(
         edp("twin", logs, "--out", tmp_path / "run", *WORDS, "--minutes", 1).err.split()
     )
     assert "--minutes: got -1" in " ".join(edp("twin", logs, "--out", tmp_path / "run", "--minutes", -1).err.split())
@@ -264,7 +264,8 @@ def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, l
     shown = edp("evaluate", run, "--data", other, "--predictor", tmp_path / "predictor").out
     for text in ("share of free runs in intervals", "at rest", "in motion", "told the commands", "it is flattered"):
         assert text.removeprefix("at ").removeprefix("in ") in " ".join(shown.split())
-    assert "no --baselines" in edp("evaluate", run, "--baselines", "none").err
+    refused = edp("evaluate", run, "--baselines", "none").err
+    assert "--baselines: it has no effect without the run of a network" in refused
 
 
 def test_a_rollout_prints_the_error_of_each_channel_by_time(edp, logs, trained):

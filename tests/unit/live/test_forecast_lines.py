@@ -83,7 +83,7 @@ def test_what_cannot_be_shown_is_one_error(tiny, run, tmp_path):
     write_recording(recording_of(tiny), log)
     for words, text in (
         ((folder, log, "--out", tmp_path / "a.gif"), "drawn on a page"),
-        ((log, "--horizon", "1"), "give a run before the log"),
+        ((log, "--horizon", "1"), "--horizon: it has no effect without a run before the log"),
         ((folder, log, log), "3 paths were given"),
     ):
         done = CliRunner().invoke(app, ["animate", *map(str, words)])

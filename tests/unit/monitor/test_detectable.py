@@ -22,7 +22,9 @@ from edp.monitor.detectable import (
     unseen_line,
 )
 from edp.monitor.monitor_file import load_monitor, save_monitor
+from edp.recording import Recording
 from edp.report.monitor.facts import headline, verdict
+from edp.signals import Channel, Kind
 from edp.testing.monitor import rig_sessions
 from edp.workflows.monitor import report_monitor, run_monitor
 
@@ -97,6 +99,21 @@ def test_a_change_begins_at_the_onset_and_has_its_size(change):
     assert changed[60:] == pytest.approx(expected[60:], rel=1e-5)
     assert changed.dtype == np.float32
     assert len(changed) == len(values)
+
+
+def test_a_scale_of_a_temperature_acts_on_degrees_celsius(monkeypatch):
+    module = importlib.import_module("edp.monitor.detectable")
+    seen = []
+    monkeypatch.setattr(module, "_alarms", lambda monitor, recording: seen.append(recording.values.copy()) or [])
+    channels = (Channel("oil", Kind.TEMPERATURE), Channel("p", Kind.PRESSURE))
+    values = np.tile(np.array([273.15 + 40.0, 2e7], np.float32), (100, 1))
+    segment = Recording("log", channels, values, 100.0)
+    for name in ("oil", "p"):
+        module._delays(None, [segment], name, INJECTIONS[Change.SCALE], 0.1)
+    after = [table[-1] for table in seen]
+    # Up and down by a tenth: 44 and 36 degC, as the logger would show them, not 344 and 282 K.
+    assert [row[0] - 273.15 for row in after[:2]] == pytest.approx([44.0, 36.0], abs=1e-3)
+    assert [row[1] for row in after[2:]] == pytest.approx([2.2e7, 1.8e7])
 
 
 def test_each_change_has_its_line_and_older_monitors_are_shifts(monitor):

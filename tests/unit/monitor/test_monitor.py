@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edp.config.monitor import load_monitor_experiment
-from edp.errors import BundleError, ConfigError, DataError
+from edp.errors import BundleError, ConfigError, DataError, EdpError
 from edp.monitor.monitor_file import HEADER, load_monitor, save_monitor
 from edp.monitor.watches import _averaged, _averages
 from edp.recording import Recording
@@ -138,16 +138,24 @@ def test_too_few_hours_name_the_rate_that_they_support(healthy):
     [
         (("chain.block_s=15",), "too few for an operating point"),
         (("chain.block_s=1.1", "chain.folds=2", "train_share=0.8"), "too few for a covariance"),
+        (
+            ("dictionary.machine=M22", "chain.block_s=0.8"),
+            "0 stretches of 40 healthy blocks are too few",
+        ),
+        (("dictionary.machine=M22", "chain.block_s=0.2"), "'M22' has none of the monitor's channels"),
     ],
 )
-def test_too_few_blocks_are_refused_before_a_residual_is_fitted(healthy, monkeypatch, changes, message):
+def test_what_no_monitor_can_be_made_from_is_refused_before_a_residual_is_fitted(
+    healthy, monkeypatch, changes, message
+):
     def called(job):
         pytest.fail("a residual is fitted before the refusal")
 
     monkeypatch.setattr(sys.modules["edp.workflows.monitor.fit_monitor"], "_fit_source", called)
     experiment = load_monitor_experiment(None, changes, {"hours_per_false_alarm": 0.02})
-    with pytest.raises(DataError, match=message):
-        fit_to_recordings(healthy[:8], experiment)
+    sessions = healthy if any("M22" in change for change in changes) else healthy[:8]
+    with pytest.raises(EdpError, match=message):
+        fit_to_recordings(sessions, experiment)
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 3, 7])

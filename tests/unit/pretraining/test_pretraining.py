@@ -15,13 +15,13 @@ from edp.errors import BundleError, ConfigError, DataError, StorageError
 from edp.networks.decomposition import decompose
 from edp.networks.predictor import build_model
 from edp.report import build_report
-from edp.report.common.wording import number
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.adaptation import adapt, loss_with
 from edp.training.objective import Objective
 from edp.training.strategy import EpisodicStrategy
 from edp.training.validation import validation_scores
+from edp.wording import number
 from edp.workflows.pretraining import PRETRAININGS, MetaSpec, Pretrain, pretrain
 from edp.workflows.train_evaluate import evaluate
 from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune

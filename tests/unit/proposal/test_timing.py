@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def written(proposal: LogsProposal, folder: Path) -> DataSource:
     write_proposal(proposal, folder)
     if DATA in proposal.files:
         return DataSource.of(folder / DATA)
-    return DataSource(proposal.source, load_signal_map(folder / MAP))
+    return replace(proposal.source, signal_map=load_signal_map(folder / MAP))
 
 
 def test_logs_of_several_rates_are_brought_to_one_so_that_training_can_read_them(tmp_path):

@@ -68,6 +68,24 @@ def test_a_run_with_less_error_everywhere_is_told_apart(pair):
     assert "less error (95 % interval" in comparison.headline()
 
 
+@pytest.mark.parametrize(("recordings", "samples"), [(6, None), (1, 9000)])
+def test_two_equal_runs_are_not_distinguishable(make_run, recordings, samples):
+    run = make_run("first", recordings=recordings, **({"samples": samples} if samples else {}))
+    comparison = compare_runs([run, shutil.copytree(run, run.parent / "second")])
+    for measure in comparison.measures:
+        difference = comparison.differences(measure)["second"]
+        assert (difference.p, difference.change, difference.told_apart) == (1.0, 0.0, False)
+    assert "second is not distinguishable (0.0 %" in comparison.headline()
+
+
+def test_a_difference_of_rounding_is_not_told_apart(make_run):
+    run = make_run("first", recordings=6)
+    comparison = compare_runs(
+        [run, changed(run, "second", [1 - 1e-7, 1 - 2e-7, 1 - 1e-7, 1 - 2e-7, 1 - 1e-7, 1 - 2e-7])]
+    )
+    assert not comparison.differences(comparison.measures[0])["second"].told_apart
+
+
 def test_the_interval_is_that_of_a_paired_t_test(pair):
     from scipy.stats import ttest_rel
 

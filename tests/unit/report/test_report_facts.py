@@ -5,7 +5,6 @@ import pytest
 from edp.errors import DataError, StorageError
 from edp.evaluation.guard import network_verdict
 from edp.report.common.tables import comparison_tables, key_figures
-from edp.report.common.wording import decimals_for, duration, listed, number, percent, unbroken
 from edp.report.run.facts import (
     NETWORK,
     comparison_rows,
@@ -18,6 +17,7 @@ from edp.report.run.facts import (
 )
 from edp.report.run.outputs import judged_line
 from edp.storage import write_json
+from edp.wording import decimals_for, duration, listed, number, percent, unbroken
 
 
 def edit_scores(folder, change):

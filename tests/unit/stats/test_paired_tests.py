@@ -1,10 +1,12 @@
 """Tests of paired differences: by hand, in their limits, and with what fails."""
 
+import inspect
 import math
 
 import numpy as np
 import pytest
 
+import edp.stats
 from edp.errors import DataError
 from edp.stats import (
     adjust_registered,
@@ -15,6 +17,7 @@ from edp.stats import (
     fill_worst,
     holm,
     kendalls_w,
+    main_effects,
     mixed_model,
     paired,
     paired_t,
@@ -63,9 +66,41 @@ def test_a_design_that_is_not_finished_counts_what_it_has():
     assert fill_worst(np.stack([table, table]), mask)[:, 3:].max() == 0.0
 
 
-@pytest.mark.parametrize("test", [clustered_t, paired_t, lambda d: mixed_model(d, np.zeros_like(d)).effect])
-def test_a_module_that_changes_nothing_is_no_improvement(test):
-    assert test(np.zeros((4, 6))).p == pytest.approx(1.0)
+MEAN_TESTS = {
+    "clustered_t": clustered_t,
+    "paired_t": paired_t,
+    "resampled_t": lambda d: resampled_t(d, 0.25),
+    "mixed_model": lambda d: mixed_model(d, np.zeros_like(d)).effect,
+}
+
+
+def test_every_test_of_a_mean_is_listed_here():
+    """A new function of `edp.stats` with a `MeanTest` or `MixedModel` result fails here."""
+    results = {name: inspect.signature(one).return_annotation for name, one in inspect.getmembers(edp.stats, callable)
+               if inspect.isfunction(one)}  # fmt: skip
+    assert {name for name, result in results.items() if result in ("MeanTest", "MixedModel")} == set(MEAN_TESTS)
+
+
+@pytest.mark.parametrize("name", sorted(MEAN_TESTS))
+def test_equal_predictions_are_no_difference_one_sided_and_two_sided(name):
+    test = MEAN_TESTS[name](np.zeros((4, 6)))
+    assert test.p == pytest.approx(1.0)
+    assert test.two_sided == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", sorted(MEAN_TESTS))
+def test_the_two_sided_p_value_is_twice_the_smaller_tail_on_both_sides(name):
+    rows = np.random.default_rng(3).normal(0.3, 1.0, size=(4, 6))
+    better, worse = MEAN_TESTS[name](-rows), MEAN_TESTS[name](rows)
+    assert better.two_sided == pytest.approx(2 * np.minimum(better.p, worse.p))
+    assert better.two_sided == pytest.approx(worse.two_sided)
+
+
+def test_main_effects_of_equal_scores_pass_nothing():
+    levels = np.array([[True, True], [True, False], [False, True], [False, False]] * 2)
+    for score in (0.0, 0.1, 1e6 / 3):
+        for effect in main_effects(levels, ("a", "b"), np.full(8, score)):
+            assert (effect.p, effect.passed) == (1.0, False)
 
 
 def test_equal_differences_speak_for_themselves():

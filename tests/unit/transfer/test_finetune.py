@@ -56,6 +56,9 @@ def test_every_method_is_judged_on_the_same_ticks_in_both_domains(tuned):
         assert len(counts) == 1, domain
     mae = {name: row["domains"]["target"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
     assert all(np.isfinite(value) for value in mae.values())
+    logs = [set(row["recordings"]) for row in found["methods"].values()]
+    assert logs == [logs[0]] * len(found["methods"])
+    assert len(logs[0]) == found["data"]["recordings"]
     assert mae["two_phase"] < mae["direct"]
     assert mae["full"] < mae["direct"]
     kept = {name: row["domains"]["source"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
@@ -299,7 +302,7 @@ def test_skew_and_squares_are_those_of_scipy(tiny):
         np.stack([part.targets] * 2, axis=1) + rng.gamma(2.0, 0.01, (part.samples, 2, 3)).astype(np.float32)
         for part in tiny.test
     ]
-    found, errors = measure(predictions, tiny, 10), errors_of(predictions, tiny, 10)
+    found, errors = measure(predictions, tiny, 10).overall, errors_of(predictions, tiny, 10)
     for horizon in ("1", "3"):
         for place, name in enumerate(tiny.task.targets):
             row, own = found[horizon][name], errors[horizon][:, place]

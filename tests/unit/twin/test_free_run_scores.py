@@ -133,7 +133,11 @@ def test_errors_by_horizon_recording_and_way_of_driving():
     assert scores["by_horizon"]["pressures"]["unit"] == "bar"
     assert list(scores["by_recording"]) == ["a", "b"]
     assert scores["by_recording"]["b"]["velocity_mae"]["by_channel"]["v1"] == pytest.approx(3.0, abs=1e-3)
-    assert scores["by_recording"]["b"]["stroke_error"][0]["by_channel"]["x2"] == pytest.approx(4.0, abs=1e-3)
+    assert scores["by_recording"]["b"]["stroke_error"][-1]["by_channel"]["x2"] == pytest.approx(4.0, abs=1e-3)
+    # The verdict compares recordings at the times at which it compares all of them.
+    assert {row["at_s"] for row in scores["stroke_error"]} <= {
+        row["at_s"] for row in scores["by_recording"]["b"]["stroke_error"]
+    }
     assert scores["by_driving"]["grade"] == scores["by_recording"]["b"]
     assert free_run_scores(runs(), at(0.5), labels={"a": "dig"})["by_driving"] == {}
 
@@ -192,7 +196,7 @@ def test_a_look_ahead_is_measured_up_to_its_moment_and_told_the_commands_after_i
 
 
 def _scores(velocity, *strokes):
-    rows = [{"by_channel": {"boom": value}} for value in strokes]
+    rows = [{"at_s": float(at), "by_channel": {"boom": value}} for at, value in enumerate(strokes, 1)]
     return {"velocity_mae": {"by_channel": {"v": velocity}}, "stroke_error": rows}
 
 
@@ -204,9 +208,7 @@ def test_a_twin_that_a_floor_beats_is_told_by_how_much():
     assert beaten.label == "static"
     assert beaten.less == pytest.approx(0.5)  # a cube root of 1 * 1 * 8
     assert beaten.outputs == ("v",)
-    assert (
-        "static has 50.0 % less error than the twin (on v): do not use this twin; take that floor" in beaten.sentence()
-    )
+    assert "static has 50 % less error than the twin (on v): do not use this twin; take that floor" in beaten.sentence()
 
 
 def test_a_twin_ahead_of_its_floors_is_not_beaten():

@@ -31,6 +31,7 @@ from edp.control.reference import TipReference
 from edp.errors import ConfigError
 from edp.networks.twin import Twin
 from edp.settings.bounds import above, check_bounds, check_count, integer, span
+from edp.wording import figure
 
 Array = NDArray[np.float64]
 MOST_BLOCKS, MOST_BLOCK_TICKS = 30, 1_000
@@ -183,8 +184,10 @@ class NmpcController(Controller):
         tick_ms, first = 1e3 / self.model.plant.rate_hz, PredictiveControl.blocks
         longer = [*first[:-1], max(first[-1], enough - sum(first[:-1]))]
         raise ConfigError(
-            f"controller.blocks = {list(self.spec.blocks)} plans {ticks * tick_ms:g} ms ahead, but by its twin the "
-            f"machine takes {enough * tick_ms:g} ms from rest to half the speed that a lever asks for; plan {enough} "
+            f"controller.blocks = {list(self.spec.blocks)} plans {figure(ticks * tick_ms)} ms ahead, but by its twin "
+            "the "
+            f"machine takes {figure(enough * tick_ms)} ms from rest to half the speed that a lever asks for; plan "
+            f"{enough} "
             f"ticks or more, such as {longer}"
         )
 

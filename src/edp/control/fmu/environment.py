@@ -19,6 +19,7 @@ from edp.control.twin_environment import MIDDLE, OPTIONS, TIP, check_air
 from edp.errors import ConfigError, closest
 from edp.sim.environment.library import gymnasium
 from edp.sim.scenario import SimulationError
+from edp.wording import figure, setting_text
 
 Array = NDArray[np.float64]
 REST_S = 2.0
@@ -186,6 +187,6 @@ def _check_step(description: FmuDescription, rate_hz: float, where: str) -> None
     whole = max(1, round(ratio)) if description.version == 3 else 1
     if abs(ratio - whole) > STEP_SLACK * whole:
         raise ConfigError(
-            f"{where} takes steps of {own:g} s ({1.0 / own:g} Hz), the loops have {rate_hz:g} Hz; set rate_hz = "
-            f"{1.0 / own:g}"
+            f"{where} takes steps of {figure(own)} s ({figure(1.0 / own)} Hz), the loops have {figure(rate_hz)} Hz; "
+            f"set rate_hz = {setting_text(1.0 / own)}"
         )

@@ -16,6 +16,7 @@ from edp.networks.twin import Twin
 from edp.settings.bounds import MOST_SEED, above, check_bounds, integer, span
 from edp.signals import TABLE_A1, Kind
 from edp.sim.environment import EnvironmentSpec
+from edp.wording import figure, setting_text
 
 PRESSURES = tuple(name for name, channel in TABLE_A1.items() if channel.kind is Kind.PRESSURE)
 OBSERVED = (*VELOCITIES, *STROKES, *PRESSURES)
@@ -93,7 +94,8 @@ class LearningSpec:
             raise ConfigError(f"task environment: seeds = {list(self.seeds)}; the lowest and the highest must hold")
         if not self.ticks > self.hold or self.ticks > MOST_TICKS:
             raise ConfigError(
-                f"task environment: duration_s = {self.duration_s:g} at {self.rate_hz:g} Hz is {self.ticks} ticks; "
+                f"task environment: duration_s = {setting_text(self.duration_s)} at {figure(self.rate_hz)} Hz is "
+                f"{self.ticks} ticks; "
                 f"more than one action ({self.hold} ticks) and at most {MOST_TICKS} must hold"
             )
         for name in self.simulator:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from edp.data.screening.compiled import spread
 from edp.data.screening.linear import Tap, gram, peaks, unexplained
 from edp.data.screening.result import Array, Flag, FlagKind
+from edp.wording import figure, number
 
 LEAKING, DETERMINED = 0.25, 0.5
 """Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak; the
@@ -132,7 +133,8 @@ def _leak(
         names[source],
         -ahead,
         share,
-        f"the pasts of the other channels leave {left[0]:.3g} of its variance; {names[source]} up to {ahead} samples "
+        f"the pasts of the other channels leave {figure(left[0], 3)} of its variance; {names[source]} up to {ahead} "
+        "samples "
         f"later takes away {100 * share:.0f} % of that: it knows what has not happened yet"
         + (f" (or it causes {names[source]}: then name it as trusted)" if differences else ""),
     )
@@ -216,13 +218,19 @@ def _copy_flag(names: Sequence[str], pair: CopiedChannel, trusted: bool) -> Flag
     name, source, value = names[pair.copy], names[pair.source], abs(pair.correlation)
     if pair.lag < -SLACK and trusted:
         text = (
-            f"shows {source} {-pair.lag} samples before {source} itself does (correlation {value:.4f}): it knows the "
+            f"shows {source} {-pair.lag} samples before {source} itself does (correlation {number(value, 4)}): it "
+            "knows the "
             "future, or a faster sensor measures the same; if the latter, name it as trusted"
         )
         return Flag(name, FlagKind.LEAK, source, pair.lag, value, text)
     if abs(pair.lag) <= SLACK:
-        return Flag(name, FlagKind.DUPLICATE, source, pair.lag, value, f"equals {source} (correlation {value:.4f})")
-    text = f"is {source} {pair.lag} samples later (correlation {value:.4f}), and what is left of it relates to nothing"
+        return Flag(
+            name, FlagKind.DUPLICATE, source, pair.lag, value, f"equals {source} (correlation {number(value, 4)})"
+        )
+    text = (
+        f"is {source} {pair.lag} samples later (correlation {number(value, 4)}), and what is left of it relates to "
+        "nothing"
+    )
     if not trusted:
         text += f"; or {source} knows its future: see which of the two is measured, and name it as trusted"
     return Flag(name, FlagKind.COPY, source, pair.lag, value, text)
@@ -249,7 +257,7 @@ def explained_flags(
         taps = [(k, a) for k in others for a in (_LONG_PAST if k in near else _SPARSE_PAST) if a <= reach]
         if not taps or (left := unexplained(correlations, channel, taps)[1]) > EXPLAINED:
             continue
-        text = f"the presents and pasts of {names[near[0]]} and others make up all but {100 * left:.2g} % of it"
+        text = f"the presents and pasts of {names[near[0]]} and others make up all but {figure(100 * left, 2)} % of it"
         value = 1.0 - left
         flags.append(Flag(names[channel], FlagKind.REDUNDANT, names[near[0]], value=value, evidence=text))
         # From now on it explains no other channel, so that something remains of each set.

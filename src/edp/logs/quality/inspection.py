@@ -24,6 +24,7 @@ from edp.logs.resolve import ChannelSource, resolve
 from edp.logs.timebase import Clock, judge
 from edp.recording import Recording
 from edp.signals import VOCABULARY, Kind, SignalMap
+from edp.wording import figure
 
 # Everything is read, so that every defect can be found and counted.
 _LEFT_OUT = {
@@ -216,19 +217,27 @@ def _time_findings(name: str, clock: Clock, repair: Repair) -> list[Finding]:
     defects = (
         ("falling", clock.falling, f"time goes back ('{name}')", back),
         ("duplicates", clock.duplicates, f"duplicate time stamps ('{name}')", '"last" (--repair duplicates=last)'),
-        ("gaps", clock.gaps, f"gaps in time ('{name}'), longest {longest:g} s", '"hold" or "cut" (--repair gaps=hold)'),
+        (
+            "gaps",
+            clock.gaps,
+            f"gaps in time ('{name}'), longest {figure(longest)} s",
+            '"hold" or "cut" (--repair gaps=hold)',
+        ),
     )
     for defect, rows, what, how in defects:
         if not len(rows):
             continue
-        where = f"{'after ' if defect == 'gaps' else ''}row {int(rows[0])} (t = {at[rows[0]]:g} s)"
+        where = f"{'after ' if defect == 'gaps' else ''}row {int(rows[0])} (t = {figure(at[rows[0]])} s)"
         allowed = getattr(repair, defect)
         severity, advice = "error", f"repair {defect} = {how}"
         if allowed != "refuse":
             severity, advice = "warning", f"repaired when it is read: {defect} = {allowed}"
         findings.append(Finding(severity, None, what, len(rows), where, advice))
     if not clock.uniform:
-        what = f"time steps are not uniform ('{name}'): rms {clock.jitter:.3g} of a step, median {clock.step_s:g} s"
-        advice = f"rows are resampled causally to {clock.rate_hz:g} Hz; set rate_hz for another rate"
+        what = (
+            f"time steps are not uniform ('{name}'): rms {figure(clock.jitter, 3)} of a step, median "
+            f"{figure(clock.step_s)} s"
+        )
+        advice = f"rows are resampled causally to {figure(clock.rate_hz)} Hz; set rate_hz for another rate"
         findings.append(Finding("note", None, what, len(at), "", advice))
     return findings

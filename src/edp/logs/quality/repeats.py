@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.logs.quality.sketches import Floats, Sketch
+from edp.wording import number
 
 WINDOW = 128
 """Blocks of a fingerprint, 12.8 s."""
@@ -90,7 +91,7 @@ class Repeat:
         return (
             f"'{self.second}' from {self.second_from_s:.1f} s repeats {self.seconds:.0f} s of '{self.first}' from "
             f"{self.first_from_s:.1f} s ({100 * self.share:.0f} % of the shorter one; correlation "
-            f"{self.correlation:.4f}, {self.channels} of {self.compared} channels{names})"
+            f"{number(self.correlation, 4)}, {self.channels} of {self.compared} channels{names})"
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError
+from edp.errors import DataError, count_of
 
 Array = NDArray[np.float64]
 SHORT, LONG = 8, 40
@@ -53,6 +53,20 @@ def parts_of(rows: Array, fresh: bool = True) -> tuple[Array | None, Array | Non
     return rows[:ONSET], rows[ONSET:] if len(rows) > ONSET else None
 
 
+def check_stretches(lengths: Sequence[int]) -> None:
+    """Refuse healthy sessions that are too short for a diagnosis, by their numbers of blocks.
+
+    Raises:
+        DataError: too few stretches of `LONG` blocks.
+    """
+    count = sum(length // LONG for length in lengths)
+    if count < LEAST_SESSIONS:
+        raise DataError(
+            f"{count_of(count, 'stretch')} of {LONG} healthy blocks {'is' if count == 1 else 'are'} too few for a "
+            f"diagnosis; bring {LEAST_SESSIONS} at least, or leave the dictionary out (--machine none)"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Scatter:
     """Means of features on healthy sessions: where they lie, and how they scatter over few and over many blocks.
@@ -76,12 +90,8 @@ class Scatter:
         Raises:
             DataError: too few sessions of `LONG` blocks.
         """
+        check_stretches([len(session) for session in sessions])
         windows = {length: _windows(sessions, length) for length in (SHORT, LONG)}
-        if len(windows[LONG]) < LEAST_SESSIONS:
-            raise DataError(
-                f"{len(windows[LONG])} stretches of {LONG} healthy blocks are too few for a diagnosis; bring "
-                f"{LEAST_SESSIONS} at least"
-            )
         mean = windows[SHORT].mean(axis=0)
         short = np.cov(windows[SHORT], rowvar=False)
         # What never varies on healthy sessions has no scale of its own, and is left out: its row stays zero.

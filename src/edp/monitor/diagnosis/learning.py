@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.errors import DataError
 from edp.monitor.diagnosis.causes import FaultClass
-from edp.monitor.diagnosis.evidence import ONSET, Scatter, mean_features
+from edp.monitor.diagnosis.evidence import ONSET, Scatter, check_stretches, mean_features
 from edp.monitor.diagnosis.matching import Candidates, Seen, candidates, judged, likelihoods
 from edp.monitor.diagnosis.signatures import Dictionary, signatures_of
 from edp.monitor.diagnosis.structure import confusions
@@ -45,6 +46,23 @@ class SimulatedFault:
     size: float
     change: Array
     sensors: Mapping[str, Array]
+
+
+def check_healthy_blocks(lengths: Sequence[int]) -> None:
+    """Refuse healthy sessions from which `fit_dictionary` could not learn, before faults are simulated.
+
+    Args:
+        lengths: blocks of each session.
+
+    Raises:
+        DataError: too few stretches, or no session as long as what an alarm looks at.
+    """
+    check_stretches(lengths)
+    if max(lengths) < ONSET + WINDOW:
+        raise DataError(
+            f"the longest healthy session has {max(lengths)} blocks, a diagnosis needs one of {ONSET + WINDOW}; bring "
+            "a longer session, or leave the dictionary out (--machine none)"
+        )
 
 
 def fit_dictionary(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 
 from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause, FaultClass
+from edp.wording import number
 
 UNKNOWN = "something changed that no fault of the dictionary explains"
 UNNAMED = "the machine or a sensor behaves otherwise than on the healthy sessions"
@@ -18,7 +19,7 @@ def size_text(size: float, unit: str) -> str:
     """A size with two to three digits and its unit, without its sign."""
     value = abs(size)
     digits = max(0, 1 - math.floor(math.log10(value))) if value > 0.0 else 0
-    text = f"{value:.{min(digits, 4)}f}"
+    text = number(value, min(digits, 4))
     return f"{text}x" if unit == "x" else f"{text} {unit}".rstrip()
 
 

@@ -26,6 +26,7 @@ from edp.monitor.residuals.base import (
 )
 from edp.monitor.residuals.committees import constant_channels
 from edp.settings.bounds import check_bounds, span
+from edp.wording import figure, setting_text
 
 Array = NDArray[np.float64]
 PREFIX = "cycle:"
@@ -141,13 +142,15 @@ class CyclesSpec(ResidualSpec):
         ticks = round(exact)
         if not 1 <= ticks <= MOST_TICKS or abs(exact - ticks) > UNEVEN:
             raise DataError(
-                f"cycles: period_s = {self.period_s:g} is {exact:.9g} ticks of {material.rate_hz:g} Hz; a whole number "
+                f"cycles: period_s = {setting_text(self.period_s)} is {figure(exact)} ticks of "
+                f"{figure(material.rate_hz)} Hz; a whole number "
                 f"of 1 to {MOST_TICKS} must hold, since each cycle begins at a tick"
             )
         whole = [log.samples // ticks if self.period_s else 1 for log in logs]
         if sum(whole) < LEAST_CYCLES:
             raise DataError(
-                f"cycles: {sum(whole)} cycles of {ticks / material.rate_hz:g} s are in the healthy logs that train; "
+                f"cycles: {sum(whole)} cycles of {figure(ticks / material.rate_hz)} s are in the healthy logs that "
+                "train; "
                 f"{LEAST_CYCLES} at least must hold: bring more logs, or give the length of a cycle as period_s"
             )
         parts = [

@@ -28,6 +28,7 @@ from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.load import LoadEstimate
 from edp.registry import Registry
 from edp.settings.bounds import above, check_bounds, integer, span
+from edp.wording import figure
 
 Array = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -104,7 +105,9 @@ class TunedSpec:
         check_bounds("tuning", self, learn_ticks=integer(2, 1000), forgetting_s=above(0.0, 1e6), gain=span(0.0, 1.0),
                      load_share=span(0.0, 1.0))  # fmt: skip
         if not (math.isnan(self.oil_c) or abs(self.oil_c) <= HOTTEST_C):
-            raise ConfigError(f"tuning: oil_c = {self.oil_c}; degrees Celsius within {HOTTEST_C:g}, or NaN, must hold")
+            raise ConfigError(
+                f"tuning: oil_c = {self.oil_c}; degrees Celsius within {figure(HOTTEST_C)}, or NaN, must hold"
+            )
         for name in self.groups:
             NUMBER_GROUPS[name]
         if not self.groups:

@@ -18,6 +18,7 @@ from edp.recording import Recording
 from edp.report.common.templates import asset, stylesheet, template
 from edp.signals import GROUND_POINTS, display_offset
 from edp.storage import write_bytes
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from edp.sim import Machine
@@ -108,7 +109,8 @@ def scene_of(
     chosen = load_machine(machine or _machine_of(recording))
     if not 0.0 <= start_s < recording.duration_s or (seconds is not None and not seconds > 0.0):
         raise ConfigError(
-            f"start {start_s:g} s and seconds {seconds} of '{recording.name}': it lasts {recording.duration_s:g} s; "
+            f"start {figure(start_s)} s and seconds {seconds} of '{recording.name}': it lasts "
+            f"{figure(recording.duration_s)} s; "
             "the start must lie within, the length be positive"
         )
     length = min(seconds or LONGEST_S, LONGEST_S, recording.duration_s - start_s)
@@ -247,7 +249,7 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
     page = template("animation.html.jinja").render(
         name=scene.name,
         machine=f"{scene.machine.name}, {scene.machine.description}",
-        stretch=f"{scene.start_s:g} to {scene.start_s + seconds:g} s",
+        stretch=f"{figure(scene.start_s)} to {figure(scene.start_s + seconds)} s",
         style=Markup(stylesheet("animation.css")),
         **animation_parts(scene),
     )

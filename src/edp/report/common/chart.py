@@ -11,6 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.wording import unit_text
+
 INK, SOFT, RULE, FRAME = "#26303a", "#66717d", "#e4e8ec", "#c4cbd2"
 BLUE, GREY, DROPPED = "#0b57d0", "#3c4650", "#b4bcc5"
 MUTED = ("#c9892f", "#5a9c8c", "#a97da0", "#8b929a", "#a5a04a", "#b9705c")
@@ -325,7 +327,8 @@ def fits(mark: Mark, chosen: Mapping[str, str]) -> bool:
 
 def with_unit(text: str, unit: str) -> str:
     """An axis title, its unit in brackets."""
-    return f"{text} [{unit}]" if unit else text
+    shown = unit_text(unit)
+    return f"{text} [{shown}]" if shown else text
 
 
 def finite(value: float, digits: int = 5) -> float | None:

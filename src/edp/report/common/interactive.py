@@ -35,7 +35,7 @@ from edp.report.common.chart import (
     Texts,
     fits,
 )
-from edp.report.common.wording import printable_lines
+from edp.wording import printable_lines
 
 FONT = 'Inter, "Helvetica Neue", "Segoe UI", Roboto, Arial, sans-serif'
 SYMBOLS = {"triangle": "triangle-up", "ring": "circle-open", "tick": "line-ns-open", "dash": "line-ew-open"}

@@ -31,8 +31,8 @@ from edp.report.common.chart import (
     Range,
     Texts,
 )  # fmt: skip
-from edp.report.common.wording import printable_lines
 from edp.storage import make_folder, write_bytes
+from edp.wording import printable_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from edp.report.common.chart import with_unit
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, decimals_for, in_cell, in_markdown, number
 from edp.storage import make_folder, write_bytes
+from edp.wording import MISSING, decimals_for, in_cell, in_markdown, number, unit_text
 
 Value = float | int | str | None
 Show = Callable[[Value], str]
@@ -74,12 +75,12 @@ class Sheet:
 
     def table(self) -> TextTable:
         """For a page."""
-        columns = tuple((column.heading, column.unit) for column in self.columns)
+        columns = tuple((column.heading, unit_text(column.unit)) for column in self.columns)
         return TextTable(self.caption, columns, self.texts(), self.marked)
 
     def heads(self) -> list[str]:
         """Headings, each with its unit."""
-        return [f"{c.heading} [{c.unit}]" if c.unit else c.heading for c in self.columns]
+        return [with_unit(c.heading, c.unit) for c in self.columns]
 
     def markdown(self) -> str:
         """For a document: the caption and a table; what stands out is bold."""

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME
-from edp.report.common.wording import MISSING, count_text, decimals_for, duration, figure, moment, number, percent
 from edp.report.run.budget import budget_rows
 from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
+from edp.wording import MISSING, count_text, decimals_for, duration, figure, moment, number, percent, unit_text
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,15 @@ class TextTable:
     columns: tuple[tuple[str, str], ...]
     rows: tuple[tuple[str, ...], ...]
     marked: frozenset[int] = frozenset()
+
+    @property
+    def filled(self) -> TextTable:
+        """Table without the columns that are empty in every row, such as pressures of a machine without them."""
+        filled_places = [i for i in range(len(self.columns)) if not i or any(row[i] != MISSING for row in self.rows)]
+        if not self.rows or len(filled_places) == len(self.columns):
+            return self
+        columns = tuple(self.columns[i] for i in filled_places)
+        return replace(self, columns=columns, rows=tuple(tuple(row[i] for i in filled_places) for row in self.rows))
 
 
 _TILES = 3
@@ -82,7 +91,7 @@ def _by_output(facts: Facts, horizon: int | None) -> TextTable | None:
     names = [target.name for target in facts.targets]
     places = {name: decimals_for(row["outputs"][name] for row in rows) for name in names}
     lines = tuple((row["label"], *(number(row["outputs"][name], places[name]) for name in names)) for row in rows)
-    units = ["" if target.unit == "1" else target.unit for target in facts.targets]
+    units = [unit_text(target.unit) for target in facts.targets]
     columns = (("Model", ""), *((target.description, unit) for target, unit in zip(facts.targets, units)))
     marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
     return TextTable(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
@@ -250,8 +259,9 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
     ours = next((row for row in rows if row["is_network"]), None)
     if not facts.averaged and ours:
         for target in facts.targets[:_TILES]:
-            unit = "" if target.unit == "1" else target.unit
-            tiles.append((number(ours["outputs"][target.name]), unit, f"{MEASURE_NAME}, {target.name}"))
+            tiles.append(
+                (number(ours["outputs"][target.name]), unit_text(target.unit), f"{MEASURE_NAME}, {target.name}")
+            )
         ours = None
     if ours:
         tiles.append((number(ours[MEASURE]), facts.unit, f"{MEASURE_NAME} (root mean square of errors)"))

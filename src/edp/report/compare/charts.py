@@ -21,10 +21,10 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import figure, short_labels
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import FREE, ComparedRun, Measure
 from edp.report.run.figures import log_ticks
+from edp.wording import figure, short_labels
 
 MOST_ROWS = 40
 """Recordings that have a row of dots."""

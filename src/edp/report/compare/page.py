@@ -6,12 +6,12 @@ from pathlib import Path
 
 from edp.report.common.sheets import Column, Sheet, Value, chance, figures
 from edp.report.common.templates import template
-from edp.report.common.wording import count_text, number, percent, unbroken
 from edp.report.compare.charts import compare_charts
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import Measure
 from edp.report.run.page import shown
 from edp.storage import write_bytes
+from edp.wording import count_text, number, percent, unbroken
 
 
 def write_compare_page(comparison: Comparison, target: str | Path, title: str = "") -> Path:

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, count_of
-from edp.evaluation.guard import ErrorOutcome
-from edp.report.common.wording import figure, listed, number, percent
+from edp.evaluation.guard import LEAST, ErrorOutcome
 from edp.report.compare.runs import FREE, MEAN, ComparedRun, Measure, read_runs, recording_that_differs
 from edp.report.run.facts import NETWORK, TRUTH
 from edp.stats.multiple import holm
 from edp.stats.resampled import paired_t
+from edp.wording import figure, listed, number, percent
 
 FEWEST = 3
 """Common recordings from which an interval over recordings is given: two leave one degree of freedom."""
@@ -50,8 +50,8 @@ class RunDifference:
 
     @property
     def told_apart(self) -> bool:
-        """Whether the adjusted p-value is below 5 %."""
-        return self.p is not None and self.p < 0.05
+        """Whether the adjusted p-value is below 5 % and the change is more than rounding and threads make."""
+        return self.p is not None and self.p < 0.05 and abs(self.change) > LEAST
 
     def text(self) -> str:
         """In words, without the names of the runs."""
@@ -97,7 +97,7 @@ class Comparison:
                 change, over = _blocks(first, run, measure, self.recordings), "blocks"
             rows.append((run, own, change, over))
         tests = [paired_t(change) if _enough(change, over) else None for _, _, change, over in rows]
-        raw = [min(2 * min(float(t.p), 1 - float(t.p)), 1.0) for t in tests if t is not None]
+        raw = [float(test.two_sided) for test in tests if test is not None]
         adjusted = iter(holm(raw) if raw else ())
         scale, results = float(base.mean()) or 1.0, {}
         for (run, own, change, over), test in zip(rows, tests, strict=True):

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError, count_of
-from edp.report.common.wording import figure
 from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
 from edp.report.twin.facts import TWIN, holds_free_runs, read_free_runs
 from edp.storage import read_object
 from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import unfinished_text
+from edp.wording import figure, unit_text
 
 MOST_RUNS = 12
 """Beside each other: more lines than that nobody tells apart."""
@@ -182,7 +182,7 @@ def _network(path: Path, name: str) -> ComparedRun:
 
 def _outputs(facts: Facts) -> list[tuple[str, str]]:
     """Name and unit of what has errors of its own: the mean first, where it means something."""
-    outputs = [(target.name, "" if target.unit == "1" else target.unit) for target in facts.targets]
+    outputs = [(target.name, unit_text(target.unit)) for target in facts.targets]
     if len(outputs) == 1:
         return outputs
     return [(MEAN, facts.unit), *outputs] if facts.averaged else outputs

@@ -9,9 +9,9 @@ from typing import Any
 
 from edp.errors import StorageError, count_of
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
 from edp.storage.paths import is_file_at
+from edp.wording import listed, number, percent
 
 RESULT, SCHEMA = "compression.json", 2
 LIMITS = {"cycles": "cycles", "parameter_bytes": "parameters", "ram_bytes": "memory", "flash_bytes": "flash"}
@@ -184,7 +184,7 @@ def caveats(facts: CompressionFacts) -> list[str]:
     held_out, parts = facts.content["held_out_test"], facts.content["recordings"]
     lines = [
         "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
-        "constants, as the exported C code holds them (INT8, which has no such code: as in Table 4.9). The high "
+        "constants, as the exported C code holds them (INT8 has no such code: one byte for each weight). The high "
         "estimate decides.",
         f"Networks are compared and chosen on {count_of(parts['validation'], 'validation recording')}, which chose "
         "their best "

@@ -10,7 +10,7 @@ from edp.errors import count_of
 from edp.recording import Recording
 from edp.report.animation.page import Scene
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import MISSING, number
+from edp.wording import MISSING, number
 
 
 @dataclass(frozen=True, eq=False)

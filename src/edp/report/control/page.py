@@ -7,11 +7,11 @@ from typing import Any
 
 from edp.report.animation.page import animation_parts
 from edp.report.common.templates import template
-from edp.report.common.wording import unbroken
 from edp.report.control.charts import control_charts
 from edp.report.control.facts import ControlFacts, event_sheet, loop_sheet, solver_sheet, tiles, verdict
 from edp.report.run.page import shown
 from edp.storage import write_bytes
+from edp.wording import unbroken
 
 
 def write_control_page(facts: ControlFacts, target: str | Path) -> Path:

@@ -24,7 +24,7 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import figure, label_by_name
+from edp.wording import figure, label_by_name
 
 MAX_AXIS = 22
 """Characters of a name beside a panel, three of which stand in a row."""

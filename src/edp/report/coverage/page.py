@@ -12,11 +12,11 @@ from edp.errors import count_of
 from edp.logs import DataQuality
 from edp.report.common.tables import TextTable
 from edp.report.common.templates import template
-from edp.report.common.wording import MISSING, count_text, figure, listed, number, percent, unbroken
 from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
 from edp.storage import write_bytes
+from edp.wording import MISSING, count_text, figure, listed, number, percent, unbroken
 
 
 def build_coverage_page(coverage: Coverage, output: str | Path, title: str, quality: DataQuality | None = None) -> Path:

@@ -7,7 +7,7 @@ import math
 from edp.errors import count_of
 from edp.logs import DataQuality, Finding, QualityReport
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, count_text, figure, number, percent
+from edp.wording import MISSING, count_text, figure, number, percent
 
 SHOWN_CHANNELS = 400
 """Rows of the table of channels; the rest is in the JSON."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from edp.errors import count_of
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import figure, number, percent
+from edp.wording import figure, number, percent
 
 WORST = 10
 SURE_T = 4.0

@@ -8,10 +8,10 @@ import numpy as np
 
 from edp.report.common.chart import BLUE, MUTED, Bars, Chart, ChartAxis, DataSeries, GuideLine, Mark, Panel
 from edp.report.common.templates import template
-from edp.report.common.wording import unbroken
 from edp.report.fleet.facts import FleetFacts, failed_sheet, headline, machine_sheet, tiles, verdict, worst_sheet
 from edp.report.run.page import shown
 from edp.storage import write_bytes
+from edp.wording import unbroken
 
 BINS = 24
 

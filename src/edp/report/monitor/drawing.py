@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.traces import RecordingTrace, pooled
 from edp.report.common.chart import BLUE, SHADES
-from edp.report.common.wording import label_by_name, number
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts, start_time
+from edp.wording import label_by_name, number
 
 FloatArray = NDArray[np.float32]
 WIDTH = 960

@@ -14,7 +14,7 @@ from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.diagnosis.structure import Confusion
 from edp.monitor.traces import RecordingTrace, RunTraces
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import MISSING, count_text, label_by_name, listed, number, short_labels
+from edp.wording import MISSING, count_text, label_by_name, listed, number, short_labels
 
 MOST_ALARMS = 40
 """With evidence each on a page, alarms that say the same as one; all of them stand in the log."""

@@ -11,11 +11,11 @@ from markupsafe import Markup
 from edp.monitor.alarms import episodes
 from edp.monitor.diagnosis.sentences import clock
 from edp.report.common.templates import stylesheet, template
-from edp.report.common.wording import unbroken
 from edp.report.monitor import facts as words
 from edp.report.monitor.drawing import LEVEL_TEXTS, MARKS, SHADES_OF_LEVELS, evidence, overview, timeline
 from edp.report.monitor.facts import MOST_ALARMS, MonitorFacts
 from edp.storage import write_bytes
+from edp.wording import unbroken
 
 MOST_TIMELINES = 16
 

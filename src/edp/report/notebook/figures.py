@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, closest
 from edp.recording import Recording
 from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, with_unit
-from edp.report.common.wording import label_by_name, short_labels
 from edp.report.run.charts import horizon_chart
 from edp.report.run.facts import Facts
 from edp.report.run.figures import downsample
 from edp.report.search.charts import study_charts
 from edp.report.search.facts import StudyFacts
 from edp.signals import KINDS, Channel
+from edp.wording import label_by_name, short_labels
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go

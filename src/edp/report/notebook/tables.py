@@ -6,11 +6,11 @@ import html
 from collections.abc import Iterable, Sequence
 
 from edp.report.common.tables import TextTable, comparison_tables
-from edp.report.common.wording import printable
 from edp.report.run.facts import Facts
 from edp.report.search import words
 from edp.report.search.facts import StudyFacts
 from edp.report.search.tables import phases_sheet
+from edp.wording import printable
 
 TERMINAL = 80
 """Characters of a line that every terminal shows."""

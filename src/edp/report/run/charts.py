@@ -28,9 +28,9 @@ from edp.report.common.chart import (
     Range,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import figure, label_by_name
 from edp.report.run import figures
 from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, label_of, main_horizon
+from edp.wording import figure, label_by_name
 
 DOTS_AT_MOST = 40  # recordings; above that a rank curve, names on hover
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from edp.errors import StorageError, count_of
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, decimals_for, number, percent
 from edp.report.run.facts import NETWORK, Facts, Target, horizon_text, label_of, score
 from edp.report.run.figures import horizons_shown
 from edp.storage import read_object, write_json
 from edp.storage.paths import is_file_at
+from edp.wording import MISSING, decimals_for, number, percent
 
 FILE = "auto.json"
 FLOOR, PERSISTENCE = "linear", "persistence"

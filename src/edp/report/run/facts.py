@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from edp.errors import DataError, StorageError, count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import read_scores
-from edp.report.common.wording import decimals_for, figure, listed, number, percent
 from edp.report.run.budget import budget_name, budget_rows
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
 from edp.report.run.predictability import limit_line, read_limit
@@ -24,6 +23,7 @@ from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
+from edp.wording import decimals_for, figure, listed, number, percent, unit_text
 
 NETWORK = "network"
 TRUTH = "truth"
@@ -122,7 +122,7 @@ class Facts:
         """
         units = {target.unit for target in self.targets}
         shared = units.pop() if len(units) == 1 else ""
-        return "" if shared == "1" else shared
+        return unit_text(shared)
 
     @property
     def averaged(self) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.report.common.sheets import Column, Sheet, Value, figures, plainly
-from edp.report.common.wording import figure
+from edp.wording import figure
 
 
 def parts_sheet(foundation: Mapping[str, Any]) -> Sheet:

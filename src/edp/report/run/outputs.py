@@ -10,9 +10,9 @@ from typing import Any
 from edp.data.splits import kind_of_name
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
-from edp.report.common.wording import listed, number, percent
 from edp.storage import read_object
 from edp.storage.paths import is_file_at
+from edp.wording import behind, listed, number, percent
 
 SHOWN = 4
 """Outputs or logs that a sentence names."""
@@ -116,7 +116,7 @@ def by_output(scores: Mapping[str, Any], horizon: int, targets: Sequence[tuple[s
         finite = {label: error for label, error in errors.items() if error is not None and math.isfinite(error)}
         best = min(finite, key=lambda label: finite[label], default=None)
         beside = "" if best is None else f" ({best} {number(finite[best], _places(finite[best]))})"
-        of_unit = "" if unit in ("", "1") else f" {unit}"
+        of_unit = behind(unit)
         parts.append(f"{number(ours, _places(ours))}{of_unit} in {description[:1].lower()}{description[1:]}{beside}")
     more = f"; {count_of(len(targets) - SHOWN, 'more output')} below" if len(targets) > SHOWN else ""
     return f"At {ahead} ahead the network is off by ({MEASURE_NAME}) {', '.join(parts)}{more}."

@@ -12,7 +12,6 @@ from markupsafe import Markup
 from edp.report.common import tables
 from edp.report.common.chart import Chart
 from edp.report.common.templates import asset, stylesheet, template
-from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
 from edp.report.run.budget import budget_name
 from edp.report.run.charts import DOTS_AT_MOST, run_charts
@@ -23,6 +22,7 @@ from edp.report.run.signals import signal_chart, signals_of
 from edp.report.run.situations import situation_sheet
 from edp.storage import write_bytes
 from edp.storage.paths import full_path
+from edp.wording import moment, unbroken
 
 DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
 """Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edp.errors import StorageError
-from edp.report.common.wording import interval, interval_decimals, number
 from edp.storage import read_json
 from edp.storage.paths import is_file_at, is_folder_at
+from edp.wording import interval, interval_decimals, number
 
 if TYPE_CHECKING:
     from edp.report.run.facts import Facts

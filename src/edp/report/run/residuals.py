@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from edp.report.common.chart import BLUE, Chart, ChartAxis, Control, DataSeries, GuideLine, Mark, Panel
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import number
 from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, score
 from edp.report.run.figures import aligned, headline_first
+from edp.wording import number
 
 LEAST_LAGS, LAGS_PER_HORIZON, MOST_LAGS = 40, 3, 400
 """Lags of the correlogram: enough beyond the horizon to see a rhythm, few enough to draw."""

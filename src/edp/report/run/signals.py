@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from edp.report.common.chart import BLUE, SHADES, Chart, ChartAxis, DataSeries, Mark, Panel, with_unit
-from edp.report.common.wording import short_labels
 from edp.report.run.facts import INPUTS, Facts
 from edp.report.run.figures import downsample
 from edp.signals import display_offset
+from edp.wording import short_labels
 
 MOST_PANELS, MOST_SERIES = 6, 7
 """Units that have a panel, and signals in one: more lines nobody tells apart."""

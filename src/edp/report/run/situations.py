@@ -8,7 +8,7 @@ from typing import Any
 
 from edp.evaluation.guard import NETWORK
 from edp.report.common.sheets import Column, Sheet, figures
-from edp.report.common.wording import percent
+from edp.wording import percent
 
 WORDS = {
     "rest": "at rest, now and then",

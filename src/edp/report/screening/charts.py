@@ -29,7 +29,6 @@ from edp.report.common.chart import (
     finite,
     with_unit,
 )
-from edp.report.common.wording import figure, label_by_name
 from edp.report.screening.views import (
     METRICS,
     UNITS,
@@ -42,6 +41,7 @@ from edp.report.screening.views import (
     stability_views,
     value_views,
 )
+from edp.wording import figure, label_by_name
 
 if TYPE_CHECKING:
     from edp.data.screening import ScreeningResult

@@ -10,13 +10,13 @@ from edp.errors import count_of
 from edp.logs import DataQuality
 from edp.report.common.picture import write_pictures
 from edp.report.common.templates import template
-from edp.report.common.wording import count_text, duration, figure, listed, number, setting_text, unbroken
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
 from edp.report.screening import tables as tables
 from edp.report.screening.charts import screening_charts
 from edp.report.screening.views import best_groups, joined
 from edp.storage import write_bytes
+from edp.wording import count_text, duration, figure, listed, number, setting_text, unbroken
 
 if TYPE_CHECKING:
     from edp.data.screening import ScreeningResult

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, count_text, duration, interval, number, percent
 from edp.report.screening.views import lag_ranges
+from edp.wording import MISSING, count_text, duration, interval, number, percent
 
 if TYPE_CHECKING:
     from edp.data.screening import ChannelVerdict, Flag, LagCurve, ScreeningResult

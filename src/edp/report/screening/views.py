@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.report.common.wording import short_labels
+from edp.wording import short_labels
 
 if TYPE_CHECKING:
     from edp.data.screening import GroupImportance, LagCurve, ScreeningResult, Stability, Value

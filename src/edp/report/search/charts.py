@@ -29,7 +29,6 @@ from edp.report.common.chart import (
     with_unit,
 )
 from edp.report.common.sheets import chance
-from edp.report.common.wording import decimals_for, number
 from edp.report.search.facts import StudyFacts
 from edp.report.search.views import (
     COSTS,
@@ -45,6 +44,7 @@ from edp.report.search.views import (
     top_of,
     tracks,
 )
+from edp.wording import decimals_for, number
 
 
 def study_charts(study: StudyFacts) -> list[Chart]:

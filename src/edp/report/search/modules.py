@@ -7,8 +7,8 @@ from typing import Any
 
 from edp.errors import count_of
 from edp.report.common.sheets import Column, Sheet, chance, figures
-from edp.report.common.wording import interval
 from edp.report.search.facts import StudyFacts, known, of_phase, real
+from edp.wording import interval
 
 GROUPS = {
     "Structural gating": ("cylinder_gate", "temporal_difference"),

@@ -10,13 +10,13 @@ from typing import Any
 from edp.report.common.picture import write_pictures
 from edp.report.common.sheets import Sheet
 from edp.report.common.templates import template
-from edp.report.common.wording import in_markdown, number, unbroken
 from edp.report.run.page import shown
 from edp.report.search import words as words
 from edp.report.search.charts import study_charts
 from edp.report.search.facts import StudyFacts, facts_of, reading
 from edp.report.search.tables import sheets
 from edp.storage import make_folder, write_bytes
+from edp.wording import in_markdown, number, unbroken
 
 SCORE = "The composite score is 0.40 MAE + 0.15 RMSE + 0.25 P95 + 0.20 P99, mean over sessions and outputs."
 

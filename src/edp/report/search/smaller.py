@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.report.common.sheets import Column, Sheet, figures
-from edp.report.common.wording import number, percent
 from edp.report.search.facts import StudyFacts, of_phase, real
+from edp.wording import number, percent
 
 
 @of_phase("compression", None)

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from edp.errors import count_of
+from edp.report.common.chart import with_unit
 from edp.report.common.sheets import Column, Sheet, Value, chance, figures, plainly
-from edp.report.common.wording import count_text, duration, moment, number, percent
 from edp.report.search.facts import StudyFacts, known, of_phase, real
 from edp.report.search.modules import modules_sheets, ordered, span
 from edp.report.search.smaller import smaller_sheet
 from edp.report.search.views import arm_views, titled
+from edp.wording import count_text, duration, moment, number, percent
 
 
 def sheets(study: StudyFacts) -> dict[str, Sheet]:
@@ -189,11 +190,11 @@ def holdout_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     for key, name in {"composite": "Composite", "mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99"}.items():
         values = [known(test[arm][key]) for arm in ("baseline", "synthesis")]
         cells = [None if v is None else _against(v, values[0], lambda x: number(x, 3)) for v in values]
-        rows.append((f"{name} on test sessions ({study.unit})", *cells, *([None] * (free is not None))))
+        rows.append((with_unit(f"{name} on test sessions", study.unit), *cells, *([None] * (free is not None))))
     if free is not None:
         fresh = [real(free["fresh"][arm]) for arm in ("synthesis", "exploration")]
         cells = [number(fresh[0], 3), f"{number(fresh[1], 3)} ({percent(fresh[1] / fresh[0] - 1, True)} to phase 4)"]
-        rows.append((f"Composite on fresh folds ({study.unit})", None, *cells))
+        rows.append((with_unit("Composite on fresh folds", study.unit), None, *cells))
     names = ("Baseline", "Winner of phase 4", "Winner of phase 5")[: len(arms)]
     seeds = study.spec.get("run_seeds", "–")
     caption = f"Baseline and winners; test scores are means of {seeds} seeds, in brackets the change to the baseline"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from edp.errors import count_of
+from edp.report.common.chart import with_unit
 from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, pair, real
 from edp.stats.effects import effect_interval
 
@@ -278,7 +279,7 @@ def _screened(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Forest, ...]
             reach = 1.96 * error * abs(value / effect) if effect else 0.0
             ends = (100.0 * (value - reach), 100.0 * (value + reach))
             effects.append(EffectView(study.module(name), 100.0 * value, *ends, real(entry["p"]), None, good, remark))
-    axis = f"Best question less the baseline's median [{study.unit}]; left is better"
+    axis = with_unit("Best question less the baseline's median, left is better", study.unit)
     return (Forest("screening", title, "", axis if study.mode == "thesis" else CHANGE, _ranked(effects)),)
 
 

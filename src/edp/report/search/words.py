@@ -8,10 +8,10 @@ from typing import Any
 
 from edp.errors import count_of
 from edp.evaluation.guard import ErrorOutcome, outcome_of
-from edp.report.common.wording import count_text, duration, listed, number, percent, setting_text
 from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, real
 from edp.report.search.smaller import chosen_words
 from edp.report.search.views import titled
+from edp.wording import behind, count_text, duration, listed, number, percent, setting_text
 
 
 def headline(study: StudyFacts) -> str:
@@ -35,14 +35,14 @@ def _result(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     gain = facts["test_gain"]
     outcome = outcome_of(ours / base - 1, None if gain is None else real(gain["high"]))
     what = f"With {names}" if own else "Tuned anew, with no module,"
-    figures = f"{number(ours, 3)} {study.unit} on {sessions}"
+    figures = f"{number(ours, 3)}{behind(study.unit)} on {sessions}"
     if outcome is ErrorOutcome.BETTER:
         change = percent(1 - ours / base)
         return f"{what} the network reaches {figures}, {change} below the baseline's {number(base, 3)}."
     if outcome is ErrorOutcome.OPEN:
         return f"{what} the network is not distinguishable from the baseline: {figures}, against {number(base, 3)}."
     return (
-        f"Nothing better than the baseline was found: {number(base, 3)} {study.unit} on {sessions}, against "
+        f"Nothing better than the baseline was found: {number(base, 3)}{behind(study.unit)} on {sessions}, against "
         f"{number(ours, 3)} with {names or 'no module'}."
     )
 

@@ -23,9 +23,9 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )  # fmt: skip
-from edp.report.common.wording import label_by_name
 from edp.report.transfer.facts import SOURCE, TARGET, Transfer
 from edp.signals import display_offset
+from edp.wording import label_by_name
 
 AHEAD, RECORDING = "horizon", "recording"
 DOMAINS = {TARGET: "On the target's logs", SOURCE: "On the source's recordings"}

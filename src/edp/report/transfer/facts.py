@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,12 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from edp.errors import StorageError, count_of
-from edp.evaluation.guard import ErrorVerdict
+from edp.evaluation.guard import ErrorRatios, ErrorVerdict, best_verdict, by_recording
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at
+from edp.wording import listed, number, percent, quantity, unit_text
 
 RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 2
 TARGET, SOURCE, MEAN = "target", "source", "mean"
@@ -55,7 +56,7 @@ class Transfer:
     def unit(self) -> str:
         """The unit that all targets share."""
         units = {target["unit"] for target in self.targets}
-        return units.pop() if len(units) == 1 else "mixed units"
+        return unit_text(units.pop()) if len(units) == 1 else "mixed units"
 
     @property
     def methods(self) -> Mapping[str, Mapping[str, Any]]:
@@ -77,6 +78,11 @@ class Transfer:
         """Scores of a method."""
         scores: Mapping[str, Any] = self.methods[method]["domains"][domain][horizon][target]
         return scores
+
+    def recordings(self, method: str, horizon: str) -> dict[str, float]:
+        """Return the mean absolute error over targets of each log of the target; empty for earlier versions."""
+        by_log = self.methods[method].get("recordings", {})
+        return {name: float(errors[horizon]) for name, errors in by_log.items() if errors.get(horizon) is not None}
 
     def gain(self, horizon: str) -> float:
         """Share of the MAE of direct transfer that is gone."""
@@ -126,7 +132,7 @@ def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
             keys = ("mse", "mae", "r2", "p95", "p99", "bias", "skew")
             rows.append((facts.methods[method]["label"], facts.name(target), *(scores[key] for key in keys)))
     unit = facts.unit
-    square = f"({unit})²" if unit != "mixed units" else unit
+    square = unit if unit in ("", "mixed units") else f"({unit})²"
     heads = (("MSE", square), ("MAE", unit), ("R²", ""), ("P95", unit), ("P99", unit), ("Bias", unit), ("Skew", ""))
     shows = [figures([row[2 + column] for row in rows]) for column in range(len(heads))]
     shows[2] = figures([], decimals=4)
@@ -183,13 +189,24 @@ def method_sheet(facts: Transfer, horizon: str) -> Sheet:
 def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:
     """Return the verdict on the fine-tuned network against the best other method at the furthest horizon."""
     horizon, method = facts.horizons[-1], facts.content["method"]
-    errors = {name: facts.score(name, horizon)["mae"] for name in facts.methods}
-    own, others = errors.pop(method), {name: error for name, error in errors.items() if error > 0}
-    if not others or not own:
+    own, ratios = float(facts.score(method, horizon)["mae"]), []
+    for name in facts.methods:
+        error = float(facts.score(name, horizon)["mae"])
+        if name != method and own > 0 < error:
+            theirs = facts.recordings(name, horizon)
+            logs = {
+                recording: [math.log(mae / theirs[recording])]
+                for recording, mae in facts.recordings(method, horizon).items()
+                if mae > 0 < theirs.get(recording, 0.0)
+            }
+            by_output = {MEAN: [math.log(own / error)]}
+            ratios.append(ErrorRatios(facts.methods[name]["label"], by_output, by_recording(logs)))
+    verdict = best_verdict(ratios, ErrorVerdict("", 0.0, (), "fine-tuned network"))
+    if verdict is None:
         return None
-    best = min(others, key=lambda name: others[name])
-    advice = f"take {facts.methods[best]['label']}, or give more recordings of this machine"
-    return ErrorVerdict(facts.methods[best]["label"], 1 - others[best] / own, (), "fine-tuned network", advice)
+    advice = f"take {verdict.label}, or give more recordings of this machine"
+    # Errors are means over targets, so that no target is named.
+    return replace(verdict, outputs=(), advice=advice)
 
 
 def headline(facts: Transfer) -> str:
@@ -206,7 +223,7 @@ def _figures(facts: Transfer) -> str:
     if not gain:
         return "No epoch was better on the validation part than the source's network as it is, so that one is kept"
     how = f"{percent(abs(gain))} {'less' if gain > 0 else 'more'}"
-    words = f"{number(after)} instead of {number(before)} {facts.unit}"
+    words = f"{number(after)} instead of {quantity(before, facts.unit)}"
     return f"{facts.methods[facts.content['method']]['label']}: {how} error than direct transfer, {words}"
 
 
@@ -223,11 +240,11 @@ def verdict(facts: Transfer) -> list[str]:
     best = min(baselines, key=lambda name: facts.score(name, horizon)["mae"])
     if facts.score(best, horizon)["mae"] < facts.score(method, horizon)["mae"]:
         better = facts.methods[best]["label"]
-        lines.append(f"{better} has less: {number(facts.score(best, horizon)['mae'])} {facts.unit}.")
+        lines.append(f"{better} has less: {quantity(facts.score(best, horizon)['mae'], facts.unit)}.")
     if SOURCE in facts.domains:
         was, now = (facts.score(name, horizon, domain=SOURCE)["mae"] for name in facts.pair)
         change = percent(now / was - 1, signed=True)
-        lines.append(f"On the source's own test part the error is {number(now)} {facts.unit}, {change}.")
+        lines.append(f"On the source's own test part the error is {quantity(now, facts.unit)}, {change}.")
     return lines
 
 

@@ -8,13 +8,13 @@ from typing import Any
 from edp.report.common.picture import write_pictures
 from edp.report.common.sheets import Sheet, write_sheets
 from edp.report.common.templates import template
-from edp.report.common.wording import unbroken
 from edp.report.run.page import shown
 from edp.report.transfer import facts as words
 from edp.report.transfer.charts import picture_charts, transfer_charts
 from edp.report.transfer.facts import Transfer, read_transfer
 from edp.storage import write_bytes
 from edp.storage.paths import full_path
+from edp.wording import unbroken
 
 
 def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:

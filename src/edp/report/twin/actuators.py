@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edp.report.common.sheets import Column, Sheet, Value
-from edp.report.common.wording import figure, number
+from edp.wording import figure, number
 
 
 def mixed_units(scores: Mapping[str, Any]) -> bool:

@@ -25,10 +25,10 @@ from edp.report.common.chart import (
     with_unit,
 )  # fmt: skip
 from edp.report.common.picture import write_pictures
-from edp.report.common.wording import label_by_name
 from edp.report.twin.facts import PARTS, TWIN, FreeRunFacts
 from edp.report.twin.steps import steps_chart
 from edp.signals import KINDS, Kind, display_offset
+from edp.wording import label_by_name
 
 RECORDING, MODEL = "recording", "model"
 DIGITS = 4

@@ -28,7 +28,6 @@ from edp.evaluation.scores_file import (
     read_shaped,
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.common.wording import figure, listed, number, percent, short_labels
 from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.report.twin.ground import ground_line
@@ -36,6 +35,7 @@ from edp.report.twin.steps import read_steps
 from edp.storage import read_object
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_file_at
+from edp.wording import figure, listed, number, percent, short_labels
 
 CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
 TWIN = "twin"
@@ -282,7 +282,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     if intervals is not None and intervals["at"]:
         shares = [row[part]["share"] for row in intervals["at"] for part in PARTS if part in row]
         meant = f"of the truth in intervals meant for {percent(intervals['coverage'])}"
-        rows.append((f"{percent(min(shares))} to {percent(max(shares))}", "", meant))
+        rows.append((" to ".join(dict.fromkeys(map(percent, (min(shares), max(shares))))), "", meant))
     return rows
 
 

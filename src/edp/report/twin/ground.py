@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from edp.report.common.wording import listed, percent
+from edp.wording import listed, percent
 
 
 def ground_line(provenance: Mapping[str, Any]) -> str:

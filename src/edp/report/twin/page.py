@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from edp.report.common.templates import template
-from edp.report.common.wording import duration, moment, unbroken
 from edp.report.run.page import shown
 from edp.report.twin import facts as words
 from edp.report.twin.charts import twin_charts
 from edp.report.twin.facts import FreeRunFacts, read_free_runs
 from edp.storage import write_bytes
+from edp.wording import duration, moment, unbroken
 
 
 def build_twin_report(run_folder: str | Path, output: str | Path | None = None, title: str | None = None) -> Path:

@@ -11,8 +11,8 @@ import numpy as np
 from edp.errors import StorageError
 from edp.evaluation.scores_file import COUNT, NAME, REAL, SIZE, KeyedObject, Listed, read_shaped
 from edp.report.common.chart import Chart, ChartAxis, Control, DataSeries, Mark, Panel, Range, with_unit
-from edp.report.common.wording import figure, label_by_name
 from edp.storage.paths import is_file_at
+from edp.wording import figure, label_by_name
 
 FILE, COMMAND = "step_response.json", "command"
 MOST_PANELS = 6

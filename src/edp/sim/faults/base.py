@@ -15,6 +15,7 @@ from edp.errors import ConfigError, closest
 from edp.registry import Registry
 from edp.settings.bounds import Bound, shown, span
 from edp.sim.machine.machine import Machine
+from edp.wording import figure, setting_text
 
 Array = NDArray[np.float64]
 Units = Mapping[str, float]
@@ -200,10 +201,11 @@ class FaultSpec:
             if not seconds.holds(value):
                 raise ConfigError(f"{what}: {name} = {shown(value)}; {seconds.rule(name)} must hold")
         if self.ramp_s > 0.0 and not kind.units:
-            raise ConfigError(f"{what}: ramp_s = {self.ramp_s:g} must be 0: this kind is there or not")
+            raise ConfigError(f"{what}: ramp_s = {setting_text(self.ramp_s)} must be 0: this kind is there or not")
         if (self.on_s > 0.0) != (self.off_s > 0.0) or 0.0 < min(self.on_s, self.off_s) < LEAST_SECONDS:
             raise ConfigError(
-                f"{what}: on_s = {self.on_s:g} and off_s = {self.off_s:g}; an intermittent fault needs both, "
+                f"{what}: on_s = {setting_text(self.on_s)} and off_s = {setting_text(self.off_s)}; an intermittent "
+                "fault needs both, "
                 f"{LEAST_SECONDS} s at least; leave both out for one that stays"
             )
 
@@ -251,7 +253,7 @@ def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> No
             raise ConfigError(f"{what}: size = {shown(size)} {shown(unit)} must be left out: this kind is there or not")
         return
     if size is None:
-        raise ConfigError(f"{what}: it needs a size, such as {kind.ladder[0]:g}{kind.unit}")
+        raise ConfigError(f"{what}: it needs a size, such as {figure(kind.ladder[0])}{kind.unit}")
     if isinstance(size, bool) or not isinstance(size, int | float) or not math.isfinite(size):
         raise ConfigError(f"{what}: size = {shown(size)} must be a finite number")
     if not isinstance(unit, str) or unit not in kind.units:
@@ -259,7 +261,9 @@ def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> No
     in_first = size * kind.units[unit] / kind.units[kind.unit]
     # The product may miss a bound by rounding: 900 % as a share of 9.
     if not kind.bound.low - 1e-9 <= in_first <= kind.bound.high + 1e-9:
-        raise ConfigError(f"{what}: size = {size:g} {unit}; {kind.bound.rule('size')} {kind.unit} must hold")
+        raise ConfigError(
+            f"{what}: size = {setting_text(size)} {unit}; {kind.bound.rule('size')} {kind.unit} must hold"
+        )
 
 
 def ladder(

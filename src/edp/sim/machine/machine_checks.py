@@ -19,6 +19,7 @@ from edp.sim.machine.machine import Machine, Rating, Ratings, Triple
 from edp.sim.machine.option_checks import CYLINDERS as CYLINDERS
 from edp.sim.machine.parameters import FLOW_SHARING, pack
 from edp.sim.physics import linkage
+from edp.wording import figure, setting_text
 
 MACHINE_FILE = SettingsTree(what="machine file", positions={Triple: CYLINDERS, Ratings: CYLINDERS})
 BEYOND_STOPS = math.radians(4.0)
@@ -33,7 +34,7 @@ LARGEST = 1e15
 
 @dataclass(frozen=True)
 class ParameterBound:
-    """Limits of a number; `above` makes the lower one strict, and above zero refuses numbers below `LEAST_POSITIVE`."""
+    """Limits of a parameter; `above` makes the lower limit strict and refuses values below `LEAST_POSITIVE`."""
 
     low: float = -LARGEST
     high: float = LARGEST
@@ -50,8 +51,9 @@ class ParameterBound:
     def __str__(self) -> str:
         text = "an integer " if self.integer else ""
         if self.high == LARGEST:
-            return f"{text}{'above' if self.above else 'at least'} {self.low:g} and at most {self.high:g}"
-        return f"{text}{f'above {self.low:g} and at most' if self.above else f'from {self.low:g} to'} {self.high:g}"
+            return f"{text}{'above' if self.above else 'at least'} {figure(self.low)} and at most {figure(self.high)}"
+        low = f"above {figure(self.low)} and at most" if self.above else f"from {figure(self.low)} to"
+        return f"{text}{low} {figure(self.high)}"
 
 
 ANY = ParameterBound()
@@ -307,13 +309,14 @@ def _check_triangle(axis: int, axes: Any, plant: Any, where: str) -> None:
     # Pins in one line give no lever arm, so equality is refused.
     if closed <= least:
         raise ConfigError(
-            f"machine file {where} [{name}_cylinder]: closed_length = {closed:g} m must be above "
-            f"|base_radius - rod_radius| = {least:.4g} m, or the pins cannot come that close"
+            f"machine file {where} [{name}_cylinder]: closed_length = {setting_text(closed)} m must be above "
+            f"|base_radius - rod_radius| = {figure(least)} m, or the pins cannot come that close"
         )
     if closed + stroke >= most:
         raise ConfigError(
-            f"machine file {where} [cylinders]: stroke[{name}] = {stroke:g} m with closed_length = {closed:g} m needs "
-            f"pins {closed + stroke:.4g} m apart; must be below base_radius + rod_radius = {most:.4g} m"
+            f"machine file {where} [cylinders]: stroke[{name}] = {setting_text(stroke)} m with closed_length = "
+            f"{setting_text(closed)} m needs "
+            f"pins {figure(closed + stroke)} m apart; must be below base_radius + rod_radius = {figure(most)} m"
         )
     ends = [linkage.angle_at_stroke(axis, s, axes, plant) for s in (0.0, stroke)]
     _check_levers(axis, min(ends), max(ends), axes, plant, where)
@@ -325,17 +328,21 @@ def _check_bucket(axes: Any, plant: Any, where: str) -> None:
     psi, length = linkage.bucket_branch(closed, closed + stroke, plant)
     if not len(psi):
         raise ConfigError(
-            f"{where_table}: rocker = {plant[at.ROCKER]:g} m and link = {plant[at.LINK]:g} m cannot close the "
+            f"{where_table}: rocker = {setting_text(plant[at.ROCKER])} m and link = {setting_text(plant[at.LINK])} m "
+            "cannot close the "
             "loop between "
-            f"rocker pivot and lug = {plant[at.LUG]:g} m at any bucket angle; rocker + link must be longer than the "
+            f"rocker pivot and lug = {setting_text(plant[at.LUG])} m at any bucket angle; rocker + link must be "
+            "longer than the "
             "pins are apart, |rocker - link| shorter"
         )
     if length[0] < closed + stroke or length[-1] > closed:
         low, high = np.degrees((psi[0], psi[-1]))
         raise ConfigError(
-            f"{where_table}: closed_length = {closed:g} m with stroke[bucket] = {stroke:g} m needs pins from "
-            f"{closed:g} to "
-            f"{closed + stroke:.4g} m apart; this linkage gives {length[-1]:.4g} to {length[0]:.4g} m (bucket angles "
+            f"{where_table}: closed_length = {setting_text(closed)} m with stroke[bucket] = {setting_text(stroke)} m "
+            "needs pins from "
+            f"{figure(closed)} to "
+            f"{figure(closed + stroke)} m apart; this linkage gives {figure(length[-1])} to {figure(length[0])} m "
+            "(bucket angles "
             f"{low:.0f} to {high:.0f} deg) before it cannot close or turns over; change closed_length, stroke, rocker "
             "or link"
         )
@@ -362,5 +369,5 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
             f"machine file {where} [{table}]: the lever arm of the {name} cylinder at joint angle "
             f"{math.degrees(psi[worst]):.0f} deg is {lever_text}; from 4 deg below to 4 deg above the working range "
             f"({math.degrees(low):.0f} to {math.degrees(high):.0f} deg) it must keep its sign and be at least "
-            f"{least:.3f} m/rad ({LEAST_LEVER:g} of the stroke); change the pins, closed_length or stroke"
+            f"{least:.3f} m/rad ({figure(LEAST_LEVER)} of the stroke); change the pins, closed_length or stroke"
         )

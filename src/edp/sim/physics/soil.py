@@ -17,6 +17,7 @@ from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.physics import ground_profile, terramechanics
 from edp.storage import SETTINGS_BYTES, parse_toml, read_text
+from edp.wording import figure, setting_text
 
 Array = NDArray[np.float64]
 SPACING_M = ground_profile.SPACING
@@ -98,13 +99,13 @@ class Material:
         check_bounds("material", self, **BOUNDS)
         if self.back_friction_deg > 0.0 and self.back_push == 0.0:
             raise ConfigError(
-                f"material: back_friction_deg = {self.back_friction_deg:g} needs a back that pushes soil; "
+                f"material: back_friction_deg = {setting_text(self.back_friction_deg)} needs a back that pushes soil; "
                 "give back_push, too, or leave both out"
             )
         if self.back_friction_deg > self.friction_deg:
             raise ConfigError(
-                f"material: back_friction_deg = {self.back_friction_deg:g} must be at most friction_deg = "
-                f"{self.friction_deg:g}; beyond it soil slides on soil"
+                f"material: back_friction_deg = {setting_text(self.back_friction_deg)} must be at most friction_deg = "
+                f"{figure(self.friction_deg)}; beyond it soil slides on soil"
             )
         if self.cone_index[0] > self.cone_index[1]:
             raise ConfigError(f"material: cone_index = {list(self.cone_index)} Pa; the smaller one must come first")

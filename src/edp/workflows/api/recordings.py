@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, overload
@@ -22,6 +22,7 @@ from edp.report.notebook import html_of, recordings_figure, text_of
 from edp.settings.bounds import SEED, between, check_bounds
 from edp.settings.tree import build
 from edp.signals import SignalMap
+from edp.wording import figure
 from edp.workflows.api.arguments import check_together, check_width, matrix_of, names_of, units_of
 from edp.workflows.api.frames import columns_of, frame_of
 
@@ -258,18 +259,20 @@ class Recordings(Sequence[Recording]):
         columns = (("Recording", ""), ("Samples", ""), ("Duration", "s"))
         channels = tuple((c.name, str(c.kind), c.unit, c.description) for c in self._recordings[0].channels)
         return [
-            TextTable(f"Recordings at {self.rate_hz:g} Hz{more}", columns, rows),
+            TextTable(f"Recordings at {figure(self.rate_hz)} Hz{more}", columns, rows),
             TextTable("Channels", (("Channel", ""), ("Kind", ""), ("SI unit", ""), ("Description", "")), channels),
         ]
 
 
 def read(
-    path: str | Path, map: str | Path | Mapping[str, Any] | None = None, repair: Mapping[str, str] | None = None
+    path: str | Path | Sequence[str | Path],
+    map: str | Path | Mapping[str, Any] | None = None,
+    repair: Mapping[str, str] | None = None,
 ) -> Recordings:
-    """Recordings from a log, a folder of logs, or a data-set file.
+    """Read recordings from logs and folders of logs, from a data-set file, or from a store.
 
     Args:
-        path: what to read (docs/recordings.md).
+        path: what to read (docs/recordings.md): one path, or a sequence of logs and folders.
         map: which columns become which channels: a map file, or its content as a mapping. Without one every column of
             numbers is taken under its own name; the vocabulary or else the file's unit tells its kind.
         repair: what may be repaired, by default nothing: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``,
@@ -279,15 +282,15 @@ def read(
         DataError: nothing to read, or a log that cannot be used as it is.
         ConfigError: a map or a repair that cannot be.
     """
-    location = Path(path)
+    source = DataSource.of(path)
     if map is None:
         # The maps of a data-set file are in it, and those of a store were applied when it was built.
-        signal_map = None if location.suffix == ".toml" or is_store(location) else SignalMap(others=True)
+        signal_map = None if source.path.suffix == ".toml" or is_store(source.path) else SignalMap(others=True)
     elif isinstance(map, Mapping):
         signal_map = map_of_table(dict(map), "map")
     else:
         signal_map = load_signal_map(map)
-    source = DataSource(location, signal_map, repair_of(repair))
+    source = replace(source, signal_map=signal_map, repair=repair_of(repair))
     return Recordings(source.read(), source)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from edp.data.prepared import Prepared
 from edp.networks.predictor import build_model
 from edp.report.run.choice import FLOOR, PERSISTENCE
+from edp.wording import percent
 from edp.workflows.auto.candidates import CANDIDATES, Amount
 from edp.workflows.auto.promise import (
     PortfolioChoice,
@@ -94,15 +95,12 @@ def sentence(choice: PortfolioChoice, trained: dict[str, TrainedCandidate], amou
     if not others:
         return f"{start}: no other one was tried, or all others diverged."
     if choice.name != choice.best:
-        gain = 100 * (1 - np.exp(-choice.excess[choice.name]))
+        gain = percent(-float(np.expm1(-choice.excess[choice.name])))
         best = CANDIDATES[choice.best].label
         return (
-            f"{start}: {best} had {gain:.1f} % less error on left-out data, but that is within one standard error, and "
+            f"{start}: {best} had {gain} less error on left-out data, but that is within one standard error, and "
             "the simpler model wins a tie."
         )
     second = min(others, key=lambda name: choice.excess[name])
-    gain = 100 * (1 - np.exp(-choice.excess[second]))
-    return (
-        f"{start}: on left-out data its error is {gain:.1f} % less than that of the next best, "
-        f"{CANDIDATES[second].label}."
-    )
+    gain = percent(-float(np.expm1(-choice.excess[second])))
+    return f"{start}: on left-out data its error is {gain} less than that of the next best, {CANDIDATES[second].label}."

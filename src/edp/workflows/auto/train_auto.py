@@ -85,7 +85,7 @@ def train_auto(
     foundation = read_foundation(settings.auto.foundation)
     if foundation is not None:
         foundation.check_recordings(once.read())
-    settings, of_channels = fit_to_channels(settings, once.read()[0].channel_names, str(source.path))
+    settings, of_channels = fit_to_channels(settings, once.read()[0].channel_names, source.label)
     settings, of_parts = divide(once.read(), settings)
     data, amount = _prepare(once, settings, foundation)
     if foundation is not None:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from edp.config.control import ControlExperiment
-from edp.control.controllers import ControllerSpec
+from edp.control.base import unused_models
+from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult, run_loop, start_options
 from edp.control.models import ControlModels
@@ -21,6 +22,7 @@ from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_m
 from edp.errors import ConfigError
 from edp.storage.paths import is_folder_at
 from edp.training.bundle import load_bundle
+from edp.wording import figure, setting_text
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class ControlBench:
         models: ControlModels | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
+        _check_used(experiment, sources)
         self.experiment, self._options = experiment, options
         rate = experiment.rate_hz
         probe = plant_of(experiment.machine, RUN_S + 1.0, rate, sources.plant, sources.trusted)
@@ -130,8 +133,8 @@ class ControlBench:
         for channel, value in zip(self.plant.channels, row, strict=True):
             if channel.name.startswith("CylPressures_") and value > first.limits.pressure_pa:
                 raise ConfigError(
-                    f"limits: pressure_pa = {first.limits.pressure_pa:g} Pa, but the machine rests with "
-                    f"{channel.name} at {value:.3g} Pa; allow more"
+                    f"limits: pressure_pa = {setting_text(first.limits.pressure_pa)} Pa, but the machine rests with "
+                    f"{channel.name} at {figure(value, 3)} Pa; allow more"
                 )
         measured = row[self.plant.columns(controller.reads)]
         # A channel that is missing at the start is named where the loop begins.
@@ -140,7 +143,24 @@ class ControlBench:
 
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""
-        return float(np.mean([result.score.position_rms_mm for result in self.results(spec)]))
+        return float(np.mean(list(self.costs(spec).values())))
+
+    def costs(self, spec: ControllerSpec) -> dict[str, float]:
+        """Return the position error of the tip, rms, mm, of each reference by its name."""
+        errors = [result.score.position_rms_mm for result in self.results(spec)]
+        return {f"{task.name} {task.seed}": float(error) for task, error in zip(self.tasks, errors, strict=True)}
+
+
+def _check_used(experiment: ControlExperiment, sources: ControlSources) -> None:
+    """Raise ConfigError for models that the controller of an experiment does not use."""
+    needs, kind = experiment.controller.needs, CONTROLLERS.name_of(experiment.controller)
+    available = [name for name in ("twin", "predictor") if getattr(sources, name) is not None]
+    for name in unused_models(needs, available):
+        uses = " and a ".join(need.replace("_", " ") for need in needs)
+        raise ConfigError(
+            f"--{name}: it has no effect with the controller '{kind}', which uses a {uses}; "
+            f"leave --{name} out, or choose another controller"
+        )
 
 
 def _bundle_of(run: Path) -> Path:

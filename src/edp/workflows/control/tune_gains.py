@@ -113,13 +113,17 @@ def tune_gains(
             study.tell(trial.number, [cost])
             best = spec if not rows or cost < min(row["cost_mm"] for row in rows) else best
             rows.append({"gains": dict(trial.values), "cost_mm": cost})
-        before, after = judge.cost(experiment.controller), judge.cost(best)
+        before, after = judge.costs(experiment.controller), judge.costs(best)
         content = {
             "schema": 1,
             "controller": CONTROLLERS.name_of(best),
             "gains": {name: getattr(best, name) for name in space},
             "tuned_cost_mm": min(row["cost_mm"] for row in rows),
-            "judged_mm": {"before": before, "after": after},
+            "judged_mm": {
+                "before": float(np.mean(list(before.values()))),
+                "after": float(np.mean(list(after.values()))),
+                "by_reference": {name: {"before": before[name], "after": after[name]} for name in before},
+            },
             "trials": rows,
         }
         write_json(run.file(RESULTS), content)

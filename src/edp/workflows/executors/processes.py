@@ -23,6 +23,7 @@ from typing import IO, Any
 
 from edp.errors import ConfigError
 from edp.storage.ledger import Record, TrainingStatus
+from edp.wording import figure
 from edp.workflows.executors.base import (
     EXECUTORS,
     RETRIES,
@@ -255,9 +256,9 @@ class LocalPool(ClosedAtExit):
             if not worker.begun:
                 self._died(worker)
                 return
-            status, message = TrainingStatus.TIMEOUT, f"it took longer than {job.seconds:g} s"
+            status, message = TrainingStatus.TIMEOUT, f"it took longer than {figure(job.seconds)} s"
         elif job.memory_mb is not None and worker.resident_mb() > job.memory_mb:
-            status, message = TrainingStatus.OOM, f"it took more than {job.memory_mb:g} MB of memory"
+            status, message = TrainingStatus.OOM, f"it took more than {figure(job.memory_mb)} MB of memory"
         else:
             return
         self._drop(worker)

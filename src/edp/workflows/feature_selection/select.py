@@ -22,7 +22,6 @@ from edp.recording import MOST_ROWS, Recording
 from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
-from edp.storage.paths import full_path
 from edp.storage.runs import command_line
 from edp.workflows.feature_selection.changes import with_changes
 from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
@@ -137,7 +136,7 @@ def select_features(
     if order.pictures:
         write_screening_pictures(screening, folder / "pictures")
         files["pictures"] = folder / "pictures"
-    title = full_path(source.path).stem
+    title = source.short_name
     tried = None if trials is None else trials.to_json()
     files["page"] = build_screening_page(screening, folder / "report.html", title, quality, tried, notes)
     return Selection(screening, quality, tuple(notes), sets, files, trials)

@@ -14,7 +14,7 @@ from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
-from edp.evaluation.free_run import free_run_scores
+from edp.evaluation.free_run import check_runs, free_run_scores
 from edp.evaluation.guard import GREY, MACHINE
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
@@ -32,6 +32,7 @@ from edp.storage.paths import is_there
 from edp.training.free_run import FreeRunProgress
 from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.twin_bundle import load_twin
+from edp.wording import figure
 from edp.workflows.identify.bodies import Poses, linked_bodies, realised
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
 from edp.workflows.identify.elements import (
@@ -143,12 +144,15 @@ def identify(
         )
     channels, data = prepared_twin(recordings, settings)
     _check_strokes(channels, data, base)
+    # What could not be judged, or holds no number, is refused before the fit of minutes.
+    celsius, notes = _celsius(recordings, base)
+    scales, judge = fit_scales(channels, data.train) if loaded is None else loaded[0].scales, settings.judge
+    check_runs(channels, scales, grey.prefix_ticks, data.test, judge.seconds, judge.starts)
     if loaded is None:
         fitted = _fitted(base, machine, grey, (channels, data, settings.training.seed), (on_event, tell))
     else:
         check_same_linkage(loaded[0], base, machine)
         fitted = _informed(loaded[0], data, settings.training.seed)
-    celsius, notes = _celsius(recordings, base)
     parts = parts_of(fitted.twin, fitted.elements, base, celsius)
     notes += _notes(parts)
     tell("fitting the machine itself to free runs")
@@ -338,7 +342,7 @@ def _celsius(recordings: Sequence[Recording], base: Machine) -> tuple[float, lis
     ]
     if len(logged) < len(recordings):
         celsius = base.oil.temperature
-        return celsius, [f"the logs have no {OIL}: {celsius:g} degC of machine {base.name} is taken"]
+        return celsius, [f"the logs have no {OIL}: {figure(celsius)} degC of machine {base.name} is taken"]
     celsius = float(np.nanmean(np.concatenate(logged).astype(np.float64))) - FREEZING
     if not np.isfinite(celsius):
         raise DataError(f"'{OIL}' holds no number; correct the log, or leave the channel out")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from edp.networks.twin.grey.datasheet import NORMAL, UNEXCITED
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
+from edp.wording import figure
 from edp.workflows.identify.bodies import NAMES, Poses, base_parameters, grey_load, linked_bodies, solved_base
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
 from edp.workflows.identify.tie import STEP, MachineTie
@@ -53,7 +54,7 @@ class IdentifiedNumber:
         """For readers: its ends, roughly or not, or `unknown`."""
         if not self.excited:
             return unknown
-        return f"{'' if self.is_told else 'roughly '}{self.low:.3g} to {self.high:.3g}"
+        return f"{'' if self.is_told else 'roughly '}{figure(self.low, 3)} to {figure(self.high, 3)}"
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""

@@ -216,7 +216,7 @@ class LiveRun:
         self.note("warning", f"row {self._left_out} that cannot be used and is left out: {reason}", "left out")
 
     def note(self, kind: str, text: str, group: str = "") -> None:
-        """An event; messages of one group are shown as often as `Repetition` says, alarms always."""
+        """Record an event; messages of one group are shown at the rate set by `Repetition`, alarms always."""
         if not hasattr(self, "session"):
             self._waiting.append((kind, text, group))
             return

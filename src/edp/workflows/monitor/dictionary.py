@@ -10,16 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config.monitor import AUTOMATIC, NO_MACHINE, DictionarySpec
+from edp.config.monitor import AUTOMATIC, NO_MACHINE, DictionarySpec, MonitorExperiment
 from edp.errors import ConfigError, DataError
 from edp.monitor.diagnosis.causes import FaultClass
 from edp.monitor.diagnosis.evidence import ONSET, mean_features, parts_of
-from edp.monitor.diagnosis.learning import SimulatedFault, fit_dictionary
+from edp.monitor.diagnosis.learning import SimulatedFault, check_healthy_blocks, fit_dictionary
 from edp.monitor.diagnosis.signatures import Dictionary
+from edp.monitor.fitting import watched_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import SideBySide
+from edp.monitor.session_blocks import block_ticks
 from edp.recording import MACHINE, Recording
+from edp.signals import Channel
 from edp.sim.machine.machine_files import load_machine, machine_names
+from edp.wording import figure
 from edp.workflows.monitor.fault_sessions import (
     FaultSession,
     cases_of,
@@ -68,6 +72,47 @@ def check_dictionary(spec: DictionarySpec) -> None:
     fault_classes(spec.kinds or None)
 
 
+def check_dictionary_inputs(
+    experiment: MonitorExperiment, channels: Sequence[Channel], healthy: Sequence[Recording]
+) -> None:
+    """Refuse logs and a machine from which no dictionary could be made, before residuals are fitted.
+
+    Lengths and channels alone tell it; sessions that turn out doubtful can still leave too little.
+
+    Args:
+        experiment: settings.
+        channels: raw inputs of the monitor.
+        healthy: sessions that no residual is fitted to.
+
+    Raises:
+        ConfigError: a machine that lacks the monitor's channels, or seconds too short for the blocks.
+        DataError: too few healthy blocks.
+    """
+    spec = experiment.dictionary
+    machine = machine_of(spec, healthy)
+    if not machine:
+        return
+    rate = healthy[0].rate_hz
+    block = block_ticks(experiment.chain.block_s, healthy)
+    check_healthy_blocks(watched_blocks(experiment.chain, healthy)[:HEALTHY_SESSIONS])
+    if round((spec.before_s + spec.after_s) * rate) // block - int(spec.before_s * rate / block) <= ONSET:
+        raise _too_short(block / rate)
+    _check_machine([channel.name for channel in channels], machine, rate)
+
+
+def _too_short(block_s: float) -> ConfigError:
+    return ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {figure(block_s)} s")
+
+
+def _check_machine(inputs: Sequence[str], machine: str, rate_hz: float) -> None:
+    session = next(simulated((), machine, (0.0, 1.0), (0, 0), rate_hz)).recording
+    if not set(inputs) & set(session.channel_names):
+        raise ConfigError(
+            f"dictionary: the simulated machine '{machine}' has none of the monitor's channels, such as "
+            f"'{inputs[0]}'; map the logs to the names of Table A.1, or leave the dictionary out (--machine none)"
+        )
+
+
 def build_dictionary(
     monitor: Monitor,
     healthy: Sequence[Recording],
@@ -100,6 +145,7 @@ def build_dictionary(
     rows = [part[np.isfinite(part).any(axis=1)] for part in rows]
     if not rows:
         raise DataError("a dictionary needs healthy sessions that no network was fitted to; bring more")
+    check_healthy_blocks([len(part) for part in rows])
     classes = fault_classes(spec.kinds or None)
     plan = _Plan(machine, (spec.before_s, spec.after_s), seed, _missing_noise(monitor, healthy, machine, seed))
     jobs = [_DrawJob(monitor, classes, plan, draw) for draw in range(spec.draws)]
@@ -192,7 +238,7 @@ def _after(monitor: Monitor, recording: Recording, onset_s: float) -> Array:
     rows = monitor.conditioned_rows(recording)
     at, after = parts_of(rows[int(onset_s / monitor.block_s) :])
     if at is None or after is None:
-        raise ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {monitor.block_s:g} s")
+        raise _too_short(monitor.block_s)
     return np.stack([mean_features(at), mean_features(after)])
 
 
@@ -225,12 +271,6 @@ def _missing_noise(monitor: Monitor, healthy: Sequence[Recording], machine: str,
     """Noise that healthy logs have on channels which the simulator shows without."""
     names = [name for name in QUIET if name in monitor.inputs]
     session = next(simulated((), machine, (0.0, 60.0), (seed, 0), monitor.rate_hz)).recording
-    lacking = [name for name in monitor.inputs if name not in session.channel_names]
-    if len(lacking) == len(monitor.inputs):
-        raise ConfigError(
-            f"dictionary: the simulated machine '{machine}' has none of the monitor's channels, such as "
-            f"'{lacking[0]}'; map the logs to the names of Table A.1, or leave the dictionary out (--machine none)"
-        )
     shown = noise_of(session, names)
     logs = [noise_of(recording, names) for recording in healthy[:8]]
     real = {name: float(np.median([sizes[name] for sizes in logs])) for name in names}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import BundleError, ConfigError, DataError, LostError, closest
+from edp.errors import ConfigError, DataError, LostError, closest
 from edp.logs.source import DataSource
 from edp.monitor.detectable import effort_line, found_sizes, healthy_range, measure_found_sizes, promise_lines
 from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_sessions, fit_chain
@@ -36,7 +36,8 @@ from edp.storage.paths import is_there
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
-from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, machine_of
+from edp.wording import figure, percent
+from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, check_dictionary_inputs, machine_of
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
@@ -117,6 +118,11 @@ def fit_monitor(
         return replace(fitted, folder=folder)
 
 
+def holds_model(path: str | Path) -> bool:
+    """Return whether a path is a run folder or a bundle, finished or not, in place of logs."""
+    return any(is_there(Path(path) / name) for name in ("bundle", "bundle.json", "run.json", "twin"))
+
+
 def _in_one_thread(function: Callable[[Any], Any], job: Any) -> Any:
     """A job with the sums of a fit in one process."""
     with one_blas_thread():
@@ -131,17 +137,12 @@ def _died(label: str) -> LostError:
 
 
 def _network_of(run: str | Path) -> Bundle | TwinBundle:
-    """The network or twin of a run.
+    """Return the network or twin of a run.
 
     Raises:
-        BundleError: it holds none, or is damaged.
+        BundleError: the folder holds none, or is damaged.
     """
-    try:
-        return load_twin(run) if holds_twin(run) else load_bundle(run)
-    except BundleError as error:
-        if any(is_there(Path(run) / name) for name in ("bundle", "bundle.json", "run.json", "twin")):
-            raise
-        raise BundleError(f"{error}; healthy logs are the last argument alone: put them into one folder") from error
+    return load_twin(run) if holds_twin(run) else load_bundle(run)
 
 
 @one_blas_thread()
@@ -174,6 +175,7 @@ def fit_to_recordings(
     train, validation, rest = _divided(sessions, experiment)
     _check_hours(sessions, rest, experiment)
     check_healthy_sessions(experiment.chain, channels, rest)
+    check_dictionary_inputs(experiment, channels, rest)
     material = FitMaterial(
         train=train,
         validation=validation,
@@ -271,7 +273,9 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
     first = recordings[0]
     rates = sorted({recording.rate_hz for recording in recordings})
     if rates[-1] > rates[0] * 1.001:
-        raise DataError(f"healthy logs have rates from {rates[0]:g} to {rates[-1]:g} Hz; set rate_hz in the signal map")
+        raise DataError(
+            f"healthy logs have rates from {figure(rates[0])} to {figure(rates[-1])} Hz; set rate_hz in the signal map"
+        )
     for name in experiment.channels:
         for recording in recordings:
             if name not in recording.channel_names:
@@ -384,10 +388,10 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
     if left < promised:
         share = left / hours
         raise ConfigError(
-            f"{hours:.3g} h of healthy logs are too few for one false alarm in {promised:g} h: "
-            f"{1.0 - share:.0%} of them train residuals, and what is left supports one in {left:.3g} h; ask "
-            f"for one in {ROOM * left:.3g} (--hours-per-false-alarm {ROOM * left:.3g}), which leaves room for sessions "
-            f"that turn out doubtful, or bring {promised / (ROOM * share) - hours:.3g} h more"
+            f"{figure(hours, 3)} h of healthy logs are too few for one false alarm in {figure(promised)} h: "
+            f"{percent(1.0 - share)} of them train residuals, and what is left supports one in {figure(left, 3)} h; "
+            f"ask for one in {figure(ROOM * left, 3)} (--hours-per-false-alarm {figure(ROOM * left, 3)}), which leaves "
+            f"room for sessions that turn out doubtful, or bring {figure(promised / (ROOM * share) - hours, 3)} h more"
         )
 
 

@@ -15,6 +15,7 @@ from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.monitor import Monitor, MonitorStream
 from edp.monitor.monitor_file import load_monitor
 from edp.sim.faults.shown import falsified_channels
+from edp.wording import figure
 
 Array = NDArray[np.float64]
 HOLD_S = 60.0
@@ -59,7 +60,8 @@ class MonitorGuard:
         names = {channel.name: i for i, channel in enumerate(plant.channels)}
         if abs(plant.rate_hz - self.monitor.rate_hz) > 1e-3 * self.monitor.rate_hz:
             raise ConfigError(
-                f"{plant.source} has {plant.rate_hz:g} Hz, the monitor {self.monitor.rate_hz:g} Hz; run the loop at "
+                f"{plant.source} has {figure(plant.rate_hz)} Hz, the monitor {figure(self.monitor.rate_hz)} Hz; run "
+                "the loop at "
                 "the rate of the monitor's recordings"
             )
         if not names.keys() & {*self.monitor.inputs}:

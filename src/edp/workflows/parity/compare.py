@@ -46,25 +46,30 @@ def _length(bundle: Bundle) -> int:
 
 
 def recorded_case(bundle: Bundle, source: DataSource, ticks: int | None = None) -> ParityCase:
-    """The first ticks of the first recording of a source; a plant runs free on its commands, behind a measured prefix.
+    """Return a case of the first ticks of each recording of a source, in equal parts, one after another.
+
+    A plant runs free on the commands, after a measured prefix.
 
     Raises:
         DataError: a channel is missing or not finite, another rate, or fewer ticks than the window.
     """
     ticks = ticks or _length(bundle)
+    recordings = source.read()[:ticks]
+    part = -(-ticks // len(recordings))
     if isinstance(bundle.predictor, TwinPlant):
-        return _case(bundle, _free_rows(bundle.predictor, source.read()[0], ticks))
-    series = unlabelled(bundle.task, source.read()[0])
-    return _case(bundle, np.ascontiguousarray(series.inputs[:ticks], dtype=np.float32))
+        return _case(bundle, _free_rows(bundle.predictor, recordings, part)[:ticks])
+    rows = np.concatenate([unlabelled(bundle.task, recording).inputs[:part] for recording in recordings])
+    return _case(bundle, np.ascontiguousarray(rows[:ticks], dtype=np.float32))
 
 
-def _free_rows(plant: TwinPlant, recording: Recording, ticks: int) -> Rows:
-    """Inputs of a plant along a recording: measured for its prefix, free from there on."""
+def _free_rows(plant: TwinPlant, recordings: Sequence[Recording], part: int) -> Rows:
+    """Return the inputs of a plant along parts of recordings: measured for its prefix, free from there on."""
     channels = plant.twin.channels
-    series = channels.task().series(matched(channels, recording), stop=ticks)
-    flags = np.zeros_like(series.targets)
+    series = [channels.task().series(matched(channels, recording), stop=part) for recording in recordings]
+    inputs, targets = (np.concatenate([getattr(one, name) for one in series]) for name in ("inputs", "targets"))
+    flags = np.zeros_like(targets)
     flags[: plant.window] = 1.0
-    return np.concatenate([series.inputs, series.targets * flags, flags], axis=1, dtype=np.float32)
+    return np.concatenate([inputs, targets * flags, flags], axis=1, dtype=np.float32)
 
 
 def _case(bundle: Bundle, inputs: Rows) -> ParityCase:

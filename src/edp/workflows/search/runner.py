@@ -23,6 +23,7 @@ from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record, check_uncoordinated
 from edp.storage.portable import cores
+from edp.wording import figure
 from edp.workflows.executors import Executor, LocalPool, RayPool
 from edp.workflows.search.context import Decision, SearchContext, is_enough, set_apart
 from edp.workflows.search.dispatch import Dispatcher
@@ -166,7 +167,8 @@ def run_search(
         source = DataSource(target / SESSIONS_FILE)
         callbacks.on_note(
             f"too few logs for sessions ({len(recordings)}): divided into {len(data.names)} sessions of "
-            f"{parts.seconds:.3g} s or more ({source.path}); what is found holds for these logs, not for other days"
+            f"{figure(parts.seconds, 3)} s or more ({source.path}); what is found holds for these logs, not for other "
+            "days"
         )
     with ExitStack() as open_things:
         ledger = open_things.enter_context(Ledger(target / "ledger"))
@@ -337,7 +339,7 @@ def _facts(plan: SearchPlan, data: _Data, source: DataSource, context: SearchCon
         "unit": data.unit,
         "preset": plan.preset,
         "data": {
-            "path": str(source.path),
+            "path": source.label,
             "sessions": len(data.names),
             "hours": round(data.hours, 4),
             "hash": data.digest,

@@ -27,7 +27,7 @@ from edp.training.bundle import weights_digest
 from edp.workflows.transfer.case import TransferCase, tuned
 from edp.workflows.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
 from edp.workflows.transfer.methods import METHODS, Made, Method, code_names
-from edp.workflows.transfer.scores import distributions, errors_of, excerpts, measure
+from edp.workflows.transfer.scores import MeasuredMethod, distributions, errors_of, excerpts, measure
 from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
 from edp.workflows.transfer.spec import FinetuneSpec
 
@@ -270,10 +270,13 @@ def _result(
     return result, excerpts(pair, data, skip)
 
 
-def _row(method: type[Method], result: Made, domains: dict[str, Any], name: str) -> dict[str, Any]:
+def _row(
+    method: type[Method], result: Made, domains: dict[str, dict[str, MeasuredMethod]], name: str
+) -> dict[str, Any]:
     return {
         "label": method.label,
         "learned": result.learned,
         "weights": None if result.network is None else weights_digest(result.network),
-        "domains": {domain: domain_scores[name] for domain, domain_scores in domains.items()},
+        "domains": {domain: measured[name].overall for domain, measured in domains.items()},
+        "recordings": domains["target"][name].by_recording,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,16 +21,34 @@ SHOWN_RECORDINGS = 3
 Errors = dict[str, NDArray[np.float64]]
 
 
-def measure(predictions: Predictions, data: Prepared, skip: int) -> dict[str, Any]:
-    """Scores by horizon and target in report units, with the skew of the errors and their mean square."""
-    scores: dict[str, Any] = score_predictions(predictions, data, skip)["overall"]
+@dataclass(frozen=True)
+class MeasuredMethod:
+    """Scores of a method on a test part.
+
+    Attributes:
+        overall: by horizon and target in report units, with the skew of the errors and their mean square.
+        by_recording: mean absolute error over targets of each recording, by horizon.
+    """
+
+    overall: Mapping[str, Any]
+    by_recording: Mapping[str, Mapping[str, float]]
+
+
+def measure(predictions: Predictions, data: Prepared, skip: int) -> MeasuredMethod:
+    """Return the scores of predictions on the test part."""
+    scored = score_predictions(predictions, data, skip)
+    scores: dict[str, Any] = scored["overall"]
     for horizon, errors in errors_of(predictions, data, skip).items():
         rows = scores[horizon]
         for index, name in enumerate(data.task.targets):
             rows[name] |= {"mse": rows[name]["rmse"] ** 2, "skew": skew(errors[:, index])}
         own = [rows[name] for name in data.task.targets]
         rows["mean"] |= {key: float(np.mean([row[key] for row in own])) for key in ("mse", "skew")}
-    return scores
+    by_recording = {
+        name: {horizon: row["mean"]["mae"] for horizon, row in by_horizon.items()}
+        for name, by_horizon in scored["recordings"].items()
+    }
+    return MeasuredMethod(scores, by_recording)
 
 
 def errors_of(predictions: Predictions, data: Prepared, skip: int) -> Errors:

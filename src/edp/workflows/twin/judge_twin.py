@@ -179,7 +179,7 @@ def evaluate_twin(
         source = read_as_before(source, bundle.provenance["data"]["reader"])
         recordings = [matched(channels, recording) for recording in source.read()]
         data = replace(data, test=[channels.task().series(recording) for recording in recordings])
-        target = make_folder(folder / f"on_{source.path.stem}")
+        target = make_folder(folder / f"on_{source.short_name}")
     scores, runs = judge_twin(bundle, experiment, data, driving_labels(recordings), tell)
     if predictor_run is not None:
         tell("the look-ahead predictor")

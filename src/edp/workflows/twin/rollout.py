@@ -22,6 +22,7 @@ from edp.report import FreeRunFacts, write_rollout_plots, write_twin_page
 from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
+from edp.wording import figure, setting_text
 from edp.workflows.twin.judge_twin import channel_facts, shown_runs
 
 FREE = "_twin"
@@ -111,7 +112,7 @@ def rollout_log(
         write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, plots)
     if page is not None:
         content = {"channels": channel_facts(twin.channels), "models": {"twin": result.scores}}
-        title = f"{recording.name} from {result.start_s:g} s"
+        title = f"{recording.name} from {figure(result.start_s)} s"
         write_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals)), page)
     return result
 
@@ -127,28 +128,31 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
     """First tick of a free run and its length, which both lie in the log."""
     rate, prefix = recording.rate_hz, twin.prefix_ticks
     if not above(0.0, MOST_SECONDS).holds(seconds):
-        raise ConfigError(f"--seconds {seconds:g}: {above(0.0, MOST_SECONDS).rule('seconds')} must hold")
+        raise ConfigError(f"--seconds {setting_text(seconds)}: {above(0.0, MOST_SECONDS).rule('seconds')} must hold")
     if start_s is not None and not span(0.0, MOST_SECONDS).holds(start_s):
-        raise ConfigError(f"--from {start_s:g}: {span(0.0, MOST_SECONDS).rule('from')} must hold")
+        raise ConfigError(f"--from {setting_text(start_s)}: {span(0.0, MOST_SECONDS).rule('from')} must hold")
     start = prefix if start_s is None else round(start_s * rate)
     ticks = max(1, round(seconds * rate))
     if recording.samples < prefix + 2:
         raise DataError(
-            f"'{recording.name}' has {recording.samples} ticks ({recording.duration_s:g} s); the twin needs a prefix "
-            f"of {prefix} measured ones ({prefix / rate:g} s) and two more: give a longer log"
+            f"'{recording.name}' has {recording.samples} ticks ({figure(recording.duration_s)} s); the twin needs a "
+            "prefix "
+            f"of {prefix} measured ones ({figure(prefix / rate)} s) and two more: give a longer log"
         )
     if start < prefix:
         raise DataError(
-            f"a free run from {start / rate:g} s has {start} measured ticks before it; the twin needs a prefix of "
-            f"{prefix} ({prefix / rate:g} s): begin at --from {prefix / rate:g} or later"
+            f"a free run from {figure(start / rate)} s has {start} measured ticks before it; the twin needs a prefix "
+            "of "
+            f"{prefix} ({figure(prefix / rate)} s): begin at --from {setting_text(prefix / rate)} or later"
         )
     # One more row than answers: the last answer is compared with the tick after the last command.
     if start + ticks + 1 > recording.samples:
         longest = (recording.samples - 1 - start) / rate
-        room = f"at most --seconds {longest:g} from there" if longest > 0 else "begin earlier"
+        room = f"at most --seconds {setting_text(longest)} from there" if longest > 0 else "begin earlier"
         raise DataError(
-            f"a free run of {seconds:g} s from {start / rate:g} s goes beyond the end of '{recording.name}' at "
-            f"{recording.duration_s:g} s; {room}"
+            f"a free run of {figure(seconds)} s from {figure(start / rate)} s goes beyond the end of "
+            f"'{recording.name}' at "
+            f"{figure(recording.duration_s)} s; {room}"
         )
     return start, ticks
 

@@ -26,6 +26,7 @@ from edp.networks.twin.grey.wiring import FARTHEST_TURN
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import MOST_MEMBERS
+from edp.networks.twin.recurrent_members import scales_for
 from edp.recording import Recording
 from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
@@ -105,8 +106,7 @@ def train_twin(
     if base is not None:
         base.check(channels, data.train)
         begun = {"from": base.digest}
-    else:
-        _check_judged(channels, data, experiment)
+    _check_judged(channels, data, experiment, base)
     # Runs of versions that knew no ground are the same ones.
     settings = {name: value for name, value in TWIN_SETTINGS.plain(experiment).items() if name != "ground"}
     key = run_key({"twin": settings} | begun | _linkage(experiment), data.digest)
@@ -140,7 +140,7 @@ def train_twin(
     return TrainedTwin(bundle, scores, False)
 
 
-def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) -> None:
+def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperiment, base: BaseTwin | None) -> None:
     """Raise an error if the new twin could not be evaluated on these recordings, before it is trained.
 
     Raises:
@@ -150,6 +150,7 @@ def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperi
     # An automatic twin is fitted to both parts in the end, and calibrated on folds of them.
     auto = isinstance(experiment.twin, AutoTwin)
     scales = fit_scales(channels, [*data.train, *data.validation] if auto else data.train)
+    scales = scales if base is None else scales_for(base.twin, scales, data.train)
     # The end stops of a motor are free, see `turning_scales`.
     turns = [channel.kind is not Kind.POSITION for channel in channels.strokes]
     columns = len(channels.velocities) + np.flatnonzero(turns)

@@ -12,6 +12,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
 from edp.settings.bounds import check_bounds, integer, span
 from edp.signals import Channel, Kind
+from edp.wording import setting_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,8 @@ class CylinderElement:
         check_bounds(f"cylinder '{self.name}'", self, bore=size, rod_diameter=size, count=integer(1, 100))
         if self.bore and self.rod_diameter >= self.bore:
             raise ConfigError(
-                f"cylinder '{self.name}': rod_diameter = {self.rod_diameter:g} m is not below bore = {self.bore:g} m"
+                f"cylinder '{self.name}': rod_diameter = {setting_text(self.rod_diameter)} m is not below bore = "
+                f"{setting_text(self.bore)} m"
             )
 
     @property

@@ -59,7 +59,7 @@ class Sink(Protocol):
         ...
 
     def leave_out(self, reason: str) -> None:
-        """Count an unusable row and report the reason for the first rows, then for one in a thousand."""
+        """Count an unusable row; report the reason for the first rows, then for every thousandth row."""
         ...
 
     def note(self, kind: str, text: str, group: str = "") -> None:

@@ -8,6 +8,7 @@ from typing import ClassVar
 from edp.data.derived_velocities import matched
 from edp.logs.source import DataSource, read_with_truth
 from edp.recording import MACHINE, Recording
+from edp.wording import figure
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Sink, SourceOptions
 
 SIMULATED = "sim:"
@@ -17,14 +18,14 @@ SIMULATED = "sim:"
 class LogSource(LiveSource):
     """One log, from its first row to its last."""
 
-    options: ClassVar[frozenset[str]] = frozenset({"map", "machine", "speed"})
+    options: ClassVar[frozenset[str]] = frozenset({"map", "machine", "speed", "until-end"})
 
     def __init__(self, recording: Recording, machine: str | None = None) -> None:
         self.recording: Recording = recording
         self.channels, self.rate_hz, self.ticks = recording.channels, recording.rate_hz, recording.samples
         self.machine = machine or _machine_of(recording)
-        self.text = f"log {recording.name}, {recording.duration_s:g} s"
-        self.ending = f"the log has ended after {recording.duration_s:g} s"
+        self.text = f"log {recording.name}, {figure(recording.duration_s)} s"
+        self.ending = f"the log has ended after {figure(recording.duration_s)} s"
 
     @classmethod
     def of(cls, options: SourceOptions, needs: Needs) -> LogSource:

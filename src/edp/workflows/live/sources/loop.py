@@ -64,7 +64,7 @@ class LoopSource(LiveSource):
         return cls(ControlBench(experiment, sources), sources)
 
     def prepare(self) -> None:
-        """See `LiveSource`: compile the plant; each loop begins with a reset of its own."""
+        """Compile the plant (see `LiveSource`); each loop begins with a reset."""
         task = self._bench.tasks[0]
         self._env.reset(seed=task.seed, options=start_options(task, self._bench.plant.geometry))
         self._env.step(np.zeros(len(LEVERS), np.float32))

@@ -41,7 +41,7 @@ class Ros2Source(LiveSource):
     """
 
     steered: ClassVar[bool] = False
-    options: ClassVar[frozenset[str]] = frozenset({"rate", "machine"})
+    options: ClassVar[frozenset[str]] = frozenset({"rate", "machine", "until-end"})
     ending = "the node has ended"
 
     def __init__(

@@ -81,7 +81,7 @@ class SimSource(LiveSource):
         return cls(options.value, rate_hz, options.seed or 0, options.settings, names)
 
     def prepare(self) -> None:
-        """See `LiveSource`: compile the simulator; each episode begins with a reset of its own."""
+        """Compile the simulator (see `LiveSource`); each episode begins with a reset."""
         self._env.reset(seed=self._seed)
         self._env.step(np.zeros(len(LEVERS), np.float32))
 

@@ -13,10 +13,11 @@ import numpy as np
 
 from edp.errors import ConfigError, DataError
 from edp.live.addresses import LOOPBACK, resolve_bind
-from edp.logs.units import check_unit, unit_for
+from edp.logs.units import check_unit, mapped_channel, unit_for
 from edp.settings.bounds import shown
 from edp.signals import VOCABULARY, Channel, Kind, SignalMap
 from edp.storage.reading import parse_json
+from edp.wording import figure
 from edp.workflows.live.sources.arrivals import Arrivals
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
 
@@ -47,7 +48,7 @@ class UdpSource(LiveSource):
     """
 
     steered: ClassVar[bool] = False
-    options: ClassVar[frozenset[str]] = frozenset({"map", "rate", "machine", "udp-bind"})
+    options: ClassVar[frozenset[str]] = frozenset({"map", "rate", "machine", "udp-bind", "until-end"})
     ending = "the source was closed"
 
     def __init__(
@@ -80,7 +81,7 @@ class UdpSource(LiveSource):
     def of(cls, options: SourceOptions, needs: Needs) -> UdpSource:
         """`SourceOptions.value` is the port; the setting ``bind`` another address than loopback."""
         rate, signal_map = chosen_rate(options, needs, "--udp"), options.signal_map()
-        mapped = tuple(entry.channel() for entry in signal_map.channels) if signal_map else ()
+        mapped = tuple(mapped_channel(entry) for entry in signal_map.channels) if signal_map else ()
         names = {channel.name for channel in mapped}
         channels = (*mapped, *(channel for channel in needs.channels if channel.name not in names))
         host = options.settings.get("bind", LOOPBACK)
@@ -89,7 +90,7 @@ class UdpSource(LiveSource):
         return source
 
     def run(self, sink: Sink) -> None:
-        """See `LiveSource`; a datagram that is not a row is left out, counted and told."""
+        """Receive rows (see `LiveSource`); a datagram that is not a row is skipped, counted and reported."""
         if not self._bind.is_loopback:
             sink.note("warning", f"rows are taken from {self._bind.reach}, whoever sends them")
         arrivals = Arrivals(sink, self.rate_hz)
@@ -146,7 +147,7 @@ class UdpSource(LiveSource):
             return tuple(VOCABULARY.get(name, Channel(name, Kind.GENERIC)) for name in names[:MOST_CHANNELS])
         self._socket.close()
         raise DataError(
-            f"{self.text}: no row with a value came for {STARTUP_S:g} s, and no model or signal map says which "
+            f"{self.text}: no row with a value came for {figure(STARTUP_S)} s, and no model or signal map says which "
             "channels there are; start the sender first, or give --map"
         )
 
@@ -183,7 +184,7 @@ def _conversions(signal_map: SignalMap | None) -> Callable[[str, Mapping[str, fl
     """From a channel's name and a row to its value in SI units."""
     entries: dict[str, Any] = {entry.name: entry for entry in (signal_map.channels if signal_map else ())}
     units = {
-        name: unit_for(check_unit(entry.unit, where), entry.channel().kind, where)
+        name: unit_for(check_unit(entry.unit, where), mapped_channel(entry).kind, where)
         for name, entry in entries.items()
         if entry.unit is not None and (where := f"signal map, channel '{name}'")
     }

@@ -12,6 +12,7 @@ from edp.config.experiment import Table
 from edp.errors import ConfigError
 from edp.registry import Registry
 from edp.stats.clustered import MeanTest
+from edp.wording import percent
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.space import Choice, Range, Space, apply
 from edp.workflows.search.study import Study, Trial
@@ -238,7 +239,7 @@ def said_of_pruned(context: SearchContext, answers: Sequence[AnsweredQuestion]) 
     share = saved / max(1, sum(bool(answer.outcomes) for answer in answers))
     return [
         f"{len(pruned)} of {len(answers)} questions were ended at a rung as worse than the median there, which spared "
-        f"{100 * share:.0f} % of the steps."
+        f"{percent(share)} of the steps."
     ]
 
 

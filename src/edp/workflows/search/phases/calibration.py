@@ -12,6 +12,7 @@ from edp.errors import DataError
 from edp.stats.efficiency import SizeScore, most_efficient
 from edp.stats.paired import fill_worst
 from edp.stats.pareto import pareto
+from edp.wording import behind, figure, percent, percent_interval
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.phases.base import (
     PHASES,
@@ -78,10 +79,13 @@ class Calibration:
             facts["backbones"][backbone] = _plain(context, picked) | {"trials": [_plain(context, item) for item in own]}
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
-            text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} {context.unit} with {size} parameters"
+            text = (
+                f"{backbone}: {_values(picked)} gives {figure(picked.score, 3)}{behind(context.unit)} with {size} "
+                "parameters"
+            )
             if lowest is not None and lowest is not picked:
                 size = f"{lowest.costs['parameters']:,.0f}"
-                text += f"; the lowest, {lowest.score:.3g}, has {size} and does not repay the difference"
+                text += f"; the lowest, {figure(lowest.score, 3)}, has {size} and does not repay the difference"
             sentences += [f"{text}.", *(f"{backbone}: {sentence}" for sentence in said_of_pruned(context, own))]
         if not chosen:
             raise DataError(
@@ -92,13 +96,13 @@ class Calibration:
         if final:
             facts["final"] = _final(context, list(chosen), final)
             scores = facts["final"]["scores"]
-            listed = ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
+            listed = ", ".join(f"{name} {figure(score, 3)}" for name, score in scores.items())
             against = "".join(
-                f"; {item['best']} against {name} {100 * item['change']:+.2f} % ({100 * item['low']:+.2f} to "
-                f"{100 * item['high']:+.2f} %)"
+                f"; {item['best']} against {name} {percent(item['change'], signed=True)} "
+                f"({percent_interval(item['low'], item['high'])})"
                 for name, item in facts["final"]["against"].items()
             )
-            sentences.append(f"Each on all {context.spec.folds} folds: {listed} {context.unit}{against}.")
+            sentences.append(f"Each on all {context.spec.folds} folds: {listed}{behind(context.unit)}{against}.")
         winner = min(scores, key=lambda name: scores[name])
         facts |= {"backbone": winner, "baseline": dict(chosen[winner].trial.values)}
         facts["settings"] = chosen[winner].settings
@@ -166,7 +170,7 @@ def _plain(context: SearchContext, answer: AnsweredQuestion) -> dict[str, Any]:
 
 def _values(answer: AnsweredQuestion) -> str:
     return ", ".join(
-        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+        f"{name} {figure(value, 3)}" if isinstance(value, float) else f"{name} {value}"
         for name, value in answer.trial.values.items()
     )
 

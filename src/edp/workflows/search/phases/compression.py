@@ -12,6 +12,7 @@ from edp.networks.narrow import width_of
 from edp.networks.predictor import build_model
 from edp.stats.pareto import pareto
 from edp.training.bundle import blank_scaler
+from edp.wording import percent
 from edp.workflows.compression import FORMATS
 from edp.workflows.compression.judged import recipe_text, relative
 from edp.workflows.compression.planning import CompressionPlan, make_plan
@@ -126,7 +127,7 @@ class CompressionPhase:
         usage = row["resource_usage"]
         sentences.append(
             f"Chosen for '{budget.name}': {row['name']} with {usage['parameter_bytes']:,} bytes of parameters "
-            f"and {usage['cycles'][2]:,} cycles a tick; its error there is {100 * (row['error'] - 1):+.1f} % "
+            f"and {usage['cycles'][2]:,} cycles a tick; its error there is {percent(row['error'] - 1, signed=True)} "
             "against the teacher's."
         )
         formats = ("float32", row["format"])
@@ -145,7 +146,7 @@ class CompressionPhase:
         facts["held_out_test"] = {"scores": scores, "error": error}
         sentences.append(
             f"On the second test set ({', '.join(context.second)}), opened for these two alone: "
-            f"{100 * (error - 1):+.1f} % against the teacher's error."
+            f"{percent(error - 1, signed=True)} against the teacher's error."
         )
         return Decision(NAME, facts, tuple(sentences))
 

@@ -10,6 +10,7 @@ import numpy as np
 from edp.errors import count_of
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
+from edp.wording import figure, percent
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import fitting, options_of, title_of
 from edp.workflows.search.phases.base import PHASES, Course, changed
@@ -69,9 +70,8 @@ class Exploration:
         verdict = "it is the teacher" if better else "the winner of phase 4 stays the teacher"
         sentences = (
             f"Best of {len(facts['trials'])} questions about all modules: {names}.",
-            f"Against the winner of phase 4 on {count_of(size, 'fresh run')}: {100 * comparison['change']:+.2f} % "
-            "(one-sided p "
-            f"{comparison['p']:.2g}); {verdict}.",
+            f"Against the winner of phase 4 on {count_of(size, 'fresh run')}: "
+            f"{percent(comparison['change'], signed=True)} (one-sided p {figure(comparison['p'], 2)}); {verdict}.",
             *facts["said_of_pruned"],
         )
         return Decision("exploration", facts, sentences)

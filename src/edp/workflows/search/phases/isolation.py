@@ -13,6 +13,7 @@ from edp.errors import DataError, count_of
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
+from edp.wording import behind, figure, percent, percent_interval
 from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
 from edp.workflows.search.phases.base import PHASES, Course, changed
 
@@ -99,19 +100,19 @@ class Isolation:
         facts["variance"] = _proxy(context, tables, arms)
         sentences = [
             f"Feature set {chosen} goes on: mean {what} "
-            + ", ".join(f"{name} {value:.3g}" for name, value in means.items())
-            + f" {context.unit} over all backbones."
+            + ", ".join(f"{name} {figure(value, 3)}" for name, value in means.items())
+            + f"{behind(context.unit)} over all backbones."
         ]
         for backbone, comparison in facts["comparisons"].items():
             sentences.append(
-                f"{backbone}: {chosen} against {comparison['reference']} {100 * comparison['change']:+.2f} % "
-                f"(one-sided p {comparison['p']:.2g}, two-way clustered t over {count_of(spec.variance_runs, 'run')})."
+                f"{backbone}: {chosen} against {comparison['reference']} {percent(comparison['change'], signed=True)} "
+                f"(one-sided p {figure(comparison['p'], 2)}, two-way clustered t over "
+                f"{count_of(spec.variance_runs, 'run')})."
             )
         for backbone, comparison in facts["backbones"].items():
             sentences.append(
-                f"With {chosen}, {comparison['best']} against {backbone} {100 * comparison['change']:+.2f} % "
-                f"({100 * comparison['low']:+.2f} to {100 * comparison['high']:+.2f} %); phase 1 tunes each before "
-                "one is chosen."
+                f"With {chosen}, {comparison['best']} against {backbone} {percent(comparison['change'], signed=True)} "
+                f"({percent_interval(comparison['low'], comparison['high'])}); phase 1 tunes each before one is chosen."
             )
         return Decision("isolation", facts, tuple(sentences))
 

@@ -19,6 +19,8 @@ HUGE, TINY = 1e15, 1e-6
 """Sizes beyond which a number is shown with a power of ten."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 """With what a spreadsheet takes a cell for a formula."""
+HUGE_SHARE = 1e13
+"""Share of one from which a percentage is shown with a power of ten."""
 
 
 def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
@@ -30,7 +32,7 @@ def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
 
 
 def number(value: float | None, decimals: int | None = None, signed: bool = False) -> str:
-    """Return a number as text, with thousands separated and a true minus sign; a dash if there is no number.
+    """Return a number as text, with thousands separated and a true minus sign; a dash for None, NaN or infinity.
 
     Decimals that would be the fifth significant digit or a later one are left out, whatever `decimals` asks for.
     """
@@ -46,17 +48,36 @@ def number(value: float | None, decimals: int | None = None, signed: bool = Fals
     return text.replace("-", "−")
 
 
-def figure(value: float | None) -> str:
+def figure(value: float | None, digits: int = MAX_DIGITS) -> str:
     """Return a setting or measured quantity as text: four significant digits, without zeros at the end.
 
     Whole numbers are shown in full.
+
+    Args:
+        value: the quantity.
+        digits: fewer significant digits, for quantities that are known less well.
     """
     if value is None or not math.isfinite(value):
         return MISSING
     if 0 < abs(value) < TINY:
-        return f"{value:.{MAX_DIGITS - 1}g}".replace("-", "−")
-    text = number(value, 0 if float(value).is_integer() else _useful_decimals(value))
+        return f"{value:.{min(digits, MAX_DIGITS - 1)}g}".replace("-", "−")
+    text = number(value, 0 if float(value).is_integer() else _useful_decimals(value, digits))
     return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as pages show it: empty for numbers without a unit, which is "1" in files."""
+    return "" if unit == "1" else unit
+
+
+def behind(unit: str) -> str:
+    """Return a unit with the blank before it, empty for numbers without a unit."""
+    return f" {unit_text(unit)}".rstrip()
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """Return a number with its unit, as `number` and `unit_text` show them."""
+    return number(value) + behind(unit)
 
 
 def interval(low: float | None, high: float | None, signed: bool = False) -> str:
@@ -70,19 +91,32 @@ def interval_decimals(low: float, high: float) -> int:
     return decimals_for([high - low or high], significant=2)
 
 
-def _useful_decimals(value: float) -> int:
-    """Return the decimals with which a number has at most `MAX_DIGITS` significant digits."""
+def _useful_decimals(value: float, digits: int = MAX_DIGITS) -> int:
+    """Return the decimals with which a number has at most `digits` significant digits."""
     # The exponent after rounding: 9.9996 has two digits before the point once it is rounded.
-    exponent = int(f"{abs(value):.{MAX_DIGITS - 1}e}".partition("e")[2])
-    return max(MAX_DIGITS - 1 - exponent, 0)
+    exponent = int(f"{abs(value):.{digits - 1}e}".partition("e")[2])
+    return max(digits - 1 - exponent, 0)
 
 
 def percent(share: float | None, signed: bool = False) -> str:
-    """A share of one as a percentage: one decimal below ten percent, none above."""
+    """Return a share of one as a percentage: one decimal below ten percent, none above; a dash if it is not known.
+
+    Headlines, first lines, tables and pages show percentages of results by this rule alone.
+    """
     if share is None or not math.isfinite(share):
-        return MISSING
+        return "–"
+    if abs(share) >= HUGE_SHARE:
+        return f"{100 * share:{'+' if signed else ''}.3g} %".replace("-", "−")
     # 0.0995 is where one decimal would round up to ten percent.
-    return number(100 * share, 1 if abs(share) < 0.0995 else 0, signed) + " %"
+    text = f"{100 * share:{'+' if signed else ''},.{1 if abs(share) < 0.0995 else 0}f}"
+    # A rounded zero must not carry a sign.
+    text = text.lstrip("+-") if float(text.replace(",", "")) == 0 else text
+    return text.replace("-", "−") + " %"
+
+
+def percent_interval(low: float, high: float) -> str:
+    """Return an interval of relative changes, such as "−3.1 % to +12 %"."""
+    return f"{percent(low, signed=True)} to {percent(high, signed=True)}"
 
 
 def setting_text(value: object) -> str:
