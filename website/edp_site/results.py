@@ -121,7 +121,7 @@ def results_page(folder: Path, goals: Sequence[Goal], archive: Sequence[Archived
         ]
         for one in archive:
             if one.covers(path.stem, result):
-                lines += [f"Archived, {one.reason}. The script: `git show {one.place}`.", ""]
+                lines += [f"Archived: {one.reason}. Script: `git show {one.place}`.", ""]
         lines += _table(result["verdicts"])
     return "\n".join(lines) + "\n"
 
