@@ -10,7 +10,7 @@ import numpy as np
 from edp.data.even_split import blocks_where_time_is_uneven, is_even, moving_ticks
 from edp.data.splits import ByRecording, ByTime
 from edp.recording import Recording
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.auto.candidates import LEAST_SPAN
 from edp.workflows.auto.settings import AutoSettings
 
@@ -44,7 +44,7 @@ def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[Aut
     if uneven is not None:
         blocks, why = uneven
         return replace(settings, split=blocks), [
-            f"{why[0].upper()}{why[1:]}: blocks of {figure(blocks.block_s, 3)} s test in turn (split.kind decides "
+            f"{why[0].upper()}{why[1:]}: blocks of {typed(blocks.block_s, 3)} s test in turn (split.kind decides "
             "otherwise)."
         ]
     return replace(settings, split=by_time), []
