@@ -18,8 +18,7 @@ from edp.training import Diverged, Fitted, TrainingProgress
 from edp.training.bagging.fit import fit_bagged
 from edp.training.blas import one_blas_thread
 from edp.training.fit import fit
-from edp.workflows.auto.candidates import CANDIDATES
-from edp.workflows.auto.foundation import Foundation
+from edp.workflows.auto.candidates import CANDIDATES, Foundation
 from edp.workflows.auto.promise import Block, Promise, promise_of, promise_of_validation, standard_truth
 
 NOTE = "progress.json"
