@@ -22,7 +22,6 @@ from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, sav
 from edp.training.blas import one_blas_thread
 from edp.wording import percent
 from edp.workflows.auto.candidates import CANDIDATES, Amount, read_foundation
-from edp.workflows.auto.portfolio import TrainedPortfolio, Trainer, train_portfolio
 from edp.workflows.auto.promise import (
     PortfolioChoice,
     Promise,
@@ -43,7 +42,13 @@ from edp.workflows.auto.recordings import (
     still_inputs,
 )
 from edp.workflows.auto.settings import AutoSettings
-from edp.workflows.auto.train_candidates import TrainedCandidate
+from edp.workflows.auto.train_candidates import (
+    TrainedCandidate,
+    TrainedPortfolio,
+    Trainer,
+    candidate_experiments,
+    train_portfolio,
+)
 from edp.workflows.train_evaluate import keep_fitted
 
 
@@ -105,6 +110,7 @@ def train_auto(
         return finished
     check_moving(data)
     check_size(data)
+    candidate_experiments(settings, amount)  # refuse unknown or unsuitable candidates before the folder is claimed
     with Run.create(out, "auto", key, tomli_w.dumps(plain_tree(settings))) as run:
         portfolio = train_portfolio(settings, data, amount, run.path, Trainer(workers, on_event, on_candidate))
         return _write_choice(run, source, portfolio, data, settings, [*of_channels, *of_parts, *still_inputs(data)])
