@@ -257,7 +257,7 @@ def score_table(scores: dict[str, Any]) -> None:
 
 def by_situation_table(scores: dict[str, Any]) -> None:
     """Print where the network's error is by what the axes did, at its furthest horizon, where the scores tell."""
-    from edp.report.run.situations import situation_sheet
+    from edp.report.run.sheets import situation_sheet
 
     horizon = max(scores["task"]["horizons"])
     sheet = situation_sheet(scores, horizon)

@@ -73,7 +73,7 @@ def pretrain(
 
 def _tables(result: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
-    from edp.report.run.foundation import contexts_sheet, parts_sheet
+    from edp.report.run.sheets import contexts_sheet, parts_sheet
 
     for sheet in (parts_sheet(result), contexts_sheet(result)):
         table(sheet.caption, sheet.heads(), sheet.texts())

@@ -100,7 +100,7 @@ def twin(
 def show_trained(trained: TrainedTwin) -> None:
     """Print what a trained twin has learned of ground and network, and how far its free runs are off."""
     from edp.evaluation.beyond import beyond_sentence
-    from edp.report.twin.ground import ground_line
+    from edp.report.twin.facts import ground_line
 
     provenance = trained.bundle.provenance
     if trained.bundle.ground is not None:
