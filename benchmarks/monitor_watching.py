@@ -29,6 +29,7 @@ from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.monitor.residuals.base import ResidualSource, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.session_blocks import SessionBlocks, blocks_of
+from edp.progress import SilentProgress
 from edp.recording import Recording
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.workflows.monitor import fit_to_recordings
@@ -240,7 +241,7 @@ def fitted(plan: Plan, side_by_side: SideBySide = map) -> dict[str, Any]:
         experiment = plan.experiment
         experiment = replace(experiment, dictionary=replace(experiment.dictionary, machine="none"))
         recordings = [read_session(plan.data / "training", name).recording for name in names]
-        result = fit_to_recordings(recordings, experiment, note=noted, side_by_side=side_by_side)
+        result = fit_to_recordings(recordings, experiment, progress=PrintedProgress(), side_by_side=side_by_side)
         save_monitor(result.monitor, plan.monitor)
         make_folder(plan.monitor / "blocks" / "training")
         for part in result.sessions:
@@ -260,9 +261,12 @@ def fitted(plan: Plan, side_by_side: SideBySide = map) -> dict[str, Any]:
     return result_facts
 
 
-def noted(text: str) -> None:
-    """Progress of a fit."""
-    print(f"fit: {text}", flush=True)
+class PrintedProgress(SilentProgress):
+    """Progress of a fit, a line per note."""
+
+    def note(self, sentence: str) -> None:
+        """Print a note."""
+        print(f"fit: {sentence}", flush=True)
 
 
 def add_dictionary(plan: Plan, side_by_side: SideBySide = map) -> bool:
@@ -274,7 +278,7 @@ def add_dictionary(plan: Plan, side_by_side: SideBySide = map) -> bool:
         machine = machine_of(spec, healthy)
         if not machine:
             return False
-        dictionary = build_dictionary(monitor, healthy, machine, spec, 0, None, side_by_side)
+        dictionary = build_dictionary(monitor, healthy, machine, spec, side_by_side=side_by_side)
         save_monitor(replace(monitor, diagnosis=dictionary), plan.named)
     return True
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from common import EXAMPLES, VARIABLE, Bench, Verdict, benchmark, option, shared_folder, table, verdict
-from edp.cli.train import source_of
+from edp.cli.options import source_of
 from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.splits import ByRecording, ByTime

@@ -9,7 +9,7 @@ from safetensors.torch import load, load_file, save
 
 from edp.errors import StorageError
 from edp.training import checkpoint
-from edp.training.checkpoint import FILE, Progress, Weights, load_checkpoint, save_checkpoint
+from edp.training.checkpoint import FILE, TrainingPosition, Weights, load_checkpoint, save_checkpoint
 
 KEY = "0123456789abcdef"
 
@@ -20,7 +20,7 @@ def file(tmp_path):
     optimizer = torch.optim.Adam(layer.parameters())
     layer(torch.ones(1, 3)).sum().backward()
     optimizer.step()
-    progress = Progress(epoch=2, best_score=float("inf"), history=[{"epoch": 1, "loss": float("nan")}])
+    progress = TrainingPosition(epoch=2, best_score=float("inf"), history=[{"epoch": 1, "loss": float("nan")}])
     path = tmp_path / FILE
     groups = [{name: one.detach().clone() for name, one in layer.named_parameters()} for _ in range(3)]
     save_checkpoint(path, KEY, progress, Weights(*groups, torch.ones(2)), optimizer)

@@ -30,14 +30,16 @@ def test_rooms_are_few_and_imports_go_down(house):
     # 23 before the room of the live view: a server that runs on, and knows neither networks nor machines.
     # 24 before `wording`, the one place of figures for readers: messages of every room need it, those of `storage` too.
     # 25 before the room of jobs, which stood within workflows.
-    assert len(house.siblings) <= 26, house.siblings
+    # 26 before `progress`, the protocol that computations of many rooms report to.
+    assert len(house.siblings) <= 27, house.siblings
     # 130 before the rooms of closed loops, which imports eight and is imported by three, and of monitoring, which
     # imports three.
     # 141 before the monitor read networks, twins and recordings (seven more rooms), and settings and testing read it.
     # 150 before the live view, which imports errors, signals, storage and report, and is imported by workflows.
     # 155 before options of the command line took their bounds from settings.
     # 156 before numbers in messages of all rooms came from `edp.wording`, which stands below them.
-    assert house.arrows <= 185
+    # 185 before workflows, and rooms with long computations below them, reported to `edp.progress`.
+    assert house.arrows <= 190
     assert house.circles == []
 
 

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
-from edp.cli.settings import SettingsOption
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
+from edp.cli.options import LogsArgument, MapOption, RepairOption, SettingsOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.wording import figure, percent
 

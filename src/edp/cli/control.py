@@ -9,8 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.consent import ask_for_fmus
-from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import MOST_LOOPS
+from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.storage.paths import full_path
 from edp.wording import figure, number
@@ -73,9 +74,8 @@ def control(
 
         guard = monitor_guard(monitor)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
-    with progress(as_json) as shown:
-        on_loop = counted(shown, Steps(as_json), "control", "loops run")
-        run = control_loops(experiment, folder, ControlSources(plant, twin, predictor, trusted=True), on_loop, guard)
+    with shown_progress("control", as_json, "loops run") as progress:
+        run = control_loops(experiment, folder, ControlSources(plant, twin, predictor, trusted=True), progress, guard)
 
     def show() -> None:
         out.print(run.content["sentence"])
@@ -118,10 +118,9 @@ def tune(
 
     ask_for_fmus(yes, on, plant)
     experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
-    with progress(as_json) as shown:
-        on_trial = counted(shown, Steps(as_json), "tune", "trials run")
+    with shown_progress("tune", as_json, "trials run") as progress:
         tuned_on, judged_on = (ControlSources(where, twin, predictor, trusted=True) for where in (on, plant))
-        tuning = tune_gains(experiment, folder, tuned_on, judged_on, TuningSpec(trials=trials, loops=loops), on_trial)
+        tuning = tune_gains(experiment, folder, tuned_on, judged_on, TuningSpec(trials=trials, loops=loops), progress)
     judged = tuning.content["judged_mm"]
     verdict = tuning_verdict(judged)
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
-from edp.cli.settings import SettingsOption
-from edp.cli.train import DataOption, MapOption, RepairOption, TrainingDisplay, source_if_given
+from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
+from edp.cli.train import TrainingDisplay
 from edp.errors import ConfigError
 from edp.wording import figure
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
-from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.cli.options import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.storage.paths import full_path
 
 app = typer.Typer(

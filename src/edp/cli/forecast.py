@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
+from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
 from edp.errors import count_of
 from edp.wording import figure
 

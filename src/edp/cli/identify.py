@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, progress, table
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
+from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.twin import FitDisplay, score_table
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.wording import figure

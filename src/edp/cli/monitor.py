@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
-from edp.cli.options import check_effects
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
-from edp.cli.workforce import WorkersOption
+from edp.cli.console import JsonFlag, duration, emit, out, table
+from edp.cli.options import LogsArgument, MapOption, RepairOption, WorkersOption, check_effects, source_of
+from edp.cli.progress import shown_progress
 from edp.errors import ConfigError, count_of
 from edp.storage.paths import full_path
 from edp.wording import figure
@@ -89,14 +88,8 @@ def fit(
         raise ConfigError("edp monitor fit: got run folders alone, expected healthy logs; name them after the runs")
     source = source_of(logs, signal_map, repair)
     began = time.monotonic()
-    with progress(as_json) as shown:
-        bar, steps = shown.add_task("monitor", total=None, note="reading recordings"), Steps(as_json)
-
-        def note(text: str) -> None:
-            shown.update(bar, note=text)
-            steps.say(f"monitor: {text}", force=True)
-
-        fitted = fit_monitor(runs, source, experiment, folder, note, workers)
+    with shown_progress("monitor", as_json) as progress:
+        fitted = fit_monitor(runs, source, experiment, folder, progress, workers)
     monitor = fitted.monitor
     facts: dict[str, Any] = {
         "monitor": str(folder),
@@ -161,9 +154,8 @@ def run(
     """
     from edp.workflows.monitor import run_monitor
 
-    with progress(as_json) as shown:
-        on_recording = counted(shown, Steps(as_json), "monitor", "recordings watched")
-        watched = run_monitor(folder, source_of(logs, signal_map, repair), target, on_recording)
+    with shown_progress("monitor", as_json, "recordings watched") as progress:
+        watched = run_monitor(folder, source_of(logs, signal_map, repair), target, progress)
 
     if mdf is not None:
         from edp.workflows.monitor.event_files import write_event_files

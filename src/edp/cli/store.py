@@ -10,8 +10,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, err, listing, out, progress, table
 from edp.cli.inspect import FAULTY
-from edp.cli.train import MapOption, RepairOption, source_of
-from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
+from edp.cli.options import ClusterOption, MapOption, OpenOption, RepairOption, source_of, workforce_of
 from edp.errors import count_of
 from edp.wording import number
 

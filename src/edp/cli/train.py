@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
-from edp.cli.options import MOST_WORKERS, check_effects
-from edp.errors import ConfigError
+from edp.cli.options import MOST_WORKERS, LogsArgument, MapOption, RepairOption, check_effects, source_of
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
@@ -25,25 +23,6 @@ AUTO = "auto"
 """`edp.config.experiment.AUTO`, known here without loading that module."""
 MOST_EXPECTED = 12
 """Outputs of which the terminal says what to expect; the report has all."""
-LogsArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="LOGS...",
-        help="Logs and folders of logs; or one data-set file (.toml), or one store.",
-    ),
-]
-DataOption = Annotated[
-    list[Path],
-    typer.Option(
-        "--data",
-        help="Other recordings: logs and folders of logs, a data-set file, or a store; may be repeated. Default: those "
-        "of the run.",
-    ),
-]
-MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
-RepairOption = Annotated[
-    list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
-]
 
 
 def train(
@@ -181,32 +160,6 @@ def run(
         display = TrainingDisplay(shown, Steps(quiet))
         bundle = run_training(source or DataSource.of(data), experiment, folder, display.on_event)
     return bundle, display.best
-
-
-def shell_words(paths: Iterable[Path]) -> str:
-    """Return paths as arguments of a command that can be typed."""
-    return shlex.join(str(path) for path in paths)
-
-
-def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource | None:
-    """Return a data source from command-line options; None if no path was given."""
-    return source_of(data, signal_map, repair) if data else None
-
-
-def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
-    """A data source from command-line options."""
-    from edp.config.experiment import build
-    from edp.logs.repair import Repair
-    from edp.logs.source import DataSource
-
-    table: dict[str, str] = {}
-    for text in repair:
-        # Only the first sign parts key and value.
-        key, sign, value = text.partition("=")
-        if not sign:
-            raise ConfigError(f"--repair '{text}': write what=how, for example nan=hold")
-        table[key] = value
-    return DataSource.of(data, signal_map, build(Repair, table, "--repair") if table else None)
 
 
 class TrainingDisplay:

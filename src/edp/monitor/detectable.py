@@ -14,6 +14,7 @@ import numpy as np
 from edp.errors import StorageError
 from edp.monitor.fitting import FittedChain
 from edp.monitor.monitor import Monitor
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.signals import KINDS, Channel
 from edp.wording import figure
@@ -159,7 +160,7 @@ class _Effort:
 
 
 def measure_found_sizes(
-    monitor: Monitor, segments: Sequence[Recording], minutes: float, fit_s: float, note: Callable[[str], None]
+    monitor: Monitor, segments: Sequence[Recording], minutes: float, fit_s: float, progress: Progress = SILENT
 ) -> FoundSizes:
     """Inject changes into held-out healthy segments and return the smallest changes that are detected.
 
@@ -172,7 +173,7 @@ def measure_found_sizes(
         segments: healthy recordings that did not set the limits.
         minutes: length of all healthy logs of the fit.
         fit_s: processor time of the fit before.
-        note: called with what begins.
+        progress: receiver of what begins.
     """
     effort = _Effort(max(MIN_EFFORT_S, EFFORT_SHARE * fit_s))
     cut = [one.rows(0, min(one.samples, round(SEGMENT_S * one.rate_hz))) for one in segments[:MAX_SEGMENTS]]
@@ -181,7 +182,7 @@ def measure_found_sizes(
     planned = [(change, channel) for change in INJECTIONS for channel in chosen]
     rows: list[FoundSize] = []
     for number, (change, channel) in enumerate(planned, start=1):
-        note(f"changes that are found: {change} of {channel.name}, {number} of {len(planned)}")
+        progress.note(f"changes that are found: {change} of {channel.name}, {number} of {len(planned)}")
         row = _of_channel(monitor, quiet, channel, change, effort)
         if row is None:
             break

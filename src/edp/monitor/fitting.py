@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +15,7 @@ from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning, check_blocks, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
 from edp.monitor.detectors.separate_cusums import SeparateCusumsSpec
-from edp.monitor.residuals.base import ResidualSource, SideBySide, note_nothing, sisters_of
+from edp.monitor.residuals.base import ResidualSource, SideBySide, sisters_of
 from edp.monitor.session_blocks import (
     BlocksJob,
     SessionBlocks,
@@ -26,6 +26,7 @@ from edp.monitor.session_blocks import (
 )
 from edp.monitor.summaries import BlockSummaries
 from edp.monitor.watches import BankSpec, Watch, WatchSpec, check_rows, fit_watch, scaled_alike
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.bounds import above, below, check_bounds, check_count, integer, span
 from edp.signals import Channel
@@ -118,7 +119,7 @@ def fit_chain(
     channels: Sequence[Channel],
     sessions: Sequence[Recording],
     promised_hours: float,
-    note: Callable[[str], None] = note_nothing,
+    progress: Progress = SILENT,
     side_by_side: SideBySide = map,
 ) -> FittedChain:
     """Fit all behind the residuals.
@@ -129,7 +130,7 @@ def fit_chain(
         channels: raw inputs, in order.
         sessions: healthy ones.
         promised_hours: operating hours to one false alarm.
-        note: called with what begins.
+        progress: receiver of what begins.
         side_by_side: calls a function for each of some jobs, such as in processes.
 
     Raises:
@@ -137,7 +138,7 @@ def fit_chain(
         DataError: too few sessions or blocks.
     """
     _check_sessions(spec, len(sessions))
-    note("summaries of healthy sessions")
+    progress.note("summaries of healthy sessions")
     summaries = fit_summaries(spec.block_s, sources, channels, sessions)
     jobs = [
         BlocksJob(summaries, sisters_of(sources, spec.tolerance, number), channels, session)
@@ -145,7 +146,7 @@ def fit_chain(
     ]
     blocks = list(side_by_side(summarised, jobs))
     settle = _settle_blocks(spec, sessions, summaries.block)
-    return fit_from_blocks(spec, summaries, blocks, sessions[0].rate_hz, settle, promised_hours, note, side_by_side)
+    return fit_from_blocks(spec, summaries, blocks, sessions[0].rate_hz, settle, promised_hours, progress, side_by_side)
 
 
 def check_healthy_sessions(spec: ChainSpec, channels: Sequence[Channel], sessions: Sequence[Recording]) -> None:
@@ -210,11 +211,11 @@ def fit_from_blocks(
     rate_hz: float,
     settle: int,
     promised_hours: float,
-    note: Callable[[str], None] = note_nothing,
+    progress: Progress = SILENT,
     side_by_side: SideBySide = map,
 ) -> FittedChain:
     """`fit_chain` from the blocks of the sessions on."""
-    note("conditioning, views and limit")
+    progress.note("conditioning, views and limit")
     remaining, doubtful = _without_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
     drift = SlowDrift(spec.drift_per_hour / 3600.0 / blocks_per_s, spec.most_drift)

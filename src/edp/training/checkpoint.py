@@ -30,7 +30,7 @@ REFIT = "refit.safetensors"
 
 
 @dataclass
-class Progress:
+class TrainingPosition:
     """Where a training stands after an integer number of epochs."""
 
     epoch: int = 0
@@ -73,7 +73,7 @@ class Weights:
 
 
 def save_checkpoint(
-    path: Path, key: str, progress: Progress, weights: Weights, optimizer: torch.optim.Optimizer
+    path: Path, key: str, progress: TrainingPosition, weights: Weights, optimizer: torch.optim.Optimizer
 ) -> None:
     """Write the checkpoint atomically; an earlier one stays until the new one is whole."""
     tensors = {"running": weights.running.detach().cpu().contiguous()}
@@ -86,7 +86,7 @@ def save_checkpoint(
     write_bytes(path, _signed(save(tensors, metadata={"edp": json.dumps(header), "blake2b": BLANK})))
 
 
-def load_checkpoint(path: Path, key: str) -> tuple[Progress, Weights, dict[str, Any]] | None:
+def load_checkpoint(path: Path, key: str) -> tuple[TrainingPosition, Weights, dict[str, Any]] | None:
     """Progress, weights and optimiser state of the run `key`, or None where there is no checkpoint yet.
 
     Raises:
@@ -111,9 +111,11 @@ def damaged(path: Path, error: Exception) -> StorageError:
     return StorageError(f"checkpoint '{path}' is damaged ({error}); remove it to train from the start")
 
 
-def _taken_apart(header: dict[str, Any], tensors: dict[str, Tensor]) -> tuple[Progress, Weights, dict[str, Any]]:
+def _taken_apart(
+    header: dict[str, Any], tensors: dict[str, Tensor]
+) -> tuple[TrainingPosition, Weights, dict[str, Any]]:
     plain = header["progress"]
-    progress = Progress(**{**plain, "schedule": ScheduleState(**plain["schedule"])})
+    progress = TrainingPosition(**{**plain, "schedule": ScheduleState(**plain["schedule"])})
     groups: dict[str, dict[str, Tensor]] = {"current": {}, "average": {}, "best": {}}
     for name, tensor in tensors.items():
         group, _, rest = name.partition("/")

@@ -20,7 +20,16 @@ from edp.networks.predictor import ModelSpec, build_model, trainable
 from edp.networks.streaming import State, detach_state, reset_where
 from edp.storage.runs import KeyedRun
 from edp.training.bagging.fit import fit_in_folds
-from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, damaged, load_checkpoint, save_checkpoint
+from edp.training.checkpoint import (
+    FILE,
+    REFIT,
+    TrainingPosition,
+    Weights,
+    Within,
+    damaged,
+    load_checkpoint,
+    save_checkpoint,
+)
 from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
@@ -132,7 +141,7 @@ class Loop:
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
         self.average = {name: tensor.detach().clone() for name, tensor in self.net.named_parameters()}
         self.best = {name: tensor.clone() for name, tensor in self.average.items()}
-        self.progress, self.within = Progress(), Within()
+        self.progress, self.within = TrainingPosition(), Within()
         self.windowed = windowed
         self.objective = Objective(spec, self.net.code)
         self.updates = spec.updates or max(1, self.sampler.updates())

@@ -40,7 +40,7 @@ from edp.settings.bounds import (
 )
 from edp.storage.runs import KeyedRun
 from edp.training.blas import one_blas_thread
-from edp.training.checkpoint import FILE, Progress, Weights, damaged, load_checkpoint, save_checkpoint
+from edp.training.checkpoint import FILE, TrainingPosition, Weights, damaged, load_checkpoint, save_checkpoint
 from edp.training.optimizers import OptimizerSpec, Soap
 from edp.wording import setting_text, typed
 
@@ -293,11 +293,11 @@ def _fitted(
 
 def _resumed(
     run: KeyedRun | None, network: CellWeights, optimizer: torch.optim.Optimizer
-) -> tuple[Progress, dict[str, Tensor]]:
+) -> tuple[TrainingPosition, dict[str, Tensor]]:
     """Where the run stands and its best weights; network and optimiser are set to where it stopped."""
     checkpoint = None if run is None else load_checkpoint(run.folder.file(FILE), run.key)
     if run is None or checkpoint is None:
-        return Progress(), copy.deepcopy(network.state_dict())
+        return TrainingPosition(), copy.deepcopy(network.state_dict())
     progress, weights, state = checkpoint
     try:
         network.load_state_dict(weights.current)
@@ -307,7 +307,7 @@ def _resumed(
     return progress, weights.best
 
 
-def _waited_out(progress: Progress, spec: FreeRunSpec, total: int) -> bool:
+def _waited_out(progress: TrainingPosition, spec: FreeRunSpec, total: int) -> bool:
     """Whether the last stage has gone on for too long without an improvement."""
     since = sum(row["update"] > progress.best_epoch for row in progress.history)
     judged = progress.history[-1]["update"] if progress.history else 0

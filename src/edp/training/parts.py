@@ -14,7 +14,7 @@ from torch import Tensor
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError
 from edp.networks.predictor import ModelSpec
-from edp.training.checkpoint import Progress, optimizer_state, pack, unpack
+from edp.training.checkpoint import TrainingPosition, optimizer_state, pack, unpack
 from edp.training.fit import Loop
 from edp.training.outcome import Fitted
 from edp.training.schedules import ScheduleState
@@ -104,7 +104,7 @@ def _state_of_epochs(loop: Loop) -> dict[str, Any]:
 
 def _restore_epochs(loop: Loop, state: dict[str, Any]) -> None:
     progress = state["progress"]
-    loop.progress = Progress(**{**progress, "schedule": ScheduleState(**progress["schedule"])})
+    loop.progress = TrainingPosition(**{**progress, "schedule": ScheduleState(**progress["schedule"])})
     with torch.no_grad():
         for name, parameter in loop.net.named_parameters():
             parameter.copy_(state["current"][name])

@@ -10,6 +10,7 @@ import pytest
 from edp.cli import console
 from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, counted, left_text, progress
 from edp.cli.fleet import MachineDisplay
+from edp.cli.progress import Display, StageDisplay
 from edp.cli.quality import LogDisplay
 from edp.cli.screen import ScreeningDisplay
 from edp.cli.search import SearchDisplay
@@ -83,6 +84,30 @@ def count(shown):
         on_next("x", done, 2)
 
 
+def display(shown, command, counted="", timed=False):
+    return StageDisplay(Display(shown, steps(), command, counted, timed))
+
+
+def loops(shown):
+    stage = display(shown, "control", "loops run").stage("loop", 2)
+    for done in (1, 2, 3):
+        stage.note("x")
+        stage.step(done)
+    stage.note("x")
+
+
+def methods(shown):
+    progress = display(shown, "finetune")
+    progress.note("reads")
+    stage = progress.stage("method", 2)
+    for done in (1, 2, 3):
+        stage.note("x")
+        epochs = stage.stage("epoch", 2)
+        for epoch in (1, 2, 3):
+            epochs.step(epoch, share=epoch / 2, seconds_left=0.2)
+        stage.step(done)
+
+
 USERS = {
     "TrainingDisplay": train,
     "SeriesDisplay": series,
@@ -92,6 +117,8 @@ USERS = {
     "LogDisplay": logs,
     "MachineDisplay": machines,
     "counted": count,
+    "Display": loops,
+    "StageDisplay": methods,
 }
 
 
@@ -123,6 +150,41 @@ def test_the_bar_shows_no_zero_while_it_works():
     working.time_remaining = 0.3
     assert TimeLeft().render(working).plain == "1 s left"
     assert TimeLeft().render(SimpleNamespace(finished=True, finished_time=3.0)).plain == "3 s"
+
+
+def test_units_that_are_counted_have_a_line_where_they_begin(capsys):
+    with progress() as shown:
+        stage = display(shown, "control", "loops run").stage("loop", 2)
+        for number, name in enumerate(("grade 0", "grade 1")):
+            stage.note(name)
+            assert shown.tasks[0].completed == number / 2
+            stage.step(number + 1)
+        assert shown.tasks[0].completed == 1.0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["control: 0/2 loops run, now grade 0", "control: 1/2 loops run, now grade 1, 1 s left"]
+
+
+def test_the_stage_of_a_training_divides_the_unit_at_work(capsys):
+    with progress() as shown:
+        methods = display(shown, "finetune").stage("method", 2)
+        methods.step(1)
+        methods.note("full")
+        methods.stage("epoch", 4).step(2, seconds_left=3.0)
+        assert shown.tasks[0].completed == 0.75
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        "finetune: method 2 of 2, full",
+        "finetune: method 2 of 2, full, epoch 2/4, 3 s left",
+    ]
+
+
+def test_notes_of_a_command_replace_each_other(capsys):
+    with progress() as shown:
+        whole = display(shown, "twin")
+        whole.note("static map")
+        whole.stage("update", 4).step(1)
+        whole.note("free runs")
+        assert shown.tasks[0].completed == 0.25
+    assert capsys.readouterr().err.splitlines() == ["twin: static map", "twin: update 1/4", "twin: free runs"]
 
 
 def test_time_left_and_counts_of_a_plan():
@@ -201,6 +263,6 @@ def test_no_other_display_exists():
             node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and "add_task(" in ast.unparse(node)
         }
     assert importers == {"console.py"}
-    assert owners == set(USERS) - {"counted"}
+    assert owners == set(USERS) - {"counted", "StageDisplay"}
     with progress() as shown:
         assert isinstance(shown, BoundedProgress)

@@ -58,7 +58,7 @@ def test_a_size_that_is_promised_is_found_on_other_sessions_and_a_small_part_of_
 
 def test_segments_with_alarms_of_their_own_measure_nothing(monitor):
     loud = [shifted(session, "stroke", 0.2) for session in rig_sessions(2, 2000, seed=3)]
-    assert measure_found_sizes(monitor, loud, 4.0, 0.0, lambda text: None).sizes == ()
+    assert measure_found_sizes(monitor, loud, 4.0, 0.0).sizes == ()
     assert unseen_line([]) == ""
 
 
@@ -67,7 +67,7 @@ def test_work_is_bounded_by_bisection(monitor, monkeypatch):
     watch = type(monitor).watch
     monkeypatch.setattr(type(monitor), "watch", lambda self, *a: calls.append(1) or watch(self, *a))
     segments = rig_sessions(1, 2000, seed=5)
-    measure_found_sizes(monitor, segments, 4.0, 0.0, lambda text: None)
+    measure_found_sizes(monitor, segments, 4.0, 0.0)
     most = sum(len(one.signs) * int(np.ceil(np.log2(len(one.factors) + 1))) for one in INJECTIONS.values())
     assert len(calls) <= 1 + most * len(monitor.inputs)
 
@@ -78,7 +78,7 @@ def test_the_trials_end_at_a_share_of_the_fit_and_say_so(monitor, monkeypatch):
     # One second for each look at the clock: what is tried depends on the share alone.
     monkeypatch.setattr(module.time, "process_time", lambda: float(next(clock)))
     segments = rig_sessions(1, 2000, seed=5)
-    results = [measure_found_sizes(monitor, segments, 4.0, fit_s, lambda text: None) for fit_s in (0.0, 1e6)]
+    results = [measure_found_sizes(monitor, segments, 4.0, fit_s) for fit_s in (0.0, 1e6)]
     assert [one.allowed_s for one in results] == [module.MIN_EFFORT_S, module.EFFORT_SHARE * 1e6]
     short, whole = results
     assert 0 < len(short.sizes) < short.planned == len(whole.sizes)

@@ -164,7 +164,7 @@ class BalancesSpec(ResidualSpec):
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
-        material.note("balances")
+        material.progress.note("balances")
         matches = [
             (level, rate, gain, max(memory, 2.0 / material.rate_hz))
             for level, rate, gain in matched_pairs(material.channels, material.train, material.rate_hz, self.match)

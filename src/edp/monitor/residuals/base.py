@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.registry import Registry
 from edp.signals import Channel
@@ -22,10 +23,6 @@ MOST_RESIDUALS = 512
 """Of one source: a machine with more channels is watched in parts."""
 SISTERS = 11
 """Seeds of drawn machines are apart from all others."""
-
-
-def note_nothing(text: str) -> None:
-    """Progress that nobody asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +39,7 @@ class FitMaterial:
         groups: names of channels that are judged together; empty where names and kinds are to tell.
         seed: root of every random choice.
         minutes: processor time that fits may take, all together.
-        note: called with what begins.
+        progress: receiver of what begins.
     """
 
     train: Sequence[Recording]
@@ -54,7 +51,7 @@ class FitMaterial:
     groups: tuple[tuple[str, ...], ...] = ()
     seed: int = 0
     minutes: float = 8.0
-    note: Callable[[str], None] = note_nothing
+    progress: Progress = SILENT
 
     @property
     def names(self) -> tuple[str, ...]:

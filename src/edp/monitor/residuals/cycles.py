@@ -122,7 +122,7 @@ class CyclesSpec(ResidualSpec):
         Raises:
             DataError: too few cycles, or one that is too long or no whole number of ticks.
         """
-        material.note("cycles")
+        material.progress.note("cycles")
         constant = constant_channels(material)
         inputs = tuple(name for name in material.names if name not in constant)
         if not inputs:

@@ -308,7 +308,7 @@ class FlowBalancesSpec(ResidualSpec):
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
-        material.note("balances of flow")
+        material.progress.note("balances of flow")
         balances = fit_chambers(material, self.rows, self.trials, self.least)
         if balances is None:
             return None

@@ -147,7 +147,7 @@ class LookAheadSpec(CommitteeOptions, ResidualSpec):
 
     def fit(self, material: FitMaterial) -> ResidualSource | None:
         """See `ResidualSpec.fit`."""
-        material.note("look-ahead errors")
+        material.progress.note("look-ahead errors")
         names = {*material.names}
         usable = [
             bundle

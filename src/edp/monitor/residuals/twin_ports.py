@@ -149,7 +149,7 @@ class TwinPortsSpec(ResidualSpec):
             same_rate = abs(channels.rate_hz - material.rate_hz) <= 1e-3 * material.rate_hz
             if not {*needed} <= {*material.names} or not same_rate:
                 continue
-            material.note("free ports of the twin")
+            material.progress.note("free ports of the twin")
             answers = {channel.name for channel in channels.answers}
             strokes = {channel.name for channel in channels.strokes}
             groups = [

@@ -161,7 +161,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         bundles = {}
         groups = self.groups(material)
         for group in groups:
-            material.note(f"virtual sensors of {group.name}")
+            material.progress.note(f"virtual sensors of {group.name}")
             bundle = self.network(group, material, len(groups))
             if bundle is not None:
                 bundles[group.name] = bundle

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from edp.control.plants import plant_of, twin_of
 from edp.control.tasks import draw_task
 from edp.control.valve_map import RUN_S, ValveMap, check_levers, measure_valve_map
 from edp.errors import ConfigError
+from edp.progress import SILENT, Progress
 from edp.storage.headers import model_digest
 from edp.storage.paths import is_folder_at
 from edp.training.bundle import load_bundle
@@ -103,27 +104,27 @@ class ControlBench:
     def results(
         self,
         spec: ControllerSpec | None = None,
-        on_loop: Callable[[str, int, int], None] | None = None,
+        progress: Progress = SILENT,
         guard: LoopGuard | None = None,
     ) -> list[LoopResult]:
         """Every loop with a controller; that of the experiment by default.
 
         Args:
             spec: of the controller.
-            on_loop: called with the name of the loop that begins, how many are done, and their number.
+            progress: receiver of the progress; its units are loops.
             guard: of every loop; begins anew with each.
 
         Raises:
             ConfigError: plant and controller, or plant and guard, do not fit.
         """
         chosen = spec or self.experiment.controller
-        results = []
+        results, loops = [], progress.stage("loop", len(self.tasks))
         for number, task in enumerate(self.tasks):
-            if on_loop is not None:
-                on_loop(f"{task.name} {task.seed}", number, len(self.tasks))
+            loops.note(f"{task.name} {task.seed}")
             controller = chosen.build(self.plant, task.limits, self.models)
             late = 1e-3 * self.experiment.deadline_ms
             results.append(run_loop(self._env, controller, task, task.seed, self._options, guard, late))
+            loops.step(number + 1)
         return results
 
     def check(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from edp.control.guard import LoopGuard
 from edp.control.loop import LoopResult
 from edp.control.tasks import TASKS, ControlTask
 from edp.logs import write_recording
+from edp.progress import SILENT, Progress
 from edp.report import ControlFacts, write_control_page
 from edp.report.animation.page import scene_of
 from edp.report.common.provenance import provenance_rows
@@ -48,7 +49,7 @@ def control_loops(
     experiment: ControlExperiment,
     out: str | Path,
     sources: ControlSources | None = None,
-    on_loop: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
     guard: LoopGuard | None = None,
 ) -> ControlRun:
     """Run loops and write a run folder: ``results.json``, ``loops/NAME.parquet``, ``control.html``, ``controller``.
@@ -57,7 +58,7 @@ def control_loops(
         experiment: the settings.
         out: run folder; loops of the same settings are run again.
         sources: models and plant.
-        on_loop: called with the name of the loop that begins, how many are done, and their number.
+        progress: receiver of the progress; its units are loops.
         guard: what the controller may rely on, such as a monitor.
 
     Raises:
@@ -74,7 +75,7 @@ def control_loops(
     models = {"sources": chosen.digests(), "guard": None if guard is None else repr(guard)}
     key = run_key(CONTROL_SETTINGS.plain(experiment) | models, "")
     with Run.create(out, "control", key, control_toml(experiment)) as run:
-        results = bench.results(on_loop=on_loop, guard=guard)
+        results = bench.results(progress=progress, guard=guard)
         folder = make_folder(run.file(LOOPS))
         for result in results:
             write_recording(result.recording, folder / f"{result.recording.name}.parquet")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -12,6 +12,7 @@ import numpy as np
 from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
 from edp.control.controllers import CONTROLLERS, ControllerSpec
 from edp.errors import ConfigError
+from edp.progress import SILENT, Progress
 from edp.settings.bounds import check_bounds, integer
 from edp.storage import read_object, write_bytes, write_json
 from edp.storage.paths import is_file_at
@@ -64,7 +65,7 @@ def tune_gains(
     tuned_on: ControlSources,
     judged_on: ControlSources,
     tuning: TuningSpec | None = None,
-    on_trial: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
 ) -> Tuning:
     """Tune a controller and write a run folder: ``tuning.json``, and ``tuned.toml`` for ``edp control --config``.
 
@@ -74,7 +75,7 @@ def tune_gains(
         tuned_on: plant and models of the tuning.
         judged_on: plant and models of the judgement.
         tuning: how.
-        on_trial: called with what begins, how many trials are done, and their number.
+        progress: receiver of the progress; its units are trials.
 
     Raises:
         EdpError: settings, models or folder cannot be used.
@@ -107,10 +108,9 @@ def tune_gains(
         study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
         rows: list[dict[str, Any]] = []
         earlier = _earlier_costs(run)
-        best = experiment.controller
+        best, trials = experiment.controller, progress.stage("trial", chosen.trials)
         for number in range(chosen.trials):
-            if on_trial is not None:
-                on_trial(f"trial {number + 1}", number, chosen.trials)
+            trials.note(f"trial {number + 1}")
             trial = study.ask(1)[0]
             spec = with_gains(experiment.controller, trial.values)
             cost = earlier[number] if number < len(earlier) else bench.cost(spec)
@@ -119,6 +119,7 @@ def tune_gains(
             rows.append({"gains": dict(trial.values), "cost_mm": cost})
             if number >= len(earlier):
                 write_json(run.file(TRIALS), {"costs_mm": [row["cost_mm"] for row in rows]})
+            trials.step(number + 1)
         before, after = judge.costs(experiment.controller), judge.costs(best)
         content = {
             "schema": 1,

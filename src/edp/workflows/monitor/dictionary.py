@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from edp.monitor.fitting import watched_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.residuals.base import SideBySide
 from edp.monitor.session_blocks import block_ticks
+from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
 from edp.signals import Channel
 from edp.sim.machine.machine_files import load_machine, machine_names
@@ -46,7 +47,6 @@ FURTHER = (
     *(f"SpoolPos_{spool}" for spool in range(1, 7)),
 )
 """Channels that a machine may have sensors for, beyond Table A.1."""
-Note = Callable[[str, int, int], None]
 
 
 def machine_of(spec: DictionarySpec, recordings: Sequence[Recording]) -> str:
@@ -119,7 +119,7 @@ def build_dictionary(
     machine: str,
     spec: DictionarySpec,
     seed: int = 0,
-    note: Note | None = None,
+    progress: Progress = SILENT,
     side_by_side: SideBySide | None = None,
 ) -> Dictionary:
     """Simulate every fault at every site and size on a machine and learn what the monitor sees of it.
@@ -132,9 +132,9 @@ def build_dictionary(
         machine: name or file.
         spec: how.
         seed: root of every random choice.
-        note: called with what is done, how much of it is, and how much there is.
+        progress: receiver of the progress; its units are draws, divided into sessions.
         side_by_side: calls a function for each of some jobs, such as in processes; then all draws are made, whatever
-            the time, and nothing is noted of single sessions.
+            the time, and single sessions are not reported.
 
     Raises:
         ConfigError: a machine that lacks the monitor's channels.
@@ -152,7 +152,7 @@ def build_dictionary(
     jobs = [_DrawJob(monitor, classes, plan, draw) for draw in range(spec.draws)]
     faults: list[SimulatedFault] = []
     draws = 0
-    for part in side_by_side(_drawn, jobs) if side_by_side is not None else _in_time(jobs, spec, began, note):
+    for part in side_by_side(_drawn, jobs) if side_by_side is not None else _in_time(jobs, spec, began, progress):
         faults += part
         draws += 1
     provenance: dict[str, Any] = {
@@ -185,23 +185,26 @@ class _DrawJob:
         return f"draw {self.number + 1} of the dictionary"
 
 
-def _drawn(job: _DrawJob, note: Note | None = None) -> list[SimulatedFault]:
-    return _draw(job.monitor, job.classes, job.plan, job.number, note)
+def _drawn(job: _DrawJob, progress: Progress = SILENT) -> list[SimulatedFault]:
+    return _draw(job.monitor, job.classes, job.plan, job.number, progress)
 
 
 def _in_time(
-    jobs: Sequence[_DrawJob], spec: DictionarySpec, began: float, note: Note | None
+    jobs: Sequence[_DrawJob], spec: DictionarySpec, began: float, progress: Progress
 ) -> Iterator[list[SimulatedFault]]:
     """One draw after the other, two at least, until the next would pass the time."""
+    draws = progress.stage("draw", len(jobs))
     for draw, job in enumerate(jobs):
         spent = time.process_time() - began
         if draw >= 2 and spent * (draw + 1) / draw > 60.0 * spec.minutes:
             return
-        yield _drawn(job, note)
+        draws.note(f"faults on {job.plan.machine}")
+        yield _drawn(job, draws)
+        draws.step(draw + 1)
 
 
 def _draw(
-    monitor: Monitor, classes: Sequence[FaultClass], plan: _Plan, draw: int, note: Note | None
+    monitor: Monitor, classes: Sequence[FaultClass], plan: _Plan, draw: int, progress: Progress
 ) -> list[SimulatedFault]:
     """All sessions of one draw, each less its sound twin."""
     before = plan.seconds[0]
@@ -209,7 +212,7 @@ def _draw(
     total, mirrored = len(cases_of(classes)), mirrors(classes)
     sound: dict[int, tuple[Array, dict[str, Array]]] = {}
     faults: list[SimulatedFault] = []
-    done = 0
+    done, sessions = 0, progress.stage("session", total)
     for session in simulated(classes, plan.machine, plan.seconds, (plan.seed, draw), monitor.rate_hz):
         noisy = with_noise(session.recording, plan.added, [plan.seed, draw, session.base])
         seen = _after(monitor, noisy, before), _shown(session, further, before)
@@ -223,8 +226,7 @@ def _draw(
         done += 1
         if session.fault in mirrored:
             faults.append(SimulatedFault(draw, mirrored[session.fault], -session.size, _mirrored(change), shown))
-        if note is not None:
-            note(f"faults on {plan.machine}, draw {draw + 1}", done, total)
+        sessions.step(done)
     return _standardised(faults, sound)
 
 

@@ -21,11 +21,12 @@ from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_se
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
-from edp.monitor.residuals.base import FitMaterial, ResidualSource, ResidualSpec, SideBySide, note_nothing
+from edp.monitor.residuals.base import FitMaterial, ResidualSource, ResidualSpec, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.residuals.groups import Group, sensed_channels
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.monitor.session_blocks import SessionBlocks, session_means
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.sandbox.helpers import Helpers
 from edp.signals import Channel
@@ -42,8 +43,6 @@ from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary,
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
-NOTED_SESSIONS = 25
-"""Simulated sessions of the dictionary between two notes."""
 CUT_S = 480.0
 """Where there are too few sessions, longer ones are cut into pieces of this length."""
 ROOM = 0.8
@@ -83,7 +82,7 @@ def fit_monitor(
     source: DataSource,
     experiment: MonitorExperiment,
     out: str | Path,
-    note: Callable[[str], None] = note_nothing,
+    progress: Progress = SILENT,
     workers: int = 1,
 ) -> FittedMonitor:
     """Fit a monitor to healthy logs and write its folder.
@@ -93,7 +92,7 @@ def fit_monitor(
         source: healthy logs.
         experiment: settings.
         out: folder of the monitor; that of a finished fit with the same settings and logs is read.
-        note: called with what begins.
+        progress: receiver of what begins.
         workers: processes side by side, 0 for one a core; the monitor does not depend on it, unless the dictionary has
             not the time for all of its draws: several processes make them all.
 
@@ -117,7 +116,7 @@ def fit_monitor(
                 return helpers.ordered(partial(_in_one_thread, function), jobs)
 
             fitted = fit_to_recordings(
-                recordings, experiment, bundles, note, side_by_side=map if helpers.workers == 1 else side_by_side
+                recordings, experiment, bundles, progress, side_by_side=map if helpers.workers == 1 else side_by_side
             )
         provenance = new_provenance(origin) | {"seed": experiment.seed, "seconds": round(fitted.seconds, 2)}
         write_json(opened.file(PROVENANCE), provenance)
@@ -168,7 +167,7 @@ def fit_to_recordings(
     recordings: Sequence[Recording],
     experiment: MonitorExperiment,
     bundles: Sequence[Bundle | TwinBundle] = (),
-    note: Callable[[str], None] = note_nothing,
+    progress: Progress = SILENT,
     again: bool = False,
     side_by_side: SideBySide = map,
 ) -> FittedMonitor:
@@ -178,7 +177,7 @@ def fit_to_recordings(
         recordings: healthy logs.
         experiment: settings.
         bundles: networks and twins of this machine.
-        note: called with what begins.
+        progress: receiver of what begins.
         again: doubtful sessions were left out of the training before.
         side_by_side: calls a function for each of some jobs, such as in processes.
 
@@ -199,28 +198,30 @@ def fit_to_recordings(
         groups=experiment.groups,
         seed=experiment.seed,
         minutes=experiment.minutes,
-        note=note,
+        progress=progress,
     )
     sources = _sources(experiment, material, side_by_side)
-    fitted = fit_chain(experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, note, side_by_side)
+    fitted = fit_chain(
+        experiment.chain, sources, channels, rest, experiment.hours_per_false_alarm, progress, side_by_side
+    )
     if not again:
-        note("sessions that trained, compared with the others")
+        progress.note("sessions that trained, compared with the others")
         trained = doubtful_sessions(fitted, experiment.chain, sources, channels, (*train, *validation), side_by_side)
         if trained:
-            note(f"once more without {', '.join(trained)}")
+            progress.note(f"once more without {', '.join(trained)}")
             left = [session for session in sessions if session.name not in trained]
-            better = fit_to_recordings(left, experiment, bundles, note, True, side_by_side)
+            better = fit_to_recordings(left, experiment, bundles, progress, True, side_by_side)
             seconds = time.process_time() - began
             return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
     monitor = _assembled(material, sources, fitted, sessions, rest)
     # Validation sessions set no limit.
     minutes, fit_s = 60.0 * float(monitor.provenance["hours"]), time.process_time() - began
-    trials = measure_found_sizes(monitor, validation, minutes, fit_s, note)
+    trials = measure_found_sizes(monitor, validation, minutes, fit_s, progress)
     measured = {"found_sizes": [asdict(size) for size in trials.sizes], "found_effort": trials.effort()}
     measured["healthy_range"] = healthy_range(fitted)
     healthy = [session for session in rest if session.name not in fitted.doubtful]
     provenance = dict(monitor.provenance) | measured | {"seconds": time.process_time() - began}
-    monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, note, side_by_side)
+    monitor = _with_dictionary(replace(monitor, provenance=provenance), healthy, experiment, progress, side_by_side)
     alone = _fits_one_machine(experiment, sources)
     return FittedMonitor(monitor, fitted.doubtful, time.process_time() - began, None, fitted.sessions, alone)
 
@@ -254,7 +255,7 @@ def _with_dictionary(
     monitor: Monitor,
     healthy: Sequence[Recording],
     experiment: MonitorExperiment,
-    note: Callable[[str], None],
+    progress: Progress,
     side_by_side: SideBySide,
 ) -> Monitor:
     """The monitor with a dictionary of faults, where there is a machine to simulate them on."""
@@ -262,14 +263,10 @@ def _with_dictionary(
     if not machine:
         return monitor
 
-    def noted(what: str, done: int, total: int) -> None:
-        if done % NOTED_SESSIONS == 0 or done == total:
-            note(f"{what}: {done} of {total} sessions")
-
     if side_by_side is not map:
-        note(f"faults on {machine}")
+        progress.note(f"faults on {machine}")
     dictionary = build_dictionary(
-        monitor, healthy, machine, experiment.dictionary, experiment.seed, noted,
+        monitor, healthy, machine, experiment.dictionary, experiment.seed, progress,
         None if side_by_side is map else side_by_side,
     )  # fmt: skip
     return replace(monitor, diagnosis=dictionary)
@@ -347,7 +344,7 @@ class _Fit:
 
 def _fit_source(job: _Fit) -> ResidualSource | Bundle | None:
     if isinstance(job.spec, VirtualSensorsSpec) and job.group is not None:
-        job.material.note(job.label)
+        job.material.progress.note(job.label)
         return job.spec.network(job.group, job.material, job.groups)
     return job.spec.fit(job.material)
 
@@ -364,7 +361,7 @@ def _sources(
     # Other processes cannot call what shows progress here.
     elsewhere = side_by_side is not map
     if elsewhere:
-        note, material = material.note, replace(material, note=note_nothing)
+        progress, material = material.progress, replace(material, progress=SILENT)
     for spec in experiment.residuals:
         groups = spec.groups(material) if isinstance(spec, VirtualSensorsSpec) else (None,)
         jobs += [_Fit(spec, material, group, len(groups)) for group in groups]
@@ -372,7 +369,7 @@ def _sources(
     networks: dict[ResidualSpec, dict[str, Bundle]] = {}
     for job, result in zip(jobs, side_by_side(_fit_source, jobs), strict=True):
         if elsewhere:
-            note(f"{job.label}, done")
+            progress.note(f"{job.label}, done")
         if job.group is None:
             fits[job.spec] = result
         elif result is not None and isinstance(job.spec, VirtualSensorsSpec):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from edp.monitor.detectable import found_sizes, outside_line, unseen_line
 from edp.monitor.monitor import Monitor, Watched
 from edp.monitor.monitor_file import load_monitor
 from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.monitor.facts import start_time
 from edp.storage import write_bytes, write_json
@@ -93,7 +94,7 @@ def run_monitor(
     folder: str | Path,
     source: DataSource,
     out: str | Path | None = None,
-    on_recording: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
 ) -> MonitorRun:
     """Watch logs.
 
@@ -101,7 +102,7 @@ def run_monitor(
         folder: of the monitor.
         source: the logs.
         out: run folder for the alarm log as JSON lines and as CSV, and for what `edp monitor report` shows.
-        on_recording: called with the name of the recording that begins, how many are done, and how many there are.
+        progress: receiver of the progress; its units are recordings.
 
     Raises:
         EdpError: monitor or logs that cannot be used, or a file that cannot be written.
@@ -117,9 +118,9 @@ def run_monitor(
         check_claimable(out, "monitor run")
     groups = groups_of(monitor)
     recordings = source.read()
-    for done, recording in enumerate(recordings):
-        if on_recording is not None:
-            on_recording(recording.name, done, len(recordings))
+    watching = progress.stage("recording", len(recordings))
+    for number, recording in enumerate(recordings):
+        watching.note(recording.name)
         lacking = monitor.check(recording)
         if lacking:
             silent[recording.name] = lacking
@@ -137,6 +138,7 @@ def run_monitor(
         alarms += watched.alarms
         traces.append(trace_of(monitor, recording, watched, groups, start))
         hours += recording.duration_s / 3600.0
+        watching.step(number + 1)
     detectors = tuple(f"{name} {n + 1}" for n, name in enumerate(_detectors(monitor)))
     names = tuple(recording.name for recording in recordings)
     run = MonitorRun(

@@ -91,13 +91,9 @@ def settings_text(proposal: MapProposal, channels: Sequence[str], targets: Seque
     )
 
 
-def listed_path(path: Path) -> str:
-    """A path for a data-set file, which puts environment variables in."""
-    return str(full_path(path))
-
-
 def named_paths(paths: Sequence[Path]) -> list[tuple[Path, str]]:
-    """Paths that a data-set file can list, each with a name of its own."""
+    """Return the paths that a data-set file can list, each with a name of its own."""
+    # A data-set file expands environment variables in paths.
     usable = [path for path in paths if "$" not in str(full_path(path)) and str(path).isprintable()]
     return list(zip(usable, unique_names([path.stem for path in usable], usable)))
 

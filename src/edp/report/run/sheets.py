@@ -1,4 +1,4 @@
-"""Where the error of a run is by what the axes did: one table for the page and the command line."""
+"""Tables of a run for its page and the command line: error by situation, and machines of a foundation run."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.evaluation.guard import NETWORK
-from edp.report.common.sheets import Column, Sheet, figures
-from edp.wording import percent
+from edp.report.common.sheets import Column, Sheet, Value, figures, plainly
+from edp.wording import figure, percent
 
 WORDS = {
     "rest": "at rest, now and then",
@@ -71,3 +71,43 @@ def _ratio(ours: list[float | None], theirs: list[float | None]) -> float | None
     """Geometric mean of the ratios of both, over the targets of which both have an error."""
     logs = [math.log(a / b) for a, b in zip(ours, theirs) if a and b]
     return math.exp(sum(logs) / len(logs)) if logs else None
+
+
+def parts_sheet(foundation: Mapping[str, Any]) -> Sheet:
+    """Machines, recordings and minutes of each part."""
+    heads = ("machines", "recordings", "minutes")
+    rows = tuple((part, *(facts[key] for key in heads)) for part, facts in foundation["data"].items())
+    columns = (Column("Part"), *(Column(head.capitalize(), show=_short) for head in heads))
+    return Sheet("parts", f"{foundation['label']} over many machines", columns, rows)
+
+
+def contexts_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Sheet:
+    """Error by the time since the state was reset, always on the same ticks."""
+    unseen = foundation["unseen"]
+    rows: list[tuple[Value, ...]] = []
+    for row in unseen["contexts"]:
+        spread = row["change_error"]
+        half_width = None if spread is None else 196 * spread
+        rows.append((row["seconds"], row["mae"], 100 * row["change"], half_width))
+    columns = (
+        Column("Since reset", "s", _short),
+        Column("MAE", unit, figures([row[1] for row in rows], decimals=3)),
+        Column("Change", "%", figures([row[2] for row in rows], signed=True, decimals=1)),
+        Column("95 %", "+- %", figures([row[3] for row in rows], decimals=1)),
+    )
+    caption = (
+        f"Machines that were never seen ({len(unseen['machines'])}), k = {foundation['horizon']}: error by the time "
+        f"since the state was reset, {unseen['ticks']} ticks"
+    )
+    return Sheet("contexts", caption, columns, tuple(rows))
+
+
+def _short(value: Value) -> str:
+    return figure(value) if isinstance(value, int | float) else plainly(value)
+
+
+def machines_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Sheet:
+    """Each machine that tests, the hardest first."""
+    each = sorted(foundation["unseen"]["machines"].items(), key=lambda entry: -entry[1])
+    columns = (Column("Machine"), Column("MAE", unit, figures([mae for _, mae in each])))
+    return Sheet("machines", "Machines that were never seen, the hardest first", columns, tuple(each))

@@ -1,4 +1,4 @@
-"""Command-line messages about reading logs: slow logs and missing sandbox layers."""
+"""Notes of every command: slow logs, missing sandbox layers, and files without a hash."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from edp.cli.console import err
 from edp.sandbox import layers, sandbox
 from edp.storage.memory import readable
+from edp.storage.seals import files_without_seal
 from edp.wording import number
 
 # Each line takes twice as long: a slow log is told often at first, and never floods a terminal.
@@ -41,3 +42,14 @@ def tell_of_slow_logs() -> None:
 def tell_of_missing_layers() -> None:
     """Say on standard error, once in each command, that logs are read with less protection than elsewhere."""
     layers.announce_by(lambda text: err.print(f"warning: {text}"))
+
+
+def tell_of_unsealed_files() -> None:
+    """Print one note that lists the files without a hash that this command has read."""
+    files = files_without_seal()
+    if files:
+        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        err.print(
+            f"note: {files[0]}{more}: written by an earlier version of EDP, without a hash, so nothing shows whether "
+            "it was changed since; the command that wrote it adds the hash when it is given again"
+        )

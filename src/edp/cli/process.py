@@ -1,18 +1,31 @@
-"""How commands end that somebody or the system stops: by a signal, or for want of memory."""
+"""The process of a command: threads of linear algebra, a stop by a signal, and lack of memory."""
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from types import FrameType
 
+from threadpoolctl import threadpool_limits
+
 from edp.storage.memory import free_bytes
 from edp.wording import figure
 
+VARIABLE = "OPENBLAS_NUM_THREADS"
 _stopped_by: list[int] = []
 """Signals that asked this process to end."""
 SHOWN_REASON = 200
 """Of what the library said, in a message."""
+
+
+def use_one_blas_thread() -> None:
+    """Use one thread in this process and its children, unless the environment names a number (see `training.blas`)."""
+    if VARIABLE in os.environ:
+        return
+    # Children and libraries that are not loaded yet read the variable; NumPy has read it already.
+    os.environ[VARIABLE] = "1"
+    threadpool_limits(limits=1, user_api="blas")
 
 
 def stop_on_request() -> None:

@@ -1,4 +1,4 @@
-"""From a folder of unknown logs to a signal map and settings with which the other commands run."""
+"""Propose a signal map and settings for unknown logs, and write them."""
 
 from __future__ import annotations
 
@@ -24,24 +24,21 @@ from edp.logs.source import DataSource
 from edp.signals import Kind
 from edp.storage import make_folder, write_bytes
 from edp.storage.folders import check_kind
-from edp.storage.paths import is_file_at, is_link_at, is_there, status_of
-from edp.workflows.proposal_files import (
+from edp.storage.paths import full_path, is_file_at, is_link_at, is_there, status_of
+from edp.workflows.proposal.choices import choose_split, choose_targets, propose_plant
+from edp.workflows.proposal.files import (
     DATA,
     MAP,
     MOST_FEATURES,
     SETTINGS,
     check_files,
     data_set_text,
-    listed_path,
     map_table,
     named_paths,
     remarks_of,
     settings_text,
     toml_text,
 )
-from edp.workflows.proposal_plant import propose_plant
-from edp.workflows.proposal_split import choose_split
-from edp.workflows.proposal_targets import choose_targets
 
 _PAIR = re.compile(r"(.+?)[_ .]?(est|val|train|test|id|training|validation|identification)", re.IGNORECASE)
 _TRAINS = ("est", "train", "id", "training", "identification")
@@ -154,7 +151,11 @@ def propose(
     if pairs:
         return _of_pairs(source, group, others, broken, proposal, pairs)
     proposal, timing = _timed(group, proposal)
-    notes = [*_notes(group, others, broken, proposal), *timing.notes, *_of_copies(copies)]
+    notes = [*_notes(group, others, broken, proposal), *timing.notes]
+    if copies:
+        shown = ", ".join(f"{copy.name[:40]} (as {first.name[:40]})" for copy, first in copies[:3])
+        rest = f" and {len(copies) - 3} more" if len(copies) > 3 else ""
+        notes.append(f"left out, since they repeat another log byte for byte: {shown}{rest}")
     targets, more = choose_targets(proposal)
     chosen = {guess.column for guess in proposal.columns if guess.channel in targets}
     notes += [
@@ -200,11 +201,11 @@ def _recordings(
 ) -> list[tuple[Path, dict[str, Any]]]:
     """The logs of a group as entries of a data set; an experiment has a map that names its variable."""
     if experiments is None:
-        return [(path, {"path": listed_path(path), "name": name}) for path, name in named_paths(group.paths)]
+        return [(path, {"path": str(full_path(path)), "name": name}) for path, name in named_paths(group.paths)]
     columns = map_table(proposal.signal_map)
     named = zip(group.paths, experiments.entries, experiments.names())
     return [
-        (pseudo_path, {"path": listed_path(path), "name": name, "map": {"variable": variable} | columns})
+        (pseudo_path, {"path": str(full_path(path)), "name": name, "map": {"variable": variable} | columns})
         for pseudo_path, (path, variable), name in named
     ]
 
@@ -220,8 +221,9 @@ def _of_experiments(experiments: Experiments, tests: Sequence[str]) -> list[str]
 
 
 def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, Path]]]:
-    """Logs without files that hold the same bytes as an earlier one, and these with that one: a test on a copy of
-    what trained says nothing.
+    """Return the logs without copies, and each copy with the log that it repeats byte for byte.
+
+    A test on a copy of what trained says nothing.
     """
     sizes = Counter(status_of(path).st_size for path in paths if is_file_at(path))
     seen: dict[bytes, Path] = {}
@@ -238,12 +240,6 @@ def _without_copies(paths: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
             seen[digest] = path
             single.append(path)
     return single, copies
-
-
-def _of_copies(copies: Sequence[tuple[Path, Path]]) -> list[str]:
-    shown = ", ".join(f"{copy.name[:40]} (as {first.name[:40]})" for copy, first in copies[:3])
-    more = f" and {len(copies) - 3} more" if len(copies) > 3 else ""
-    return [f"left out, since they repeat another log byte for byte: {shown}{more}"] if copies else []
 
 
 def _timed(group: LogGroup, proposal: MapProposal) -> tuple[MapProposal, Timing]:
@@ -346,7 +342,7 @@ def _of_pairs(
                 if entry.column == guess.column
             )
             table = map_table(replace(proposal.signal_map, channels=entries))
-            recordings.append({"path": listed_path(path), "name": f"{name}_{ending}", "map": table})
+            recordings.append({"path": str(full_path(path)), "name": f"{name}_{ending}", "map": table})
     renamed_columns = tuple(replace(guess, channel=stem) for stem, guess in pairs[train].items())
     renamed_proposal = replace(proposal, columns=renamed_columns)
     targets, notes = choose_targets(renamed_proposal)

@@ -1,0 +1,132 @@
+"""Presenter of `edp.progress.Progress`: a bar in a terminal, lines in a pipe or file, nothing with ``--json``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from edp.cli.console import Steps, count_text, duration, left_text, progress
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bars
+
+
+class Display:
+    """Progress of a command on standard error.
+
+    Args:
+        bars: bars of the terminal.
+        steps: lines for output that is not a terminal.
+        command: first word of each line.
+        counted: participle for units that are complete, such as ``loops run``; empty for the name of the unit alone.
+        timed: state the time since the beginning in each note.
+    """
+
+    def __init__(self, bars: Bars, steps: Steps, command: str, counted: str = "", timed: bool = False) -> None:
+        self.bars, self.steps, self.command, self.counted, self.timed = bars, steps, command, counted, timed
+        self.began = time.monotonic()
+        self.bar = bars.add_task(command, total=1.0 if counted else None, note="reading recordings" if counted else "")
+
+    def show(self, text: str, share: float | None, left: str = "", line: bool = True, force: bool = False) -> None:
+        """Update the bar and print a line.
+
+        Args:
+            text: what is shown.
+            share: completed fraction of the command; None leaves the bar where it is.
+            left: time left, for the line; the bar estimates its own.
+            line: print a line.
+            force: print the line even if the last one is recent.
+        """
+        if share is None:
+            self.bars.update(self.bar, note=text)
+        else:
+            self.bars.update(self.bar, total=1.0, completed=share, note=text)
+        if line:
+            self.steps.say(f"{self.command}: {text}{left}", force=force)
+
+
+class StageDisplay:
+    """Progress of one stage.
+
+    Args:
+        display: display of the command.
+        name: unit that the stage counts.
+        total: number of units planned.
+        outer: stage that this one is a part of.
+    """
+
+    def __init__(
+        self, display: Display, name: str = "", total: int | None = None, outer: StageDisplay | None = None
+    ) -> None:
+        self.display, self.name, self.total, self.outer = display, name, total, outer
+        self.began, self.done, self.text = time.monotonic(), 0, ""
+        self.share: float | None = None if total is None else 0.0
+
+    def stage(self, name: str, total: int | None = None) -> StageDisplay:
+        """Begin a stage within this one."""
+        if self.total is None:
+            self.text = ""
+        return StageDisplay(self.display, name, total, self)
+
+    def step(self, done: int, **values: float) -> None:
+        """Show how many units are complete."""
+        named, self.text, self.done = bool(self.text), "", done
+        self.share = values.get("share", done / max(1, self.total or 1))
+        left = left_text(values["seconds_left"]) if "seconds_left" in values else self._estimated()
+        # Units with names have a line where they begin.
+        self.display.show(self._path(), self._share(), left, line=not named)
+
+    def note(self, sentence: str) -> None:
+        """Show what begins."""
+        self.text = sentence
+        counts = self.total is not None
+        spent = f", {duration(time.monotonic() - self.display.began)} so far" if self.display.timed else ""
+        left = self._estimated() if counts else spent
+        force = not (counts and self.display.counted)
+        self.display.show(self._path(), self._share() if counts else None, left, force=force)
+
+    def _estimated(self) -> str:
+        """Return the time left, if the units so far tell it."""
+        if not self.display.counted or not self.done or self.total is None:
+            return ""
+        return left_text((time.monotonic() - self.began) / self.done * (self.total - self.done))
+
+    def _share(self, inner: float = 0.0) -> float | None:
+        """Return the completed fraction of the command; `inner` is that of the unit at work."""
+        share = self.share
+        if share is not None and self.total is not None:
+            share += inner / max(1, self.total)
+        if self.outer is None or self.outer.total is None:
+            return share
+        return self.outer._share(share or 0.0)
+
+    def _path(self) -> str:
+        """Return the texts of this stage and those around it."""
+        texts = [self.outer._path()] if self.outer is not None else []
+        return ", ".join(text for text in (*texts, self._phrase()) if text)
+
+    def _phrase(self) -> str:
+        if self.total is None:
+            return self.text
+        if self.display.counted:
+            now = f", now {self.text}" if self.text else ""
+            return f"{count_text(self.done, self.total, '/')} {self.display.counted}{now}"
+        if self.text:
+            return f"{self.name} {count_text(self.done + 1, self.total)}, {self.text}"
+        return f"{self.name} {count_text(self.done, self.total, '/')}"
+
+
+@contextmanager
+def shown_progress(command: str, quiet: bool, counted: str = "", timed: bool = False) -> Iterator[StageDisplay]:
+    """Show the progress of a command; see `Display`.
+
+    Args:
+        command: first word of each line.
+        quiet: show nothing.
+        counted: participle for units that are complete.
+        timed: state the time since the beginning in each note.
+    """
+    with progress(quiet) as bars:
+        yield StageDisplay(Display(bars, Steps(quiet), command, counted, timed))
