@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from common import Verdict, finish, in_folder, kept, parser, table, verdict
+from common import PrintedProgress, Verdict, finish, in_folder, kept, parser, table, verdict
 from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.series import Series
@@ -193,7 +193,7 @@ def default_twin(logs: Logs, given: Any) -> tuple[Twin, float]:
     changes += ["judge.calibration_starts=2", *(f"twin.candidates={list(some)}" for some in [given.candidates] if some)]
     experiment = replace(load_twin_experiment(None, changes), split=logs.experiment.split)
     out = logs.work / f"run_default{'_quick' if logs.quick else ''}"
-    trained = train_twin(logs.source, experiment, out, on_step=print, workers=given.workers)
+    trained = train_twin(logs.source, experiment, out, progress=PrintedProgress(), workers=given.workers)
     print("chosen:", trained.bundle.provenance.get("chosen"), flush=True)
     return trained.bundle.twin, float(trained.bundle.provenance["seconds"])
 

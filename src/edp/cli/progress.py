@@ -8,9 +8,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from edp.cli.console import Steps, count_text, duration, left_text, progress
+from edp.wording import figure
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
+
+WORDS = {"length_s": "runs of {} s", "free_run_error": "free-run error {} deviations"}
+"""Text of each value that a step may have, for its figure."""
 
 
 class Display:
@@ -62,6 +66,7 @@ class StageDisplay:
     ) -> None:
         self.display, self.name, self.total, self.outer = display, name, total, outer
         self.began, self.done, self.text = time.monotonic(), 0, ""
+        self.values: dict[str, float] = {}
         self.share: float | None = None if total is None else 0.0
 
     def stage(self, name: str, total: int | None = None) -> StageDisplay:
@@ -72,7 +77,7 @@ class StageDisplay:
 
     def step(self, done: int, **values: float) -> None:
         """Show how many units are complete."""
-        named, self.text, self.done = bool(self.text), "", done
+        named, self.text, self.done, self.values = bool(self.text), "", done, values
         self.share = values.get("share", done / max(1, self.total or 1))
         left = left_text(values["seconds_left"]) if "seconds_left" in values else self._estimated()
         # Units with names have a line where they begin.
@@ -115,7 +120,8 @@ class StageDisplay:
             return f"{count_text(self.done, self.total, '/')} {self.display.counted}{now}"
         if self.text:
             return f"{self.name} {count_text(self.done + 1, self.total)}, {self.text}"
-        return f"{self.name} {count_text(self.done, self.total, '/')}"
+        values = [WORDS[name].format(figure(value, 3)) for name, value in self.values.items() if name in WORDS]
+        return ", ".join([f"{self.name} {count_text(self.done, self.total, '/')}", *values])
 
 
 @contextmanager

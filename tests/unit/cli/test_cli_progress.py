@@ -8,16 +8,16 @@ from types import SimpleNamespace
 import pytest
 
 from edp.cli import console
-from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, counted, left_text, progress
+from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, left_text, progress
 from edp.cli.fleet import MachineDisplay
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.quality import LogDisplay
 from edp.cli.screen import ScreeningDisplay
 from edp.cli.search import SearchDisplay
 from edp.cli.train import SeriesDisplay, TrainingDisplay
-from edp.cli.twin import FitDisplay
 from edp.training import TrainingProgress
 from edp.training.free_run import FreeRunProgress
+from edp.training.progress_steps import free_run_steps
 
 COMMANDS = Path(console.__file__).parent
 
@@ -46,10 +46,9 @@ def series(shown):
 
 
 def fit(shown):
-    display = FitDisplay(shown, quiet=False)
-    display.steps = steps()
+    report = free_run_steps(display(shown, "twin"))
     for update in (1, 64, 88):
-        display.on_event(FreeRunProgress(update, 64, 1.0, 0.2 if update == 1 else 0.0, None, False))
+        report(FreeRunProgress(update, 64, 1.0, 0.2 if update == 1 else 0.0, None, False))
 
 
 def screening(shown):
@@ -76,12 +75,6 @@ def machines(shown):
     display = MachineDisplay(shown, steps(), "fleet")
     for done in (0, 2, 3):
         display.on_machine("x", done, 2)
-
-
-def count(shown):
-    on_next = counted(shown, steps(), "replay", "done")
-    for done in (0, 1, 2, 3):
-        on_next("x", done, 2)
 
 
 def display(shown, command, counted="", timed=False):
@@ -111,12 +104,11 @@ def methods(shown):
 USERS = {
     "TrainingDisplay": train,
     "SeriesDisplay": series,
-    "FitDisplay": fit,
+    "free_run_steps": fit,
     "ScreeningDisplay": screening,
     "SearchDisplay": search,
     "LogDisplay": logs,
     "MachineDisplay": machines,
-    "counted": count,
     "Display": loops,
     "StageDisplay": methods,
 }
@@ -181,10 +173,14 @@ def test_notes_of_a_command_replace_each_other(capsys):
     with progress() as shown:
         whole = display(shown, "twin")
         whole.note("static map")
-        whole.stage("update", 4).step(1)
+        whole.stage("update", 4).step(1, length_s=2.0, free_run_error=0.25)
         whole.note("free runs")
         assert shown.tasks[0].completed == 0.25
-    assert capsys.readouterr().err.splitlines() == ["twin: static map", "twin: update 1/4", "twin: free runs"]
+    assert capsys.readouterr().err.splitlines() == [
+        "twin: static map",
+        "twin: update 1/4, runs of 2 s, free-run error 0.25 deviations",
+        "twin: free runs",
+    ]
 
 
 def test_time_left_and_counts_of_a_plan():
@@ -263,6 +259,6 @@ def test_no_other_display_exists():
             node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and "add_task(" in ast.unparse(node)
         }
     assert importers == {"console.py"}
-    assert owners == set(USERS) - {"counted", "StageDisplay"}
+    assert owners == set(USERS) - {"StageDisplay", "free_run_steps"}
     with progress() as shown:
         assert isinstance(shown, BoundedProgress)

@@ -13,6 +13,7 @@ from edp.errors import ConfigError
 from edp.jobs import Workforce, cluster
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
+from edp.progress import SilentProgress
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
@@ -63,6 +64,17 @@ class Plug:
             time.sleep(0.5)  # until the loss is noticed
         self.nodes.join(3)
         ray.shutdown()
+
+
+class PullingProgress(SilentProgress):
+    """Progress whose first note pulls a plug."""
+
+    def __init__(self, plug):
+        self.plug = plug
+
+    def note(self, sentence):
+        """Pull the plug."""
+        self.plug.pull()
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +128,7 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     assert _digest(tmp_path / "run") == _digest(one / "run")
     plug.mend()
 
-    scored = evaluate_with(there, tmp_path / "run", on_step=plug.pull)
+    scored = evaluate_with(there, tmp_path / "run", progress=PullingProgress(plug))
     evaluate(one / "run")
     assert _scores(scored) == _scores(one / "run")
     plug.mend()

@@ -1,0 +1,24 @@
+"""Conversion of events of a training to steps of `edp.progress.Progress`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from edp.progress import Progress
+from edp.training.free_run import FreeRunProgress
+
+
+def free_run_steps(progress: Progress) -> Callable[[FreeRunProgress], None]:
+    """Return a listener of trainings on free runs that reports each event as a step.
+
+    Args:
+        progress: stage that the trainings belong to.
+    """
+
+    def report(event: FreeRunProgress) -> None:
+        # A fit that goes on beyond its plan has no time left to state.
+        left = 0.0 if event.update >= event.updates else event.seconds_left
+        error = {} if event.validation is None else {"free_run_error": event.validation}
+        progress.stage("update", event.updates).step(event.update, seconds_left=left, length_s=event.length_s, **error)
+
+    return report
