@@ -124,7 +124,7 @@ def cell(work: Path, lengths: Lengths, base: str, seed: int) -> dict[str, float]
 def case_of(source: SourceModel, data: Prepared, logs: Path, folder: Path, seed: int) -> TransferCase:
     """A transfer to some logs, with the usual rates."""
     experiment = target_experiment(source, (f"training.seed={seed}",))
-    return TransferCase(source, DataSource.of(logs), data, experiment, FinetuneSpec(), folder, lambda name, event: None)
+    return TransferCase(source, DataSource.of(logs), data, experiment, FinetuneSpec(), folder)
 
 
 def error(made: Made, data: Prepared) -> float:

@@ -156,7 +156,7 @@ class World:
         experiment = target_experiment(self.source, (f"training.seed={seed}", *shorter))
         folder = self.work / "runs" / f"{method}_{minutes}_{seed}"
         data = shortened(self.data, minutes, seed) if minutes else self.data
-        case = TransferCase(self.source, self.logs, data, experiment, self.size.spec, folder, lambda name, event: None)
+        case = TransferCase(self.source, self.logs, data, experiment, self.size.spec, folder)
         return METHODS[method]().make(case)
 
     def scores(self, made: Made, both: bool) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.progress import shown_progress
 from edp.cli.settings import SettingsOption
-from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
+from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
@@ -69,7 +70,7 @@ def finetune(
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.report import read_transfer, write_transfer_page
     from edp.report.transfer.facts import transfer_verdict
-    from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec
+    from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec
     from edp.workflows.transfer import finetune as make
 
     spec, others = command_settings("finetune", FinetuneSpec, config, changes, TRAINING_TABLES)
@@ -87,15 +88,13 @@ def finetune(
         raise ConfigError("give LOGS of one machine, or --fleet with a store of many, to which --delta-kb belongs")
     order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
     source = source_of(logs, signal_map, repair)
-    with progress(as_json) as shown:
-        display = SeriesDisplay(shown, as_json, "finetune", "method")
-        callbacks = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
+    with shown_progress("finetune", as_json) as progress:
         if workforce.alone:
-            result = make(bundle, source, order, folder, callbacks)
+            result = make(bundle, source, order, folder, progress)
         else:
             from edp.workflows.fleet.training import finetune_with
 
-            result = finetune_with(workforce, bundle, source, order, folder, callbacks)
+            result = finetune_with(workforce, bundle, source, order, folder, progress)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from edp.progress import Progress
 from edp.training.free_run import FreeRunProgress
+from edp.training.outcome import TrainingProgress
 
 
 def free_run_steps(progress: Progress) -> Callable[[FreeRunProgress], None]:
@@ -20,5 +21,23 @@ def free_run_steps(progress: Progress) -> Callable[[FreeRunProgress], None]:
         left = 0.0 if event.update >= event.updates else event.seconds_left
         error = {} if event.validation is None else {"free_run_error": event.validation}
         progress.stage("update", event.updates).step(event.update, seconds_left=left, length_s=event.length_s, **error)
+
+    return report
+
+
+def training_steps(progress: Progress) -> Callable[[TrainingProgress], None]:
+    """Return a listener of a training that reports each event as a step, with the best validation error so far.
+
+    Args:
+        progress: stage that the training belongs to.
+    """
+    best: dict[str, float] = {}
+
+    def report(event: TrainingProgress) -> None:
+        if event.row is not None and event.row["best"]:
+            best["validation_mae"] = event.row["validation_mae"]
+        epochs = progress.stage("refit, epoch" if event.refit else "epoch", event.epochs)
+        speed, left = event.targets_per_s, event.seconds_left
+        epochs.step(event.epoch, share=event.share, seconds_left=left, targets_per_s=speed, **best)
 
     return report

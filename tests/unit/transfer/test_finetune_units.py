@@ -15,7 +15,7 @@ from edp.workflows import train_evaluate
 from edp.workflows.fleet.judging import UNITS, evaluate_with
 from edp.workflows.fleet.training import finetune_with
 from edp.workflows.train_evaluate import evaluate, trained_run
-from edp.workflows.transfer import FinetuneCallbacks, FinetuneRequest, finetune
+from edp.workflows.transfer import FinetuneRequest, finetune
 
 
 def without_times(value):
@@ -27,11 +27,11 @@ def without_times(value):
 
 def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small, tmp_path):
     order = FinetuneRequest(spec=small, method="full", baselines=("low_rank", "ridge_arx"))
-    notes = []
-    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", FinetuneCallbacks(on_note=notes.append))
+    noted = NotedProgress()
+    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", noted)
     here = finetune(run, target, order, tmp_path / "here")
     assert json.dumps(without_times(there)) == json.dumps(without_times(here))
-    assert [note for note in notes if note.startswith("trained:")] == [
+    assert [note for note in noted.notes if note.startswith("trained:")] == [
         "trained: full, 1 of 2",
         "trained: low_rank, 2 of 2",
     ]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from edp.config.experiment import Experiment
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError
-from edp.training import TrainingProgress
+from edp.progress import SILENT, Progress
 from edp.workflows.auto.candidates import CANDIDATES, Amount, RecurrentTrial
 from edp.workflows.auto.promise import blocks_of, choose
 from edp.workflows.auto.settings import AutoSettings
-from edp.workflows.auto.train_candidates import CandidateTraining, OnCandidate, TrainedCandidate, train_all
+from edp.workflows.auto.train_candidates import CandidateTraining, TrainedCandidate, train_all
 
 LINEAR, COMMITTEE, RECURRENT = "linear", "committee", "recurrent"
 TRIAL_FOLDER = "trial"
@@ -29,25 +29,16 @@ class Trainer:
 
     Attributes:
         workers: processes that train side by side; 0 for one a core.
-        on_event: called with progress of the training at work.
-        on_candidate: called with a candidate's label, how many are done and of how many.
+        progress: receiver of the progress; its units are models.
     """
 
     workers: int = 1
-    on_event: Callable[[TrainingProgress], None] | None = None
-    on_candidate: OnCandidate | None = None
+    progress: Progress = SILENT
 
     def train(self, jobs: Sequence[CandidateTraining], done: int = 0, total: int = 0) -> Outcomes:
         """By name; `done` others of `total` came before."""
-        tell = self.on_candidate
-
-        def shifted(label: str, number: int, _: int) -> None:
-            if tell is not None:
-                tell(label, done + number, total or len(jobs))
-
-        return {
-            job.name: one for job, one in zip(jobs, train_all(jobs, self.workers, self.on_event, shifted), strict=True)
-        }
+        trained = train_all(jobs, self.workers, self.progress, done, total)
+        return {job.name: one for job, one in zip(jobs, trained, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)

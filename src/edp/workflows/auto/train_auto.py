@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,13 @@ from edp.data.scaling import least_spread
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError
 from edp.logs.source import DataSource
+from edp.progress import SILENT, Progress
 from edp.recording import FloatArray, Recording
 from edp.report.run.choice import FILE, FLOOR, read_choice
 from edp.signals import Kind
 from edp.storage import write_json
 from edp.storage.runs import FINISHED, Run, check_claimable, run_key, state_of
-from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
+from edp.training import Bundle, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.workflows.auto.candidates import LEAST_SPAN, Amount
 from edp.workflows.auto.channels import MOST_LISTED, fit_to_channels
@@ -62,8 +63,7 @@ def train_auto(
     source: DataSource,
     settings: AutoSettings,
     out: str | Path,
-    on_event: Callable[[TrainingProgress], None] | None = None,
-    on_candidate: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
     workers: int = 1,
 ) -> AutoResult:
     """Train every candidate that suits the data, choose, and write the winner's run folder.
@@ -72,8 +72,7 @@ def train_auto(
         source: where the recordings are.
         settings: task, split, budget, judge.
         out: run folder; a finished one of the same settings and data is read, not made again.
-        on_event: called with progress of the training at work.
-        on_candidate: called with a candidate's label, how many are done and of how many.
+        progress: receiver of the progress; its units are models.
         workers: processes that train candidates side by side; 0 for one a core. The run has the same bits with any
             number.
 
@@ -97,7 +96,7 @@ def train_auto(
     _check_moving(data)
     check_size(data)
     with Run.create(out, "auto", key, tomli_w.dumps(plain_tree(settings))) as run:
-        portfolio = train_portfolio(settings, data, amount, run.path, Trainer(workers, on_event, on_candidate))
+        portfolio = train_portfolio(settings, data, amount, run.path, Trainer(workers, progress))
         return _write_choice(run, source, portfolio, data, settings, [*of_channels, *of_parts, *_still_inputs(data)])
 
 

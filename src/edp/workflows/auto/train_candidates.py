@@ -10,6 +10,7 @@ from pathlib import Path
 from edp.config.experiment import Experiment, experiment_toml, plain_tree
 from edp.data.prepared import Prepared
 from edp.errors import EdpError, LostError
+from edp.progress import SILENT, Progress
 from edp.sandbox.helpers import Helpers
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.paths import is_file_at
@@ -18,6 +19,7 @@ from edp.training import Diverged, Fitted, TrainingProgress
 from edp.training.bagging.fit import fit_bagged
 from edp.training.blas import one_blas_thread
 from edp.training.fit import fit
+from edp.training.progress_steps import training_steps
 from edp.workflows.auto.candidates import CANDIDATES
 from edp.workflows.auto.foundation import Foundation
 from edp.workflows.auto.promise import Block, Promise, promise_of, promise_of_validation, standard_truth
@@ -25,7 +27,6 @@ from edp.workflows.auto.promise import Block, Promise, promise_of, promise_of_va
 NOTE = "progress.json"
 """How far a training in another process is, in its folder."""
 OnEvent = Callable[[TrainingProgress], None]
-OnCandidate = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +113,16 @@ def _by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCan
 
 
 def train_all(
-    jobs: Sequence[CandidateTraining], workers: int, on_event: OnEvent | None, on_candidate: OnCandidate | None
+    jobs: Sequence[CandidateTraining], workers: int, progress: Progress = SILENT, done: int = 0, total: int = 0
 ) -> Iterator[TrainedCandidate | str]:
     """What each training gives, in order; the same bits with any number of processes.
 
     Args:
         jobs: the trainings, the shortest first.
         workers: processes; 0 for one a core.
-        on_event: called with progress.
-        on_candidate: called with the label of the training at work, how many are done and of how many.
+        progress: receiver of the progress; its units are models.
+        done: number of models trained before these.
+        total: number of models with those before and after these; 0 for these alone.
 
     Raises:
         EdpError: see `train_candidate`, or a process died.
@@ -128,12 +130,13 @@ def train_all(
     count = min(workers or os.cpu_count() or 1, len(jobs))
     # Trainings on folds alone take seconds where a process takes as long to start.
     if count <= 1 or all(job.on_folds for job in jobs):
-        for number, job in enumerate(jobs):
-            if on_candidate is not None:
-                on_candidate(job.label, number, len(jobs))
-            yield train_candidate(job, on_event)
+        models = progress.stage("model", total or len(jobs))
+        for number, job in enumerate(jobs, start=done):
+            models.step(number)
+            models.note(job.label)
+            yield train_candidate(job, training_steps(models))
         return
-    display = _Display(jobs, on_event, on_candidate)
+    display = _Display(jobs, progress)
     with Helpers(count, _died) as helpers:
         # The longest first, or it would wait for the others and end alone.
         trained = list(helpers.ordered(_noting, jobs[::-1], display.look))
@@ -165,11 +168,8 @@ def _died(label: str) -> LostError:
 class _Display:
     """Shows of trainings side by side the one that has the longest to go."""
 
-    def __init__(
-        self, jobs: Sequence[CandidateTraining], on_event: OnEvent | None, on_candidate: OnCandidate | None
-    ) -> None:
-        self.jobs, self.on_event, self.on_candidate = jobs, on_event, on_candidate
-        self.shown = ""
+    def __init__(self, jobs: Sequence[CandidateTraining], progress: Progress) -> None:
+        self.jobs, self.progress = jobs, progress
         self.last: TrainingProgress | None = None
 
     def look(self) -> None:
@@ -178,11 +178,8 @@ class _Display:
         if not noted:
             return
         job, event = max(noted, key=lambda pair: pair[1].seconds_left)
-        if job.name != self.shown and self.on_candidate is not None:
-            self.on_candidate(job.label, self.jobs.index(job), len(self.jobs))
-        self.shown = job.name
-        if event != self.last and self.on_event is not None:
-            self.on_event(event)
+        if event != self.last:
+            training_steps(self.progress.stage(job.label))(event)
         self.last = event
 
 

@@ -217,7 +217,7 @@ def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithSt
         experiment = target_experiment(base, request.changes)
         data, _ = target_data(base, logs, experiment, request)
         with tempfile.TemporaryDirectory(prefix="edp-machine-") as folder:
-            case = TransferCase(base, logs, data, experiment, request.spec, Path(folder), lambda name, event: None)
+            case = TransferCase(base, logs, data, experiment, request.spec, Path(folder))
             network = METHODS[request.method]().make(case).network
     except EdpError as error:
         # A machine without usable logs must not end the fleet's run; other machines go on.
