@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from edp import __version__
-from edp.errors import BusyError, StorageError
+from edp.errors import BusyError, ConfigError, DataError, StorageError
 from edp.storage.folders import check_kind
 from edp.storage.locks import check_held, held_by, hold
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
@@ -74,6 +74,7 @@ class Run:
 
         The state is ``running`` inside the block and ``finished`` after it. A block that raises leaves ``running``,
         which readers show as stopped as soon as no process holds the folder; `write_status` in the block replaces it.
+        A new run is removed if its block raises ConfigError or DataError before it writes a file.
         The state of a run that ended before does not become ``running``.
 
         Args:
@@ -88,12 +89,19 @@ class Run:
             StorageError: the folder holds another run, or something else.
         """
         with nullcontext(path) if isinstance(path, Run) else cls(path, kind) as run:
-            run.claim(key, settings)
+            continues = run.claim(key, settings)
             status = run.status().get("status")
             run.is_finished = status == FINISHED
             if status not in ENDED:
                 run.write_status("running")
-            yield run
+            try:
+                yield run
+            except (ConfigError, DataError):
+                # A corrected command has another key: a refused command must leave the folder free.
+                if not continues and {entry.name for entry in entries_of(run.path)} <= {IDENTITY, STATUS, *LEFT}:
+                    for name in (IDENTITY, STATUS):
+                        run.file(name).unlink()
+                raise
             if run is not path:
                 run.finish()
 

@@ -276,18 +276,18 @@ def train_portfolio(
         ConfigError: no candidate suits the data.
         EdpError: see `train_all`.
     """
-    experiments = candidate_experiments(settings, amount)
+    experiments = _experiments(settings, amount)
     if amount.foundation is not None or not {LINEAR, COMMITTEE, RECURRENT} <= experiments.keys():
         return TrainedPortfolio(trainer.train(_jobs(experiments, data, amount, folder)), amount)
     amount = replace(amount, trial=RecurrentTrial.RUNNING)
-    experiments = candidate_experiments(settings, amount)
+    experiments = _experiments(settings, amount)
     linear, trial = _jobs({name: experiments[name] for name in (LINEAR, RECURRENT)}, data, amount, folder)
     trial = replace(trial, folder=folder / "candidates" / TRIAL_FOLDER, trial=True)
     first = trainer.train([linear, trial], total=len(experiments))
     ratio = _over_linear(first)
     passed = ratio is not None and ratio <= MARGIN
     amount = replace(amount, trial=RecurrentTrial.PASSED if passed else RecurrentTrial.FAILED)
-    experiments = candidate_experiments(settings, amount)
+    experiments = _experiments(settings, amount)
     rest = {name: one for name, one in experiments.items() if name != LINEAR and (passed or name != RECURRENT)}
     second = trainer.train(_jobs(rest, data, amount, folder), done=len(first), total=len(first) + len(rest))
     outcomes = first | second
@@ -309,7 +309,7 @@ def _over_linear(outcomes: Mapping[str, TrainedCandidate | str]) -> float | None
     return math.exp(excess[RECURRENT] - excess[LINEAR])
 
 
-def candidate_experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment]:
+def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment]:
     """Return the settings of the candidates that suit the data, the simplest first.
 
     Raises:
