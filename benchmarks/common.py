@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from edp.progress import SilentProgress
 from edp.storage import make_folder, read_json, write_json
 from edp.storage.provenance import command_line, environment
 
@@ -70,6 +71,18 @@ class Verdict:
     met: bool
     unit: str
     quick: bool
+
+
+class PrintedProgress(SilentProgress):
+    """Progress with a line per note and per step."""
+
+    def note(self, sentence: str) -> None:
+        """Print a note."""
+        print(sentence, flush=True)
+
+    def step(self, done: int, **values: float) -> None:
+        """Print a step."""
+        print(done, *(f"{name} {value:.4f}" for name, value in values.items()), flush=True)
 
 
 def verdict(name: str, ours: float, rival: float, goal: str, unit: str, quick: bool) -> Verdict:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from common import DATA, WORK, Bench, benchmark, kept, option, table
+from common import DATA, WORK, Bench, PrintedProgress, benchmark, kept, option, table
 from edp.config.twin import load_twin_experiment
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
@@ -92,7 +92,7 @@ def one_machine(given: Any, name: str) -> dict[str, Any]:
             folder / f"{name}_found.toml",
             str(folder / f"{name}_measured.toml"),
             load_twin_experiment(None, ["twin.kind=greybox", *changes]),
-            on_event=lambda e: print(f"round {e.update}/{e.updates}, validation {e.validation:.4f}", flush=True),
+            progress=PrintedProgress(),
         )
         return compared(truth, measured(truth), result) | {"seconds": time.process_time() - began}
 

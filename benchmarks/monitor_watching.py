@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common import finite
+from common import PrintedProgress, finite
 from edp.config.monitor import MonitorExperiment, load_monitor_experiment
 from edp.errors import DataError
 from edp.monitor.alarms import MonitorAlarm
@@ -29,7 +29,6 @@ from edp.monitor.monitor_file import load_monitor, save_monitor
 from edp.monitor.residuals.base import ResidualSource, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.session_blocks import SessionBlocks, blocks_of
-from edp.progress import SilentProgress
 from edp.recording import Recording
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.workflows.monitor import fit_to_recordings
@@ -259,14 +258,6 @@ def fitted(plan: Plan, side_by_side: SideBySide = map) -> dict[str, Any]:
         )
     result_facts: dict[str, Any] = read_json(facts)
     return result_facts
-
-
-class PrintedProgress(SilentProgress):
-    """Progress of a fit, a line per note."""
-
-    def note(self, sentence: str) -> None:
-        """Print a note."""
-        print(f"fit: {sentence}", flush=True)
 
 
 def add_dictionary(plan: Plan, side_by_side: SideBySide = map) -> bool:

@@ -248,7 +248,7 @@ class Judged:
         data: Any = StretchFold(parts[:1], parts[1:])
         scales = fit_scales(self.channels, parts[:1])
         with tempfile.TemporaryDirectory() as folder, Run(folder) as run:
-            fit = TwinFit(self.channels, scales, data, experiment, None, lambda text: None)
+            fit = TwinFit(self.channels, scales, data, experiment)
             result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
         facts = {"chosen": next(one.label for one in tried if one.chosen), "candidates": [one.row() for one in tried]}
         return result, facts, experiment

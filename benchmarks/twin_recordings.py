@@ -98,7 +98,7 @@ def measure(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) 
     scales, seed = fit_scales(channels, data.train), experiment.training.seed
     judge = replace(experiment.judge, seconds=30.0, starts=8, at_s=(1.0, 5.0, 10.0, 30.0))
     with tempfile.TemporaryDirectory() as folder, Run(folder) as run:
-        fit = TwinFit(channels, scales, data, experiment, None, lambda text: None)
+        fit = TwinFit(channels, scales, data, experiment)
         result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
     twins = {"twin": result.fitted.twin}
     # The twin's validation part chose; what needs no choice has it to learn from.

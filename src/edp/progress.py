@@ -16,7 +16,7 @@ class Progress(Protocol):
         """Begin a part of the computation and return its progress.
 
         Args:
-            name: unit that the stage counts, in singular, such as ``trial``.
+            name: unit that the stage counts, in singular, such as ``trial``; without a total what it does.
             total: number of units planned; None if they are not counted.
         """
         ...

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from noted_progress import NotedProgress
 
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError
@@ -179,10 +180,11 @@ def test_candidates_side_by_side_give_the_same_bits(tmp_path, monkeypatch):
     monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
     source = write(tmp_path / "logs", ticks=1500)
     settings = load_auto(None, [*SET, "auto.candidates=['linear', 'recurrent']"])
-    shown, runs = [], []
+    told, runs = [], []
     for workers in (1, 2):
         folder = tmp_path / f"run{workers}"
-        train_auto(source, settings, folder, None, lambda *event: shown.append(event), workers)
+        told.append(NotedProgress())
+        train_auto(source, settings, folder, told[-1], workers)
         runs.append(folder)
         left = sorted(path.name for path in (folder / "candidates").iterdir())
         assert left == ["recurrent"]  # whose checkpoint a stopped run goes on from
@@ -192,7 +194,8 @@ def test_candidates_side_by_side_give_the_same_bits(tmp_path, monkeypatch):
         for candidate in each["candidates"].values():
             del candidate["seconds"]
     assert facts[0] == facts[1]
-    assert [event[1:] for event in shown[:2]] == [(0, 2), (1, 2)]
+    assert [stage for stage in told[0].stages if stage[0] == "model"] == [("model", 2)]
+    assert len(told[0].notes) == 2
     states = [load_bundle(folder).predictor.state_dict() for folder in runs]
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
 
@@ -334,14 +337,15 @@ def test_a_recurrent_network_is_trained_to_the_end_where_its_trial_comes_near_th
 ):
     monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
     monkeypatch.setattr("edp.workflows.auto.train_candidates.MARGIN", margin)
-    shown = []
+    told = NotedProgress()
     source = write(tmp_path / "logs", ticks=1500)
-    facts = train_auto(source, load_auto(None, SET), tmp_path / "run", None, lambda *event: shown.append(event)).facts
+    facts = train_auto(source, load_auto(None, SET), tmp_path / "run", told).facts
     assert sorted(path.name for path in (tmp_path / "run" / "candidates").iterdir()) == trained
     assert list(facts["candidates"]) == ["linear", "committee", "recurrent"]
     assert any("short trial" in note for note in facts["notes"]) == (len(trained) == 1)
     count = 2 + len(trained)
-    assert [event[1:] for event in shown] == [(0, 3), (1, 3), *((number, count) for number in range(2, count))]
+    assert [stage for stage in told.stages if stage[0] == "model"] == [("model", 3), ("model", count)]
+    assert len(told.notes) == count
 
 
 def test_trees_of_many_outputs_keep_most_of_the_rows():

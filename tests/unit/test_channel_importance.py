@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.data.features import FeatureSet
 from edp.data.prepared import Prepared
@@ -50,11 +51,11 @@ def predictor(data, tiny_model, tiny_training):
 
 @pytest.fixture(scope="module")
 def importances(predictor, data):
-    seen = []
-    found = measure_channel_importance(
-        predictor, data, SPEC, lambda name, done, total: seen.append((name, done, total))
-    )
-    assert seen == [(", ".join(row.members), n, 6) for n, row in enumerate(found.rows[::2])]
+    seen = NotedProgress()
+    found = measure_channel_importance(predictor, data, SPEC, seen)
+    assert seen.stages == [("channel", 6)]
+    assert seen.notes == [", ".join(row.members) for row in found.rows[::2]]
+    assert seen.steps == [1, 2, 3, 4, 5, 6]
     return found
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from browser import browser as browser
 from browser import check_page
+from noted_progress import NotedProgress
 from typer.testing import CliRunner
 
 from edp.cli import app
@@ -27,7 +28,6 @@ from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler
 from edp.workflows.compression import (
-    CompressionCallbacks,
     CompressionSearchRequest,
     CompressionSearchSpec,
     resource_usage,
@@ -112,13 +112,17 @@ def test_a_stopped_search_goes_on_to_the_same_result(run, tight, done, tmp_path)
     class Pulled(Exception):
         pass
 
-    def pull(name, number, count, event):
-        if number == 1 and event.row is not None:
+    trained = []
+
+    def pull(done, **values):
+        if not values:
+            trained.append(done)
+        elif trained and "validation_mae" in values:
             raise Pulled
 
     spec = asked(budget=tight, formats=("float32", "w8a16"))
     with pytest.raises(Pulled):
-        search(run, spec, tmp_path / "out", callbacks=CompressionCallbacks(on_training=pull))
+        search(run, spec, tmp_path / "out", progress=NotedProgress(pull))
     found = search(run, spec, tmp_path / "out")
     assert [row.error for row in found.rows] == [row.error for row in done[1].rows]
 

@@ -5,6 +5,7 @@ import json
 
 import pytest
 import torch
+from noted_progress import NotedProgress
 from typer.testing import CliRunner
 
 from edp.cli import app
@@ -45,8 +46,8 @@ class Pulled(Exception):
     pass
 
 
-def pull(event):
-    if event.row is not None:
+def pull(done, **values):
+    if "validation_mae" in values:
         raise Pulled
 
 
@@ -58,7 +59,7 @@ def test_a_student_is_a_run_that_goes_on_after_a_stop(run, tmp_path):
     spec = DistilRequest(spec=DistilSpec(units=4))
     whole = distil(run, spec, tmp_path / "whole")
     with pytest.raises(Pulled):
-        distil(run, spec, tmp_path / "stopped", on_event=pull)
+        distil(run, spec, tmp_path / "stopped", progress=NotedProgress(pull))
     assert same(distil(run, spec, tmp_path / "stopped"), whole)
     assert whole.predictor.spec.backbone.units == 4
     assert whole.predictor.spec.backbone.channels == (4,)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from noted_progress import NotedProgress
 
 from edp.cli import app
 from edp.cli.console import run_app
@@ -112,8 +113,9 @@ def test_the_same_settings_and_data_give_the_same_bits(logs, tmp_path):
 def test_evaluation_writes_scores_here_and_into_the_bundle(logs, tmp_path):
     train(source_of(logs), experiment(), tmp_path / "run")
     assert load_bundle(tmp_path / "run").scores == {}
-    steps = []
-    assert evaluate(tmp_path / "run", on_step=steps.append) == tmp_path / "run"
+    told = NotedProgress()
+    steps = told.notes
+    assert evaluate(tmp_path / "run", progress=told) == tmp_path / "run"
     scores = json.loads((tmp_path / "run" / "scores.json").read_text())
     assert steps == ["network", "persistence"]
     assert set(scores["models"]) == {"network", "persistence"}
@@ -208,28 +210,30 @@ def test_intervals_are_judged_and_shown(output, logs, tmp_path, capsys):
 
 def test_the_same_judgement_is_not_made_twice(logs, tmp_path):
     train(source_of(logs), experiment(), tmp_path / "run")
-    steps = []
-    evaluate(tmp_path / "run", on_step=steps.append)
+    told = NotedProgress()
+    steps = told.notes
+    evaluate(tmp_path / "run", progress=told)
     scores = (tmp_path / "run" / "scores.json").read_bytes()
     train(source_of(logs), experiment(), tmp_path / "run")
-    evaluate(tmp_path / "run", on_step=steps.append)
+    evaluate(tmp_path / "run", progress=told)
     assert steps == ["network", "persistence"]
     assert (tmp_path / "run" / "scores.json").read_bytes() == scores
     assert load_bundle(tmp_path / "run").scores == json.loads(scores)["models"]["network"]["overall"]
-    evaluate(tmp_path / "run", baselines=["ridge_arx"], on_step=steps.append)
+    evaluate(tmp_path / "run", baselines=["ridge_arx"], progress=told)
     assert steps[2:] == ["network", "ridge_arx"]
 
 
 def test_cheap_baselines_come_first_and_a_budget_leaves_out_the_others(logs, tmp_path):
     train(source_of(logs), experiment(), tmp_path / "run")
-    steps = []
+    told = NotedProgress()
+    steps = told.notes
     names = ["small_mlp", "ridge_arx", "persistence"]
-    evaluate(tmp_path / "run", baselines=names, on_step=steps.append, minutes=0.0)
+    evaluate(tmp_path / "run", baselines=names, progress=told, minutes=0.0)
     scores = json.loads((tmp_path / "run" / "scores.json").read_text())
     assert "small_mlp" in scores["left_out"]
     assert "small_mlp" not in scores["models"]
     steps.clear()
-    evaluate(tmp_path / "run", baselines=names, on_step=steps.append)
+    evaluate(tmp_path / "run", baselines=names, progress=told)
     assert steps == ["network", "persistence", "ridge_arx", "small_mlp"]
     assert "left_out" not in json.loads((tmp_path / "run" / "scores.json").read_text())
 

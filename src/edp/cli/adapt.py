@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, SettingsOption, source_of
+from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.wording import figure, percent
 
@@ -79,9 +80,8 @@ def replay(
     from edp.evaluation.guard import adaptation_verdict
     from edp.workflows.adaptation import replay_run
 
-    with progress(as_json) as shown:
-        on_recording = counted(shown, Steps(as_json), "replay", "done")
-        facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, on_recording, twin)
+    with shown_progress("replay", as_json, "done") as progress:
+        facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, progress, twin)
 
     verdict = adaptation_verdict(facts)
 

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
-from edp.cli.train import SeriesDisplay
+from edp.cli.progress import shown_progress
 
 if TYPE_CHECKING:
-    from edp.training import TrainingProgress
     from edp.workflows.compression import Judged
 
 
@@ -46,7 +45,6 @@ def compress(
     from edp.evaluation.controller import load_budget
     from edp.report import read_compression, write_compression_page
     from edp.workflows.compression import (
-        CompressionCallbacks,
         CompressionSearchRequest,
         CompressionSearchSpec,
         search,
@@ -56,15 +54,8 @@ def compress(
     spec, others = command_settings("compress", CompressionSearchSpec, config, [*changes, *own], TRAINING_TABLES)
     request = CompressionSearchRequest(spec=spec, again=again, changes=others)
     source = source_if_given(data, signal_map, repair)
-    with progress(as_json) as shown:
-        display = SeriesDisplay(shown, as_json, "compress", "network")
-
-        def on_training(name: str, done: int, count: int, event: TrainingProgress) -> None:
-            # At least one: the number of networks is known only after planning.
-            display.done, display.count = done, max(1, count)
-            display.on_training(name, event)
-
-        compression = search(bundle, request, folder, source, CompressionCallbacks(display.on_note, on_training))
+    with shown_progress("compress", as_json) as progress:
+        compression = search(bundle, request, folder, source, progress)
     page = write_compression_page(folder)
     facts = read_compression(folder)
 

@@ -316,27 +316,6 @@ def waiting(text: str, quiet: bool = False, every_s: float = 15.0) -> Iterator[N
         teller.join()
 
 
-def counted(shown: Progress, steps: Steps, command: str, verb: str) -> Callable[[str, int, int], None]:
-    """What shows, when called with the name of the one that begins, how many are done and how many there are, a count.
-
-    Args:
-        shown: progress display.
-        steps: for output that is not a terminal.
-        command: name of the command.
-        verb: what was done with those that are done.
-    """
-    began = time.monotonic()
-    bar = shown.add_task(command, total=1.0, note="reading recordings")
-
-    def on_next(name: str, done: int, count: int) -> None:
-        left = left_text((time.monotonic() - began) / done * (count - done)) if done else ""
-        text = count_text(done, count, "/")
-        shown.update(bar, completed=done / max(1, count), note=f"{text}, {name}")
-        steps.say(f"{command}: {text} {verb}, now {name}{left}")
-
-    return on_next
-
-
 def duration(seconds: float) -> str:
     """Seconds as ``1 h 05 min``, ``3 min 20 s`` or ``12 s``."""
     whole = round(seconds)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
-from edp.cli.train import TrainingDisplay
+from edp.cli.progress import shown_progress
 from edp.errors import ConfigError
 from edp.wording import figure
 
@@ -66,15 +66,14 @@ def distil(
         changes=others,
     )
     source = source_if_given(data, signal_map, repair)
-    with progress(as_json) as shown:
-        display = TrainingDisplay(shown, Steps(as_json))
-        bundle = make(run, request, folder, source, display.on_event)
+    with shown_progress("distil", as_json) as progress:
+        bundle = make(run, request, folder, source, progress)
     counts = {"teacher": footprint(load_bundle(run).predictor), "student": footprint(bundle.predictor)}
     facts = {
         "run": str(folder),
         "bundle": str(folder / "bundle"),
         "seconds": bundle.provenance["seconds"],
-        "validation_mae": display.best,
+        "validation_mae": progress.display.measured("validation_mae"),
         **{name: {"parameters": count.parameters, "macs_tick": count.macs_tick} for name, count in counts.items()},
     }
     emit(as_json, facts, lambda: _show(counts, facts))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import (
     MOST_HOURS,
     MOST_MINUTES,
@@ -24,6 +23,7 @@ from edp.cli.options import (
     within,
     workforce_of,
 )
+from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.settings.bounds import above, span
 from edp.wording import figure, number, percent, setting_text
@@ -151,15 +151,8 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
     from edp.workflows.twin import evaluate_twin
     from edp.workflows.twin.judge_twin import SCORES
 
-    steps = Steps(as_json, every_s=0.0)
-    with progress(as_json) as shown:
-        bar = shown.add_task("evaluate", total=None, note="")
-
-        def on_step(name: str) -> None:
-            shown.update(bar, note=name)
-            steps.say(f"evaluate: {name}")
-
-        folder = evaluate_twin(run, source, predictor, on_step)
+    with shown_progress("evaluate", as_json) as progress:
+        folder = evaluate_twin(run, source, predictor, progress)
     scores = read_object(folder / SCORES)
     verdict = twin_verdict(scores["models"])
 
@@ -190,21 +183,13 @@ def run_evaluation(
     from edp.storage import read_object
     from edp.workflows.train_evaluate import evaluate as judge_run
 
-    # Every step is told: there are few, and each takes long.
-    steps, began = Steps(quiet, every_s=0.0), time.monotonic()
-    with progress(quiet) as shown:
-        bar = shown.add_task("evaluate", total=None, note="")
-
-        def on_step(name: str) -> None:
-            shown.update(bar, note=name)
-            steps.say(f"evaluate: {name}, {duration(time.monotonic() - began)} so far")
-
+    with shown_progress("evaluate", quiet, timed=True) as progress:
         if workforce is None or workforce.alone:
-            folder = judge_run(run, source, names, on_step, minutes, at_most_h=at_most_h)
+            folder = judge_run(run, source, names, progress, minutes, at_most_h=at_most_h)
         else:
             from edp.workflows.fleet.judging import evaluate_with
 
-            folder = evaluate_with(workforce, run, source, names, on_step, at_most_h)
+            folder = evaluate_with(workforce, run, source, names, progress, at_most_h)
     return folder, read_object(folder / "scores.json")
 
 
@@ -214,9 +199,8 @@ def run_importance(
     """Take channels away with a progress display."""
     from edp.workflows.train_evaluate import channel_importance
 
-    with progress(quiet) as shown:
-        on_group = counted(shown, Steps(quiet), "channel importance", "removed")
-        importances, _ = channel_importance(run, source, on_group=on_group, at_most_h=at_most_h)
+    with shown_progress("channel importance", quiet, "removed") as progress:
+        importances, _ = channel_importance(run, source, progress=progress, at_most_h=at_most_h)
     return importances
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import (
     ClusterOption,
     MapOption,
@@ -18,7 +18,7 @@ from edp.cli.options import (
     source_of,
     workforce_of,
 )
-from edp.cli.train import SeriesDisplay
+from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import ConfigError
 from edp.wording import figure
@@ -77,7 +77,7 @@ def finetune(
     from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.report import read_transfer, write_transfer_page
     from edp.report.transfer.facts import transfer_verdict
-    from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec
+    from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec
     from edp.workflows.transfer import finetune as make
 
     spec, others = command_settings("finetune", FinetuneSpec, config, changes, TRAINING_TABLES)
@@ -95,15 +95,13 @@ def finetune(
         raise ConfigError("give LOGS of one machine, or --fleet with a store of many, to which --delta-kb belongs")
     order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
     source = source_of(logs, signal_map, repair)
-    with progress(as_json) as shown:
-        display = SeriesDisplay(shown, as_json, "finetune", "method")
-        callbacks = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
+    with shown_progress("finetune", as_json) as progress:
         if workforce.alone:
-            result = make(bundle, source, order, folder, callbacks)
+            result = make(bundle, source, order, folder, progress)
         else:
             from edp.workflows.fleet.training import finetune_with
 
-            result = finetune_with(workforce, bundle, source, order, folder, callbacks)
+            result = finetune_with(workforce, bundle, source, order, folder, progress)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 
@@ -123,12 +121,10 @@ def _finetune_fleet(
     bundle: Path, store: Path, folder: Path, order: PersonalOrder, workforce: Workforce, as_json: bool
 ) -> None:
     """Fine-tune for every machine of a store, with a progress display, and print what it came to."""
-    from edp.cli.fleet import MachineDisplay
     from edp.workflows.fleet.personal import errors_by_machine, finetune_fleet
 
-    with progress(as_json) as shown:
-        on_machine = MachineDisplay(shown, Steps(as_json), "finetune").on_machine
-        content = finetune_fleet(workforce, bundle, store, order, folder, on_machine)
+    with shown_progress("finetune", as_json) as progress:
+        content = finetune_fleet(workforce, bundle, store, order, folder, progress)
 
     def show() -> None:
         rows = [(name, *(figure(error) for error in errors)) for name, *errors in errors_by_machine(content)]

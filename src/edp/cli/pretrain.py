@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.options import (
     ClusterOption,
     LogsArgument,
@@ -19,7 +19,7 @@ from edp.cli.options import (
     source_of,
     workforce_of,
 )
-from edp.cli.train import TrainingDisplay
+from edp.cli.progress import shown_progress
 
 
 def pretrain(
@@ -59,18 +59,15 @@ def pretrain(
     order = Pretrain(method=method, meta=meta, start=start)
     # Other splits are refused; the default makes the usual call short.
     experiment = load_experiment(config, preset, ['split.kind="machines"', *changes], aside=("pretrain",))
-    with progress(as_json) as shown:
-        steps = Steps(as_json)
-        display = TrainingDisplay(shown, steps)
+    with shown_progress("pretrain", as_json) as progress:
         source = source_of(data, signal_map, repair)
         if cluster:
             from edp.workflows.fleet.training import pretrain_with
 
-            steps.say(f"pretrain: on a node of the cluster at {cluster}", force=True)
+            progress.note(f"on a node of the cluster at {cluster}")
             result = pretrain_with(workforce_of(1, cluster, open_cluster), source, experiment, order, folder)
         else:
-            on_step = lambda text: steps.say(text, force=True)  # noqa: E731
-            result = make(source, experiment, order, folder, display.on_event, on_step)
+            result = make(source, experiment, order, folder, progress)
 
     def show() -> None:
         _tables(result)

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, err, left_text, out, progress, table
+from edp.cli.console import JsonFlag, duration, emit, err, out, table
 from edp.cli.options import MOST_WORKERS, LogsArgument, MapOption, RepairOption, check_effects, source_of
+from edp.cli.progress import shown_progress
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from edp.logs.source import DataSource
-    from edp.training import Bundle, TrainingProgress
+    from edp.training import Bundle
 
 AUTO = "auto"
 """`edp.config.experiment.AUTO`, known here without loading that module."""
@@ -93,9 +92,8 @@ def _train_auto(
     if not quiet:
         limit = f"{figure(settings.auto.minutes)} min"
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
-    with progress(quiet) as shown:
-        display = TrainingDisplay(shown, Steps(quiet))
-        result = train_auto(source, settings, folder, display.on_event, display.on_candidate, workers)
+    with shown_progress("train", quiet) as progress:
+        result = train_auto(source, settings, folder, progress, workers)
     facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.facts}
 
     def show() -> None:
@@ -153,72 +151,10 @@ def run(
     """Train with a progress display; returns the bundle and the best validation error."""
     from edp.config.experiment import load_experiment
     from edp.logs.source import DataSource
+    from edp.training.progress_steps import training_steps
     from edp.workflows.train_evaluate import train as run_training
 
     experiment = load_experiment(config, preset, changes)
-    with progress(quiet) as shown:
-        display = TrainingDisplay(shown, Steps(quiet))
-        bundle = run_training(source or DataSource.of(data), experiment, folder, display.on_event)
-    return bundle, display.best
-
-
-class TrainingDisplay:
-    """Shows training events as a bar on a terminal, as lines elsewhere."""
-
-    def __init__(self, shown: Progress, steps: Steps) -> None:
-        self.shown, self.steps = shown, steps
-        self.bar = shown.add_task("train", total=1.0, note="")
-        self.best: float | None = None
-        self.model = ""
-
-    def on_candidate(self, label: str, done: int, count: int) -> None:
-        """The training of another model begins, after `done` of `count`."""
-        self.best, self.model = None, f"{label} ({count_text(done + 1, count)}), "
-        self.steps.say(f"train: {label}, model {count_text(done + 1, count)}", force=True)
-
-    def on_event(self, event: TrainingProgress) -> None:
-        """Show one event."""
-        if event.row is not None and event.row["best"]:
-            self.best = event.row["validation_mae"]
-        score = "" if self.best is None else f", validation MAE {figure(self.best)}"
-        stage = "refit, " if event.refit else ""
-        epoch = count_text(event.epoch, event.epochs, "/")
-        note = f"{self.model}{stage}epoch {epoch}, {number(event.targets_per_s, 0)} targets/s{score}"
-        self.shown.update(self.bar, completed=event.share, note=note)
-        self.steps.say(f"train: {note}{left_text(event.seconds_left)}", force=event.row is not None)
-
-
-class SeriesDisplay:
-    """Shows which of several trainings is at work, and the time left of it.
-
-    Args:
-        shown: progress display.
-        quiet: print nothing on standard output or error.
-        command: name of the command.
-        each: what one of them is made for, such as ``method``.
-    """
-
-    def __init__(self, shown: Progress, quiet: bool, command: str, each: str) -> None:
-        self.shown, self.quiet, self.command, self.each = shown, quiet, command, each
-        self.steps = Steps(quiet)
-        self.bar = shown.add_task(command, total=1.0, note="reading recordings")
-        self.done, self.count = 0, 1
-
-    def on_note(self, text: str) -> None:
-        """Print a sentence."""
-        if not self.quiet:
-            out.print(text)
-
-    def on_next(self, name: str, done: int, count: int) -> None:
-        """Another one begins, after `done` of at most `count`."""
-        self.done, self.count = done, max(1, count)
-        self.shown.update(self.bar, completed=done / self.count, note=name)
-        self.steps.say(f"{self.command}: {self.each} {count_text(done + 1, count)}, {name}", force=True)
-
-    def on_training(self, name: str, event: TrainingProgress) -> None:
-        """Show an event of the training that is at work."""
-        epoch = count_text(event.epoch, event.epochs, "/")
-        note = f"{name}, {self.each} {count_text(self.done + 1, self.count)}, epoch {epoch}"
-        self.shown.update(self.bar, completed=(self.done + event.share) / self.count, note=note)
-        left = left_text(event.seconds_left)
-        self.steps.say(f"{self.command}: {note}{left and f'{left} of it'}", force=event.row is not None)
+    with shown_progress("train", quiet) as progress:
+        bundle = run_training(source or DataSource.of(data), experiment, folder, training_steps(progress))
+    return bundle, progress.display.measured("validation_mae")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, duration, emit, left_text, out, progress, table
+from edp.cli.console import JsonFlag, duration, emit, out, table
 from edp.cli.options import (
     MOST_MINUTES,
     MOST_SECONDS,
@@ -19,6 +19,7 @@ from edp.cli.options import (
     source_of,
     within,
 )
+from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
 from edp.settings.bounds import MIN_MINUTES, above, span
@@ -26,9 +27,6 @@ from edp.storage.paths import full_path, is_file_at
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
-    from edp.training.free_run import FreeRunProgress
     from edp.workflows.twin import TrainedTwin
 
 
@@ -78,10 +76,9 @@ def twin(
     check_effects(context, {name: effect and not experiment.ground for name, effect in effects.items()})
     if minutes is not None:
         experiment = with_budget(experiment, minutes)
-    with progress(as_json) as shown:
-        display = FitDisplay(shown, as_json)
+    with shown_progress("twin", as_json) as progress:
         source = source_of(data, signal_map, repair)
-        trained = train_twin(source, experiment, folder, display.on_event, display.on_step, workers, start)
+        trained = train_twin(source, experiment, folder, progress, workers, start)
     seconds = trained.bundle.provenance["seconds"]
     verdict = twin_verdict(trained.scores)
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
@@ -308,25 +305,3 @@ def _with_unit(text: str, row: dict[str, Any]) -> str:
 def _number(value: float | None) -> str:
     # Mixed units have no mean; the JSON has each channel.
     return "-" if value is None else figure(value, 3)
-
-
-class FitDisplay:
-    """Shows what is at work, and how far a fit to free runs is."""
-
-    def __init__(self, shown: Progress, quiet: bool, what: str = "twin") -> None:
-        self.shown, self.steps, self.what = shown, Steps(quiet), what
-        self.bar = shown.add_task(what, total=1.0, note="")
-
-    def on_step(self, text: str) -> None:
-        """What begins."""
-        self.shown.update(self.bar, note=text)
-        self.steps.say(f"{self.what}: {text}", force=True)
-
-    def on_event(self, event: FreeRunProgress) -> None:
-        """How far it is."""
-        error = "" if event.validation is None else f", free-run error {figure(event.validation, 3)} deviations"
-        # A fit that goes on beyond its plan has no time left to state.
-        left = "" if event.update >= event.updates else left_text(event.seconds_left)
-        note = f"update {count_text(event.update, event.updates, '/')}, runs of {figure(event.length_s)} s{error}"
-        self.shown.update(self.bar, completed=event.update / max(1, event.updates), note=note)
-        self.steps.say(f"{self.what}: {note}{left}")

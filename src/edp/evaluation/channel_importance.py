@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -26,11 +26,11 @@ from edp.errors import ConfigError, DataError, closest
 from edp.evaluation.conditional import OthersModel
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
+from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_NAMES, MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
 from edp.signals import KINDS
 
 Array = NDArray[np.float64]
-OnGroup = Callable[[str, int, int], None]
 # Eight stretches give Student's t seven degrees of freedom: an interval that is wide, but means something.
 PIECES = 8
 """Stretches that intervals are taken over, at least; recordings are cut where there are fewer."""
@@ -134,7 +134,7 @@ def measure_channel_importance(
     predictor: Predictor,
     data: Prepared,
     spec: ChannelImportanceSpec | None = None,
-    on_group: OnGroup | None = None,
+    progress: Progress = SILENT,
 ) -> ChannelImportances:
     """Take every input channel of a predictor away, one at a time and in groups, on ``data.test``.
 
@@ -142,7 +142,7 @@ def measure_channel_importance(
         predictor: the network; channels that only a physics base reads are taken away like the others.
         data: prepared series: ``data.test`` is judged, ``data.train`` tells what channels say of each other.
         spec: how.
-        on_group: called with the members, how many groups are done and of how many.
+        progress: receiver of the progress; its units are channels, or groups of them.
 
     Raises:
         ConfigError: a group names what is no input.
@@ -158,9 +158,9 @@ def measure_channel_importance(
     # The same donors for every channel, so that channels differ by themselves and not by the draw.
     donors = [_donors(data.test, np.random.default_rng([spec.seed, turn])) for turn in range(spec.repeats)]
     rows: list[ChannelImportance] = []
+    removals = progress.stage("channel", len(groups))
     for done, (members, columns) in enumerate(zip(groups, places, strict=True)):
-        if on_group is not None:
-            on_group(", ".join(members), done, len(groups))
+        removals.note(", ".join(members))
         growths = []
         for base in ([np.zeros_like(values) for values in expected[done]], expected[done]):
             # All changed recordings go through the network together: streams side by side cost little more than one.
@@ -169,6 +169,7 @@ def measure_channel_importance(
             each = [ruler.errors(predictions[i * count : (i + 1) * count]) for i in range(spec.repeats)]
             growths.append(np.mean(each, axis=0) - plain)
         rows += ruler.rows(members, growths[0], growths[1], explained[done])
+        removals.step(done + 1)
     return ChannelImportances(tuple(rows), ruler.table(plain), ruler.units(), tuple(part.name for part in data.test))
 
 

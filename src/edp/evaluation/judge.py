@@ -22,6 +22,7 @@ from edp.evaluation.scores_file import nearest_to_shown
 from edp.evaluation.situation import situation_of
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_groups, streamed
+from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_TICKS, SEED, check_bounds, integer
 from edp.stats.metrics import weighted_interval_score
 from edp.stats.sketch import MOST_EXACT
@@ -116,7 +117,7 @@ def judge(
     spec: JudgeSpec,
     label: str,
     seconds: float = 0.0,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress = SILENT,
     minutes: float | None = None,
 ) -> Evaluation:
     """Score the predictor and the baselines on ``data.test``.
@@ -127,22 +128,21 @@ def judge(
         spec: which baselines, how much history, which ticks.
         label: how reports call the network.
         seconds: its training time.
-        on_step: called with the name of each model before it runs.
+        progress: receiver of the name of each model before it runs.
         minutes: after which no further baseline is begun, the cheapest being first; scores name those left out.
 
     Raises:
         DataError: no tick of the test series can be scored.
     """
-    say = on_step or (lambda name: None)
     bench = ModelBench(predictor, data, spec)
-    say("network")
+    progress.note("network")
     models = {"network": bench.network(label, seconds)}
     start, left_out = time.perf_counter(), []
     for name in by_effort(spec.baselines):
         if minutes is not None and time.perf_counter() - start > 60 * minutes:
             left_out.append(name)
             continue
-        say(name)
+        progress.note(name)
         models[name] = bench.baseline(name)
     return bench.together(models, left_out)
 

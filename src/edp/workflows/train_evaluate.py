@@ -31,6 +31,7 @@ from edp.evaluation.scores_file import earlier_scores
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
@@ -209,7 +210,7 @@ def evaluate(
     run: str | Path,
     source: DataSource | None = None,
     baselines: Sequence[str] | None = None,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress = SILENT,
     minutes: float | None = None,
     judged_by: JudgedBy | None = None,
     at_most_h: float | None = None,
@@ -222,7 +223,7 @@ def evaluate(
         run: run folder.
         source: other recordings. Logs without a map are read with that of the run.
         baselines: names; None takes those of the settings.
-        on_step: called with the name of each model before it runs.
+        progress: receiver of the name of each model before it runs.
         minutes: after which no further baseline is begun; a later call judges it.
         judged_by: measures all models in place of this process; `minutes` is then not looked at.
         at_most_h: judge on evenly spread stretches of so many hours, about, where there are more; None judges on all.
@@ -249,7 +250,7 @@ def evaluate(
     if scores is None:
         label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
         if judged_by is None:
-            evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step, minutes)
+            evaluation = judge(bundle.predictor, data, chosen, label, seconds, progress, minutes)
         else:
             bench = ModelBench(bundle.predictor, data, chosen)
             evaluation = bench.together(judged_by(bench, " ".join(judged)))
@@ -298,7 +299,7 @@ def channel_importance(
     run: str | Path,
     source: DataSource | None = None,
     spec: ChannelImportanceSpec | None = None,
-    on_group: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
     at_most_h: float | None = None,
 ) -> tuple[ChannelImportances, Path]:
     """Importance of each input channel to the network of a run, on its held-out recordings or on other ones.
@@ -307,7 +308,7 @@ def channel_importance(
         run: run folder.
         source: other recordings.
         spec: how channels are taken away; without it, collinear channels are also taken away together.
-        on_group: called with the channels, how many groups are done and of how many.
+        progress: receiver of the progress; its units are channels, or groups of them.
         at_most_h: as in `evaluate`.
 
     Returns:
@@ -323,7 +324,7 @@ def channel_importance(
     if spec is None:
         groups = collinear([part.inputs for part in data.train])
         spec = ChannelImportanceSpec(groups=tuple(tuple(data.task.inputs[i] for i in group) for group in groups))
-    importances = measure_channel_importance(bundle.predictor, data, spec, on_group)
+    importances = measure_channel_importance(bundle.predictor, data, spec, progress)
     write_json(target / "channel_importance.json", {"schema": 1} | importances.to_json())
     return importances, target / "channel_importance.json"
 

@@ -8,16 +8,14 @@ from types import SimpleNamespace
 import pytest
 
 from edp.cli import console
-from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, counted, left_text, progress
-from edp.cli.fleet import MachineDisplay
+from edp.cli.console import BoundedProgress, Steps, TimeLeft, count_text, left_text, progress
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.quality import LogDisplay
 from edp.cli.screen import ScreeningDisplay
 from edp.cli.search import SearchDisplay
-from edp.cli.train import SeriesDisplay, TrainingDisplay
-from edp.cli.twin import FitDisplay
 from edp.training import TrainingProgress
 from edp.training.free_run import FreeRunProgress
+from edp.training.progress_steps import free_run_steps, training_steps
 
 COMMANDS = Path(console.__file__).parent
 
@@ -31,25 +29,19 @@ def steps():
 
 
 def train(shown):
-    display = TrainingDisplay(shown, steps())
-    display.on_candidate("ridge", 2, 2)
-    for number in (1, 2, 3):
-        display.on_event(epoch(number))
-
-
-def series(shown):
-    display = SeriesDisplay(shown, False, "finetune", "method")
-    display.steps = steps()
+    models = display(shown, "train").stage("model", 2)
     for done in (0, 1, 2, 3):
-        display.on_next("x", done, 2)
-        display.on_training("x", epoch(2))
+        models.step(done)
+        models.note("ridge")
+        report = training_steps(models)
+        for number in (1, 2, 3):
+            report(epoch(number))
 
 
 def fit(shown):
-    display = FitDisplay(shown, quiet=False)
-    display.steps = steps()
+    report = free_run_steps(display(shown, "twin"))
     for update in (1, 64, 88):
-        display.on_event(FreeRunProgress(update, 64, 1.0, 0.2 if update == 1 else 0.0, None, False))
+        report(FreeRunProgress(update, 64, 1.0, 0.2 if update == 1 else 0.0, None, False))
 
 
 def screening(shown):
@@ -70,18 +62,6 @@ def logs(shown):
     display = LogDisplay(shown, steps())
     for number in (1, 2, 3, 4):
         display.on_log(Path("x"), number, 2)
-
-
-def machines(shown):
-    display = MachineDisplay(shown, steps(), "fleet")
-    for done in (0, 2, 3):
-        display.on_machine("x", done, 2)
-
-
-def count(shown):
-    on_next = counted(shown, steps(), "replay", "done")
-    for done in (0, 1, 2, 3):
-        on_next("x", done, 2)
 
 
 def display(shown, command, counted="", timed=False):
@@ -109,14 +89,11 @@ def methods(shown):
 
 
 USERS = {
-    "TrainingDisplay": train,
-    "SeriesDisplay": series,
-    "FitDisplay": fit,
+    "training_steps": train,
+    "free_run_steps": fit,
     "ScreeningDisplay": screening,
     "SearchDisplay": search,
     "LogDisplay": logs,
-    "MachineDisplay": machines,
-    "counted": count,
     "Display": loops,
     "StageDisplay": methods,
 }
@@ -173,7 +150,26 @@ def test_the_stage_of_a_training_divides_the_unit_at_work(capsys):
         assert shown.tasks[0].completed == 0.75
     assert capsys.readouterr().err.splitlines()[1:] == [
         "finetune: method 2 of 2, full",
-        "finetune: method 2 of 2, full, epoch 2/4, 3 s left",
+        "finetune: method 2 of 2, full, epoch 2/4, 3 s left of it",
+    ]
+
+
+def test_a_training_shows_speed_and_the_best_error_so_far(capsys):
+    with progress() as shown:
+        whole = display(shown, "train")
+        whole.note("reading recordings")
+        report = training_steps(whole)
+        for event in (
+            TrainingProgress(1, 2, 10, 10, 1e5, 75.0, {"best": True, "validation_mae": 0.5}),
+            TrainingProgress(2, 2, 5, 10, 1e5, 0.2, {"best": False, "validation_mae": 0.7}),
+            TrainingProgress(1, 3, 5, 10, 1e5, 0.2, refit=True),
+        ):
+            report(event)
+        assert whole.display.measured("validation_mae") == 0.5
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        "train: epoch 1/2, 100,000 targets/s, validation MAE 0.5, 1 min 15 s left",
+        "train: epoch 2/2, 100,000 targets/s, validation MAE 0.5, 1 s left",
+        "train: refit, epoch 1/3, 100,000 targets/s, validation MAE 0.5, 1 s left",
     ]
 
 
@@ -181,10 +177,14 @@ def test_notes_of_a_command_replace_each_other(capsys):
     with progress() as shown:
         whole = display(shown, "twin")
         whole.note("static map")
-        whole.stage("update", 4).step(1)
+        whole.stage("update", 4).step(1, length_s=2.0, free_run_error=0.25)
         whole.note("free runs")
         assert shown.tasks[0].completed == 0.25
-    assert capsys.readouterr().err.splitlines() == ["twin: static map", "twin: update 1/4", "twin: free runs"]
+    assert capsys.readouterr().err.splitlines() == [
+        "twin: static map",
+        "twin: update 1/4, runs of 2 s, free-run error 0.25 deviations",
+        "twin: free runs",
+    ]
 
 
 def test_time_left_and_counts_of_a_plan():
@@ -205,7 +205,7 @@ def functions():
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef):
                 calls = {ast.unparse(c.func) for c in ast.walk(node) if isinstance(c, ast.Call)}
-                if any(name.endswith((".say", "shown.update")) for name in calls):
+                if any(name.endswith((".say", "shown.update", "bars.update")) for name in calls):
                     yield file.name, node
 
 
@@ -263,6 +263,6 @@ def test_no_other_display_exists():
             node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and "add_task(" in ast.unparse(node)
         }
     assert importers == {"console.py"}
-    assert owners == set(USERS) - {"counted", "StageDisplay"}
+    assert owners == set(USERS) - {"StageDisplay", "free_run_steps", "training_steps"}
     with progress() as shown:
         assert isinstance(shown, BoundedProgress)

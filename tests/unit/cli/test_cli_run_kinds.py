@@ -4,8 +4,8 @@ import contextlib
 
 import pytest
 
-from edp.cli.console import progress
-from edp.cli.twin import FitDisplay
+from edp.cli.console import Steps, progress
+from edp.cli.progress import Display, StageDisplay
 from edp.errors import StorageError
 from edp.storage import write_json
 from edp.storage.locks import hold
@@ -13,6 +13,7 @@ from edp.storage.run_kinds import RUN_KINDS
 from edp.storage.run_listing import MODELS, list_runs
 from edp.storage.runs import Run, state_of
 from edp.training.free_run import FreeRunProgress
+from edp.training.progress_steps import free_run_steps
 
 
 @pytest.mark.parametrize("kind", sorted(set(RUN_KINDS) - {"search"}))
@@ -72,9 +73,9 @@ def test_results_of_earlier_versions_are_listed_as_finished(tmp_path, mark, kind
 
 def test_a_fit_that_exceeds_its_plan_says_so(capsys):
     with progress(quiet=False) as shown:
-        display = FitDisplay(shown, quiet=False)
-        display.steps.every_s = 0.0
+        whole = StageDisplay(Display(shown, Steps(False, every_s=0.0), "twin"))
         for update in (64, 88):
-            display.on_event(FreeRunProgress(update, 64, 1.0, 0.0, None, False))
+            free_run_steps(whole)(FreeRunProgress(update, 64, 1.0, 0.2, None, False))
         assert shown.tasks[0].completed <= shown.tasks[0].total
-    assert "88/64" not in capsys.readouterr().err
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["twin: update 64/64, runs of 1 s", "twin: update 88, more than the 64 planned, runs of 1 s"]

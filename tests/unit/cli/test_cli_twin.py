@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edp.cli.progress import StageDisplay
 from edp.data.features import FeatureSet
 from edp.data.prepared import prepare
 from edp.data.splits import ByRecording
@@ -76,15 +77,13 @@ def test_a_run_holds_a_twin_its_settings_and_scores_beside_the_floors(edp, logs,
 
 
 def test_a_stopped_training_goes_on(edp, logs, trained, tmp_path, monkeypatch):
-    from edp.cli.twin import FitDisplay
-
-    def stop(self, event):
-        if event.update == 3:
+    def stop(self, done, **values):
+        if done == 3:
             raise KeyboardInterrupt
 
     run = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(FitDisplay, "on_event", stop)
+        patch.setattr(StageDisplay, "step", stop)
         assert edp("twin", logs, "--out", run, *WORDS).code == 130
     assert not (run / "twin").exists()
     assert edp("twin", logs, "--out", run, *WORDS).code in (0, 6)  # as above

@@ -13,6 +13,7 @@ from edp.errors import ConfigError
 from edp.jobs import Workforce, cluster
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
+from edp.progress import SilentProgress
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
@@ -65,6 +66,22 @@ class Plug:
         ray.shutdown()
 
 
+class PullingProgress(SilentProgress):
+    """Progress that pulls a plug."""
+
+    def __init__(self, plug):
+        self.plug = plug
+
+    def note(self, sentence):
+        """Pull the plug."""
+        self.plug.pull()
+
+    def step(self, done, **values):
+        """Pull the plug once something is done."""
+        if done:
+            self.plug.pull()
+
+
 @pytest.fixture(scope="module")
 def nodes():
     with pytest.MonkeyPatch.context() as patch, three_nodes(patch, Path(__file__).parent) as running:
@@ -83,7 +100,7 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     plug.mend()
 
     source = DataSource.of(one / "logs")
-    store_with(there, source, tmp_path / "store", lambda progress: progress.logs and plug.pull())
+    store_with(there, source, tmp_path / "store", PullingProgress(plug))
     source.store(one / "store", 1)
     digests = [[entry.digest for entry in read_store(folder / "store")] for folder in (tmp_path, one)]
     assert digests[0] == digests[1]
@@ -116,7 +133,7 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     assert _digest(tmp_path / "run") == _digest(one / "run")
     plug.mend()
 
-    scored = evaluate_with(there, tmp_path / "run", on_step=plug.pull)
+    scored = evaluate_with(there, tmp_path / "run", progress=PullingProgress(plug))
     evaluate(one / "run")
     assert _scores(scored) == _scores(one / "run")
     plug.mend()

@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from noted_progress import NotedProgress
 
 from edp.config.experiment import load_experiment
 from edp.data.chunks import stack
@@ -102,12 +103,12 @@ def test_a_stopped_pretraining_goes_on_to_the_same_bits(made, machines, experime
     folder, found = made
     order = Pretrain(method=found["method"], meta=META)
 
-    def pull(event):
-        if event.row is not None and event.epoch == 1:
+    def pull(done, **values):
+        if "validation_mae" in values and done == 1:
             raise Pulled
 
     with pytest.raises(Pulled):
-        pretrain(machines, experiment, order, tmp_path / "run", pull)
+        pretrain(machines, experiment, order, tmp_path / "run", NotedProgress(pull))
     again = pretrain(machines, experiment, order, tmp_path / "run")
     assert again == found
     ends = [load_bundle(place).predictor.state_dict() for place in (folder, tmp_path / "run")]

@@ -4,10 +4,12 @@ import copy
 import dataclasses
 import json
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
+from noted_progress import NotedProgress
 from scipy import stats
 from typer.testing import CliRunner
 
@@ -26,7 +28,7 @@ from edp.training.transfer.both_domains import BothDomains, BothSpec
 from edp.training.transfer.strategies import LowRank
 from edp.training.warm_start import WarmStart
 from edp.workflows.train_evaluate import evaluate, train
-from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec, finetune
+from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec, finetune
 from edp.workflows.transfer.case import tuned as tuning
 from edp.workflows.transfer.scores import errors_of, measure, skew
 from edp.workflows.transfer.source import read_source, target_experiment, task_settings
@@ -127,16 +129,18 @@ def test_low_rank_changes_have_their_rank_and_leave_an_ordinary_network(tuned, r
 def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
     whole, _ = tuned
     order = FinetuneRequest(spec=small, method="two_phase", changes=UPDATES)
-    for stop in (1, 3):
+    for stop in (1, 2):
         seen = []
 
-        def pull(name, event, seen=seen, stop=stop):
-            seen.append(event.row)
-            if sum(row is not None for row in seen) == stop:
+        def pull(done, seen=seen, stop=stop, **values):
+            if values:
+                seen.append((done, values["share"]))
+            begun = sum(epoch != before or share < earlier for (before, earlier), (epoch, share) in pairwise(seen))
+            if begun == stop:
                 raise Pulled
 
         with pytest.raises(Pulled):
-            finetune(run, target, order, tmp_path / "run", FinetuneCallbacks(on_training=pull))
+            finetune(run, target, order, tmp_path / "run", NotedProgress(pull))
     found = finetune(run, target, order, tmp_path / "run")
     ends = [load_bundle(folder).predictor.state_dict() for folder in (whole, tmp_path / "run")]
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
@@ -149,13 +153,13 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, smal
 def test_a_stopped_adversarial_training_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
     whole, _ = tuned
 
-    def pull(name, event):
-        if event.row is not None:
+    def pull(done, **values):
+        if "validation_mae" in values:
             raise Pulled
 
     order = FinetuneRequest(spec=small, method="adversarial", changes=UPDATES)
     with pytest.raises(Pulled):
-        finetune(run, target, order, tmp_path / "run", FinetuneCallbacks(on_training=pull))
+        finetune(run, target, order, tmp_path / "run", NotedProgress(pull))
     finetune(run, target, order, tmp_path / "run")
     ends = [
         load_bundle(folder).predictor.state_dict() for folder in (whole / "baselines/adversarial", tmp_path / "run")
@@ -176,10 +180,11 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
     (tmp_path / "alone").mkdir()
     for file in (run / "bundle").iterdir():
         (tmp_path / "alone" / file.name).write_bytes(file.read_bytes())
-    notes = []
+    told = NotedProgress()
+    notes = told.notes
     changes = ("training.updates=2", "training.chunks.length=32")
     order = FinetuneRequest(spec=small, method="two_phase", baselines=("adversarial",), changes=changes)
-    found = finetune(tmp_path / "alone", target, order, tmp_path / "run", FinetuneCallbacks(on_note=notes.append))
+    found = finetune(tmp_path / "alone", target, order, tmp_path / "run", told)
     assert list(found["methods"]["two_phase"]["domains"]) == ["target"]
     assert any("bundle without the run" in note for note in notes)
     assert any("sign of rise, turn was not checked" in note for note in notes)

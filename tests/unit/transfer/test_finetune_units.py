@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+from noted_progress import NotedProgress
 
 from edp.errors import BundleError
 from edp.evaluation import judge
@@ -14,7 +15,7 @@ from edp.workflows import train_evaluate
 from edp.workflows.fleet.judging import UNITS, evaluate_with
 from edp.workflows.fleet.training import finetune_with
 from edp.workflows.train_evaluate import evaluate, trained_run
-from edp.workflows.transfer import FinetuneCallbacks, FinetuneRequest, finetune
+from edp.workflows.transfer import FinetuneRequest, finetune
 
 
 def without_times(value):
@@ -26,11 +27,11 @@ def without_times(value):
 
 def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small, tmp_path):
     order = FinetuneRequest(spec=small, method="full", baselines=("low_rank", "ridge_arx"))
-    notes = []
-    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", FinetuneCallbacks(on_note=notes.append))
+    noted = NotedProgress()
+    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", noted)
     here = finetune(run, target, order, tmp_path / "here")
     assert json.dumps(without_times(there)) == json.dumps(without_times(here))
-    assert [note for note in notes if note.startswith("trained:")] == [
+    assert [note for note in noted.notes if note.startswith("trained:")] == [
         "trained: full, 1 of 2",
         "trained: low_rank, 2 of 2",
     ]
@@ -42,16 +43,16 @@ def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small,
 def test_models_run_apart_have_the_scores_of_one_process(run, target, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     names = ("persistence", "ridge_arx", "small_mlp")
-    told = []
+    told = NotedProgress()
     for source in (None, target):
-        folder = evaluate_with(Workforce(), tmp_path / "run", source, names, told.append)
+        folder = evaluate_with(Workforce(), tmp_path / "run", source, names, told)
         there = read_json(folder / "scores.json")
         (folder / "scores.json").unlink()
         here = read_json(evaluate(tmp_path / "run", source, names) / "scores.json")
         assert without_times(there) == without_times(here)
         assert list(there["models"]) == list(here["models"])
         assert there["key"] == here["key"]
-    assert told[-1] == "network, 4 of 4"
+    assert told.notes[-1] == "network, 4 of 4"
     assert not (tmp_path / "run" / UNITS).exists()
 
 
@@ -60,11 +61,11 @@ def test_a_network_run_in_parts_has_the_scores_of_one_process(run, target, tmp_p
     whole = read_json(evaluate(tmp_path / "run", target, ()) / "scores.json")
     monkeypatch.setattr(judge, "PART_TICKS", 100)
     monkeypatch.setattr(judge, "stream_groups", lambda series: running.stream_groups(series, 1))
-    told = []
+    told = NotedProgress()
     folder = tmp_path / "run"
     (evaluate(folder, target, ()) / "scores.json").unlink()
-    there = read_json(evaluate_with(Workforce(), folder, target, (), told.append) / "scores.json")
-    assert len(told) > 1
+    there = read_json(evaluate_with(Workforce(), folder, target, (), told) / "scores.json")
+    assert len(told.notes) > 1
     (evaluate(folder, target, ()) / "scores.json").unlink()
     here = read_json(evaluate(folder, target, ()) / "scores.json")
     assert without_times(there) == without_times(here)

@@ -18,6 +18,7 @@ from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.lumped.parts import MassElement
 from edp.networks.twin.recurrent import Recurrent, averaged, member_seed
 from edp.networks.twin.static_map import StaticMap
+from edp.progress import SilentProgress
 from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
 from edp.training import free_run_members
@@ -37,7 +38,7 @@ def choice(run, training=TINY, recordings=None, **auto):
     data = prepare(recordings, channels.task(), ByRecording(), 20)
     experiment = TwinExperiment(twin=AutoTwin(prefix_ticks=20, **auto), training=training)
     experiment = replace(experiment, judge=replace(experiment.judge, seconds=4.0, calibration_starts=4))
-    fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, None, lambda text: None)
+    fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment)
     return TwinChoice(fit, experiment.twin, KeyedRun(run, "k" * 32))
 
 
@@ -229,14 +230,15 @@ def test_a_stopped_choice_goes_on_to_the_same_bits(tmp_path):
     def best(folder, stop_at=0):
         seen = []
 
-        def on_event(event):
-            seen.append(event)
-            if len(seen) == stop_at:
-                raise Stop
+        class Stopping(SilentProgress):
+            def step(self, done, **values):
+                seen.append(done)
+                if len(seen) == stop_at:
+                    raise Stop
 
         with Run(folder) as run:
             one = choice(run, training, candidates=("recurrent",))
-            return TwinChoice(replace(one.fit, on_event=on_event), one.auto, one.run).best()
+            return TwinChoice(replace(one.fit, progress=Stopping()), one.auto, one.run).best()
 
     whole, _ = best(tmp_path / "whole")
     for stop_at in (3, 6):

@@ -18,6 +18,7 @@ from edp.ir.rls import Adaptation, RlsCorrector, RlsState, RlsStatus
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
+from edp.progress import SILENT, Progress
 from edp.signals import KINDS, Kind
 from edp.training import load_bundle
 from edp.training.twin_bundle import load_twin
@@ -137,7 +138,7 @@ def replay(
     series: Sequence[Series],
     carry: bool = False,
     learn: bool = True,
-    on_recording: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
     moves: Callable[[Sequence[Rows]], Sequence[Rows]] | None = None,
 ) -> Replay:
     """Run recordings one after the other through a network and its adaptation.
@@ -148,7 +149,7 @@ def replay(
         series: the recordings.
         carry: keep what was learned from one recording to the next, as on one machine; else each starts from nothing.
         learn: False freezes the adaptation.
-        on_recording: called with name, how many are done and of how many.
+        progress: receiver of the progress; its units are recordings.
         moves: what becomes of the network's predictions ``(time, horizon, target)`` of the recordings before the
             adaptation corrects them; None: nothing.
 
@@ -164,9 +165,9 @@ def replay(
     adapter, replayed = RlsCorrector(adaptation), []
     plain = stream_predictions(predictor, series)
     moved = plain if moves is None else moves(plain)
-    for done, (part, base, start) in enumerate(zip(series, plain, moved, strict=True)):
-        if on_recording is not None:
-            on_recording(part.name, done, len(series))
+    recordings = progress.stage("recording", len(series))
+    for number, (part, base, start) in enumerate(zip(series, plain, moved, strict=True)):
+        recordings.note(part.name)
         # The gap between recordings is no motion: predictions from before it must not be judged after it.
         adapter.interrupt()
         if not carry:
@@ -176,6 +177,7 @@ def replay(
             # Before a whole window the network itself is not warm; its errors would teach the wrong thing.
             adapted[tick], status[tick] = adapter.step(x, y, fresh=tick + 1 >= skip, learn=learn)
         replayed.append(Replayed(part.name, base, adapted, motion_s(adaptation, part.targets), status, part.targets))
+        recordings.step(number + 1)
     return Replay(replayed, adaptation.horizons, skip, adapter.learned)
 
 
@@ -184,7 +186,7 @@ def replay_run(
     source: DataSource,
     carry: bool = False,
     learn: bool = True,
-    on_recording: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
     twin: str | Path | None = None,
 ) -> dict[str, Any]:
     """Replay logs through a run that `edp adapt` wrote; see `replay`.
@@ -194,7 +196,7 @@ def replay_run(
         source: the logs.
         carry: keep what was learned from one recording to the next.
         learn: False freezes what was learned.
-        on_recording: called with name, how many are done and of how many.
+        progress: receiver of the progress; its units are recordings.
         twin: run folder of a grey box of the machine as it was, whose numbers follow the machine and towards which the
             network's predictions move before they are corrected (`edp.networks.twin.tuned_correction`); None: none.
 
@@ -211,5 +213,5 @@ def replay_run(
         grey = load_twin(twin)
         by_twin = TwinMoves(grey.twin, correction_of(grey.twin, bundle.adaptation, bundle.task, tuned_spec(grey)))
         moves = partial(by_twin, recordings, carry=carry, learn=learn)
-    result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording, moves)
+    result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, progress, moves)
     return result.to_json(bundle.task, bundle.target_kinds)

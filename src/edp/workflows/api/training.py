@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,13 @@ from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, DataError, closest
 from edp.logs.source import DataSource
 from edp.logs.write import write_recording
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.tree import Table, merged, read_toml
 from edp.storage import make_folder
 from edp.storage.paths import is_there
-from edp.training import Diverged, TrainingProgress
+from edp.training import Diverged
+from edp.training.progress_steps import training_steps
 from edp.workflows import train_evaluate
 from edp.workflows.api.predictor import TrainedPredictor
 from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
@@ -38,7 +40,7 @@ def train(
     out: str | Path | None = None,
     preset: str | None = None,
     settings: Mapping[str, Any] | str | Path | None = None,
-    on_progress: Callable[[TrainingProgress], None] | None = None,
+    progress: Progress = SILENT,
 ) -> TrainedPredictor:
     """Train a predictor of `targets` some samples ahead; what `edp train` does, with the same settings.
 
@@ -58,7 +60,8 @@ def train(
             ``auto``, or ``standard`` where `settings` hold some of the network or of its training.
         settings: laid over the preset: a TOML file, or a mapping with the keys of docs/settings.md, nested or dotted
             (``{"training.epochs": 3}``).
-        on_progress: called with the progress.
+        progress: receiver of the progress: an object with the methods `stage`, `step` and `note` of
+            `edp.progress.Progress`.
 
     Returns:
         The predictor with the weights of the best epoch.
@@ -76,7 +79,7 @@ def train(
     folder = Path(tempfile.mkdtemp(prefix="edp-run-")) if out is None else Path(out)
     source = together.source or MemorySource(folder / RECORDINGS, recordings=tuple(together))
     try:
-        _train(source, experiment, folder, on_progress)
+        _train(source, experiment, folder, progress)
     # Even an interrupt must not leave a temporary folder behind, which nobody would find.
     except BaseException:
         if out is None:
@@ -89,13 +92,13 @@ def _train(
     source: DataSource,
     experiment: Experiment | AutoSettings,
     folder: Path,
-    on_progress: Callable[[TrainingProgress], None] | None,
+    progress: Progress,
 ) -> None:
     try:
         if isinstance(experiment, AutoSettings):
-            train_auto(source, experiment, folder, on_progress)
+            train_auto(source, experiment, folder, progress)
         else:
-            train_evaluate.train(source, experiment, folder, on_progress)
+            train_evaluate.train(source, experiment, folder, training_steps(progress))
     # A diverged run keeps its best weights, which can only be judged with its recordings.
     except Diverged:
         _write(source)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,11 @@ from edp.data.prepared import Prepared
 from edp.errors import ConfigError
 from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
+from edp.progress import SILENT, Progress
 from edp.report.run.choice import FILE, FLOOR, PERSISTENCE, read_choice
 from edp.storage import write_json
 from edp.storage.runs import FINISHED, Run, check_claimable, run_key, state_of
-from edp.training import Bundle, TrainingProgress, load_bundle, make_bundle, save_bundle
+from edp.training import Bundle, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
 from edp.wording import percent
 from edp.workflows.auto.candidates import CANDIDATES, Amount, read_foundation
@@ -45,7 +46,6 @@ from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.auto.train_candidates import (
     TrainedCandidate,
     TrainedPortfolio,
-    Trainer,
     train_portfolio,
 )
 from edp.workflows.train_evaluate import keep_fitted
@@ -74,8 +74,7 @@ def train_auto(
     source: DataSource,
     settings: AutoSettings,
     out: str | Path,
-    on_event: Callable[[TrainingProgress], None] | None = None,
-    on_candidate: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
     workers: int = 1,
 ) -> AutoResult:
     """Train every candidate that suits the data, choose, and write the winner's run folder.
@@ -84,8 +83,7 @@ def train_auto(
         source: where the recordings are.
         settings: task, split, budget, judge.
         out: run folder; a finished one of the same settings and data is read, not made again.
-        on_event: called with progress of the training at work.
-        on_candidate: called with a candidate's label, how many are done and of how many.
+        progress: receiver of the progress; its units are models.
         workers: processes that train candidates side by side; 0 for one a core. The run has the same bits with any
             number.
 
@@ -110,7 +108,7 @@ def train_auto(
     check_moving(data)
     check_size(data)
     with Run.create(out, "auto", key, tomli_w.dumps(plain_tree(settings))) as run:
-        portfolio = train_portfolio(settings, data, amount, run.path, Trainer(workers, on_event, on_candidate))
+        portfolio = train_portfolio(settings, data, amount, run.path, workers, progress)
         return _write_choice(run, source, portfolio, data, settings, [*of_channels, *of_parts, *still_inputs(data)])
 
 

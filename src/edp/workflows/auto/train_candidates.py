@@ -11,6 +11,7 @@ from pathlib import Path
 from edp.config.experiment import Experiment, experiment_toml, plain_tree
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, EdpError, LostError
+from edp.progress import SILENT, Progress
 from edp.sandbox.helpers import Helpers
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.paths import is_file_at
@@ -19,6 +20,7 @@ from edp.training import Diverged, Fitted, TrainingProgress
 from edp.training.bagging.fit import fit_bagged
 from edp.training.blas import one_blas_thread
 from edp.training.fit import fit
+from edp.training.progress_steps import training_steps
 from edp.workflows.auto.candidates import CANDIDATES, Amount, Foundation, RecurrentTrial
 from edp.workflows.auto.promise import (
     Block,
@@ -38,7 +40,6 @@ TRIAL_FOLDER = "trial"
 MARGIN = 1.25
 """Error of a trial over that of the linear model up to which the long training is worth its time: see decision 99."""
 OnEvent = Callable[[TrainingProgress], None]
-OnCandidate = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +126,16 @@ def _by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCan
 
 
 def train_all(
-    jobs: Sequence[CandidateTraining], workers: int, on_event: OnEvent | None, on_candidate: OnCandidate | None
+    jobs: Sequence[CandidateTraining], workers: int, progress: Progress = SILENT, done: int = 0, total: int = 0
 ) -> Iterator[TrainedCandidate | str]:
     """What each training gives, in order; the same bits with any number of processes.
 
     Args:
         jobs: the trainings, the shortest first.
         workers: processes; 0 for one a core.
-        on_event: called with progress.
-        on_candidate: called with the label of the training at work, how many are done and of how many.
+        progress: receiver of the progress; its units are models.
+        done: number of models trained before these.
+        total: number of models with those before and after these; 0 for these alone.
 
     Raises:
         EdpError: see `train_candidate`, or a process died.
@@ -141,12 +143,13 @@ def train_all(
     count = min(workers or os.cpu_count() or 1, len(jobs))
     # Trainings on folds alone take seconds where a process takes as long to start.
     if count <= 1 or all(job.on_folds for job in jobs):
-        for number, job in enumerate(jobs):
-            if on_candidate is not None:
-                on_candidate(job.label, number, len(jobs))
-            yield train_candidate(job, on_event)
+        models = progress.stage("model", total or len(jobs))
+        for number, job in enumerate(jobs, start=done):
+            models.step(number)
+            models.note(job.label)
+            yield train_candidate(job, training_steps(models))
         return
-    display = _Display(jobs, on_event, on_candidate)
+    display = _Display(jobs, progress)
     with Helpers(count, _died) as helpers:
         # The longest first, or it would wait for the others and end alone.
         trained = list(helpers.ordered(_noting, jobs[::-1], display.look))
@@ -178,11 +181,8 @@ def _died(label: str) -> LostError:
 class _Display:
     """Shows of trainings side by side the one that has the longest to go."""
 
-    def __init__(
-        self, jobs: Sequence[CandidateTraining], on_event: OnEvent | None, on_candidate: OnCandidate | None
-    ) -> None:
-        self.jobs, self.on_event, self.on_candidate = jobs, on_event, on_candidate
-        self.shown = ""
+    def __init__(self, jobs: Sequence[CandidateTraining], progress: Progress) -> None:
+        self.jobs, self.progress = jobs, progress
         self.last: TrainingProgress | None = None
 
     def look(self) -> None:
@@ -191,11 +191,8 @@ class _Display:
         if not noted:
             return
         job, event = max(noted, key=lambda pair: pair[1].seconds_left)
-        if job.name != self.shown and self.on_candidate is not None:
-            self.on_candidate(job.label, self.jobs.index(job), len(self.jobs))
-        self.shown = job.name
-        if event != self.last and self.on_event is not None:
-            self.on_event(event)
+        if event != self.last:
+            training_steps(self.progress.stage(job.label))(event)
         self.last = event
 
 
@@ -211,35 +208,6 @@ def _noted(job: CandidateTraining) -> TrainingProgress | None:
         return TrainingProgress(epoch, epochs, update, updates, speed, left)
     except (EdpError, TypeError, ValueError):
         return None  # a note is for readers: what cannot be read now is read at the next look
-
-
-@dataclass(frozen=True)
-class Trainer:
-    """How candidates are trained, and who is told.
-
-    Attributes:
-        workers: processes that train side by side; 0 for one a core.
-        on_event: called with progress of the training at work.
-        on_candidate: called with a candidate's label, how many are done and of how many.
-    """
-
-    workers: int = 1
-    on_event: Callable[[TrainingProgress], None] | None = None
-    on_candidate: OnCandidate | None = None
-
-    def train(
-        self, jobs: Sequence[CandidateTraining], done: int = 0, total: int = 0
-    ) -> dict[str, TrainedCandidate | str]:
-        """By name; `done` others of `total` came before."""
-        tell = self.on_candidate
-
-        def shifted(label: str, number: int, _: int) -> None:
-            if tell is not None:
-                tell(label, done + number, total or len(jobs))
-
-        return {
-            job.name: one for job, one in zip(jobs, train_all(jobs, self.workers, self.on_event, shifted), strict=True)
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,38 +226,44 @@ class TrainedPortfolio:
 
 
 def train_portfolio(
-    settings: AutoSettings, data: Prepared, amount: Amount, folder: Path, trainer: Trainer
+    settings: AutoSettings, data: Prepared, amount: Amount, folder: Path, workers: int = 1, progress: Progress = SILENT
 ) -> TrainedPortfolio:
     """Train every candidate that suits the data.
 
-    Where a recurrent network is among them it first trains for a share of its time. Unless it comes near the linear
-    model in that, the committee gets more of the budget, and the trial stands for the network.
+    A recurrent network first trains for a share of its time. Unless its error comes near that of the linear model, the
+    committee gets more of the budget, and the trial stands for the network.
 
     Args:
         settings: task, budget, which candidates.
         data: prepared series.
         amount: what there is to learn from.
         folder: of the run; checkpoints lie in it.
-        trainer: how.
+        workers: processes that train in parallel; 0 for one a core.
+        progress: receiver of the progress; its units are models.
 
     Raises:
         ConfigError: no candidate suits the data.
         EdpError: see `train_all`.
     """
+
+    def train(jobs: Sequence[CandidateTraining], done: int = 0, total: int = 0) -> dict[str, TrainedCandidate | str]:
+        trained = train_all(jobs, workers, progress, done, total)
+        return {job.name: one for job, one in zip(jobs, trained, strict=True)}
+
     experiments = _experiments(settings, amount)
     if amount.foundation is not None or not {LINEAR, COMMITTEE, RECURRENT} <= experiments.keys():
-        return TrainedPortfolio(trainer.train(_jobs(experiments, data, amount, folder)), amount)
+        return TrainedPortfolio(train(_jobs(experiments, data, amount, folder)), amount)
     amount = replace(amount, trial=RecurrentTrial.RUNNING)
     experiments = _experiments(settings, amount)
     linear, trial = _jobs({name: experiments[name] for name in (LINEAR, RECURRENT)}, data, amount, folder)
     trial = replace(trial, folder=folder / "candidates" / TRIAL_FOLDER, trial=True)
-    first = trainer.train([linear, trial], total=len(experiments))
+    first = train([linear, trial], total=len(experiments))
     ratio = _over_linear(first)
     passed = ratio is not None and ratio <= MARGIN
     amount = replace(amount, trial=RecurrentTrial.PASSED if passed else RecurrentTrial.FAILED)
     experiments = _experiments(settings, amount)
     rest = {name: one for name, one in experiments.items() if name != LINEAR and (passed or name != RECURRENT)}
-    second = trainer.train(_jobs(rest, data, amount, folder), done=len(first), total=len(first) + len(rest))
+    second = train(_jobs(rest, data, amount, folder), done=len(first), total=len(first) + len(rest))
     outcomes = first | second
     notes = []
     if not passed:

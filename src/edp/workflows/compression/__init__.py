@@ -11,7 +11,6 @@ from edp.workflows.compression.distil import DISTIL_SETTINGS, DistilRequest, Dis
 from edp.workflows.compression.formats import FORMATS, Deployed, ResourceUsage, deploy, resource_usage
 from edp.workflows.compression.judged import CompressionResult, Judged
 from edp.workflows.compression.searching import (
-    CompressionCallbacks,
     CompressionSearchRequest,
     CompressionSearchSpec,
     search,
@@ -24,7 +23,6 @@ __all__ = [
     "VARIANTS",
     "Bench",
     "CompressedCandidate",
-    "CompressionCallbacks",
     "CompressionRequest",
     "CompressionResult",
     "CompressionSearchRequest",

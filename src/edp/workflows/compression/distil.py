@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,17 @@ from edp.errors import ConfigError, StorageError
 from edp.logs.source import DataSource
 from edp.networks.losses import LOSSES
 from edp.networks.predictor import Predictor
+from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, integer
 from edp.settings.tree import SettingsTree
 from edp.storage.paths import is_file_at
 from edp.storage.provenance import read_provenance
 from edp.storage.runs import check_claimable
-from edp.training import Bundle, TrainingProgress, load_bundle
+from edp.training import Bundle, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.compression.distillation import DistillationSpec
 from edp.training.compression.qat import RoundingSpec
+from edp.training.progress_steps import training_steps
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import CompressionRequest
@@ -81,7 +83,7 @@ def distil(
     request: DistilRequest,
     out: str | Path,
     source: DataSource | None = None,
-    on_event: Callable[[TrainingProgress], None] | None = None,
+    progress: Progress = SILENT,
 ) -> Bundle:
     """Train a student of a run and write a run folder; an interrupted one goes on where it stopped.
 
@@ -90,7 +92,7 @@ def distil(
         request: what is made of it.
         out: run folder of the student.
         source: recordings to learn on; by default those of the run.
-        on_event: called with progress.
+        progress: receiver of the progress; its units are epochs.
 
     Raises:
         EdpError: not a run, a student that is no smaller, teachers that contradict one another, other data or settings
@@ -117,7 +119,8 @@ def distil(
     if order.on_rows(teachers):
         _refuse_settings_of_chunks(experiment.training, read_run(run)[1].training)
     student_experiment = replace(experiment, model=model, training=order.training(experiment.training))
-    return train(source or own, student_experiment, out, on_event, StrategyFactory(facts, strategy, frozen))
+    strategy_factory = StrategyFactory(facts, strategy, frozen)
+    return train(source or own, student_experiment, out, training_steps(progress), strategy_factory)
 
 
 def _refuse_settings_of_chunks(asked: TrainingSpec, before: TrainingSpec) -> None:

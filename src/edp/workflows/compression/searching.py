@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,16 @@ from edp.evaluation.controller import Budget
 from edp.logs.source import DataSource
 from edp.networks.narrow import width_of
 from edp.networks.predictor import Predictor
+from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, integer, shown
 from edp.signals import KINDS
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.ledger import Ledger
 from edp.storage.paths import is_file_at
 from edp.storage.runs import Run, check_claimable, run_key
-from edp.training import TrainingProgress, load_bundle
+from edp.training import load_bundle
 from edp.training.bundle import weights_digest
+from edp.training.progress_steps import training_steps
 from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import Bench, CompressionRequest
 from edp.workflows.compression.distil import frozen_sessions, order_facts, read_run
@@ -92,19 +94,6 @@ class CompressionSearchRequest:
     changes: tuple[Change, ...] = ()
 
 
-@dataclass(frozen=True)
-class CompressionCallbacks:
-    """Called on the way.
-
-    Attributes:
-        on_note: with a sentence.
-        on_training: with the name of a training, how many came before it and how many there are, and its event.
-    """
-
-    on_note: Callable[[str], None] = lambda text: None
-    on_training: Callable[[str, int, int, TrainingProgress], None] = lambda name, done, count, event: None
-
-
 class DiskBench(Bench):
     """A bench whose trainings are runs in a folder; finished ones are read, unfinished ones go on.
 
@@ -114,7 +103,9 @@ class DiskBench(Bench):
         experiment: settings of the teacher's run.
         source: where the recordings are.
         folder: for the runs.
-        callbacks: called on the way.
+
+    Attributes:
+        networks: stage of the progress whose units are networks.
     """
 
     def __init__(
@@ -124,24 +115,25 @@ class DiskBench(Bench):
         experiment: Experiment,
         source: DataSource,
         folder: Path,
-        callbacks: CompressionCallbacks,
     ) -> None:
         super().__init__(teacher, data, experiment.training)
         self.frozen: Mapping[str, str] = {}
-        self.experiment, self.source, self.folder, self.callbacks = experiment, source, folder, callbacks
-        self.done, self.count = 0, 0
+        self.experiment, self.source, self.folder = experiment, source, folder
+        self.networks: Progress = SILENT
+        self.done = 0
 
     def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
         """Carry out an order as a run, or read the run."""
         facts = order_facts(order) | {"teachers": [weights_digest(self.teacher)]}
         facts |= {"start": None if start is None else weights_digest(start)}
         run = self.folder / order.name
-        done, self.done = self.done, self.done + 1
+        self.done += 1
         # A finished run with the same facts is read: a search that goes on trains nothing twice.
         status = read_object(run / "status.json", ("status",))["status"] if is_file_at(run / "status.json") else ""
         if status == "finished":
             bundle = load_bundle(run)
             if bundle.provenance.get("strategy") == facts:
+                self.networks.step(self.done)
                 return bundle.predictor
 
         def strategy(data: Prepared) -> TrainingStrategy | DirectFit:
@@ -149,16 +141,12 @@ class DiskBench(Bench):
 
         model, training = order.model(self.teacher.spec), order.training(self.training)
         student_experiment = replace(self.experiment, model=model, training=training)
-        tell = self.callbacks.on_training
+        self.networks.note(order.name)
         strategy_factory = StrategyFactory(facts, strategy, self.frozen)
-        return train(
-            self.source,
-            student_experiment,
-            run,
-            lambda event: tell(order.name, done, self.count, event),
-            strategy_factory,
-            self.data,
-        ).predictor
+        listener = training_steps(self.networks)
+        bundle = train(self.source, student_experiment, run, listener, strategy_factory, self.data)
+        self.networks.step(self.done)
+        return bundle.predictor
 
 
 def search(
@@ -166,7 +154,7 @@ def search(
     request: CompressionSearchRequest,
     out: str | Path,
     source: DataSource | None = None,
-    callbacks: CompressionCallbacks | None = None,
+    progress: Progress = SILENT,
 ) -> CompressionResult:
     """Make smaller networks of a run, judge them in their formats, and choose the best that fits a budget.
 
@@ -179,7 +167,7 @@ def search(
         request: what is made of it.
         out: folder of the search, with a run for each network.
         source: recordings to learn, choose and judge on; by default those of the run.
-        callbacks: called on the way.
+        progress: receiver of the progress; its units are networks.
 
     Raises:
         EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a test set that was
@@ -189,9 +177,8 @@ def search(
     spec = request.spec
     teacher, experiment, own = read_run(run, request.changes)
     plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.recipes)
-    callbacks = callbacks or CompressionCallbacks()
     for note in plan.notes:
-        callbacks.on_note(note)
+        progress.note(note)
     frozen = frozen_sessions(run, experiment)
     data = prepare_data(source or own, experiment, frozen)
     held_out = _held_out_test_of(source or own, experiment, data)
@@ -199,11 +186,11 @@ def search(
     settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
     with Run.create(out, "compression", key, experiment_toml(experiment)) as folder:
-        bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), callbacks)
+        bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")))
         # A network judged in several formats is streamed in float only once.
         bench.frozen = frozen
         evaluator = _Evaluator(bench, spec.budget, Path(run), held_out.data)
-        rows, notes = _rows(bench, evaluator, plan, spec)
+        rows, notes = _rows(bench, evaluator, plan, spec, progress)
         front, chosen = choose(rows)
         result = CompressionResult(evaluator.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
         if result.best is not None:
@@ -250,11 +237,11 @@ def _held_out_test_of(source: DataSource, experiment: Experiment, data: Prepared
 
 
 def _rows(
-    bench: DiskBench, evaluator: _Evaluator, plan: CompressionPlan, spec: CompressionSearchSpec
+    bench: DiskBench, evaluator: _Evaluator, plan: CompressionPlan, spec: CompressionSearchSpec, progress: Progress
 ) -> tuple[list[Judged], list[str]]:
     """Every network in every format that it can be in, and what could not be."""
     names = _variants(bench) if spec.thesis else []
-    bench.count = plan.trainings + len(names)
+    bench.networks = progress.stage("network", plan.trainings + len(names))
     rows, notes = [], []
 
     def judge(order: CompressionRequest | None, network: Predictor, formats: Sequence[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from edp.jobs.packing import packed, unpacked
 from edp.jobs.units import UnitResult, WorkUnit, forget_units, run_units
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
+from edp.progress import SILENT, Progress
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path
 from edp.storage.provenance import read_provenance
@@ -30,7 +31,7 @@ def evaluate_with(
     run: str | Path,
     source: DataSource | None = None,
     baselines: Sequence[str] | None = None,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress = SILENT,
     at_most_h: float | None = None,
 ) -> Path:
     """As `edp.workflows.train_evaluate.evaluate`, by a workforce: models run side by side.
@@ -40,7 +41,7 @@ def evaluate_with(
         run: run folder; what was measured stays in it until the scores are written.
         source: other recordings.
         baselines: names; None takes those of the settings.
-        on_step: called with a sentence when a model is done.
+        progress: receiver of a sentence when a model is done.
         at_most_h: as in `evaluate`.
 
     Returns:
@@ -63,8 +64,7 @@ def evaluate_with(
         ]
 
         def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-            if on_step is not None:
-                on_step(f"{unit.arguments.get('model', NETWORK)}, {done} of {len(models) + parts}")
+            progress.note(f"{unit.arguments.get('model', NETWORK)}, {done} of {len(models) + parts}")
 
         results = run_units([*models, *runs], workforce, folder / UNITS, note)
         judged = {

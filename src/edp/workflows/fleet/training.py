@@ -15,12 +15,13 @@ from edp.errors import ConfigError
 from edp.jobs import Workforce
 from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.logs.source import DataSource
+from edp.progress import SILENT, Progress
 from edp.storage.ledger import TrainingIdentity
 from edp.storage.paths import full_path, is_file_at
 from edp.training import Diverged
 from edp.workflows.fleet.storing import keys_of
 from edp.workflows.pretraining import MetaSpec, Pretrain, pretrain
-from edp.workflows.transfer import FinetuneCallbacks, FinetuneRequest, FinetuneSpec, finetune
+from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 from edp.workflows.transfer.finetune import train_method, trained_methods
 
 DIVERGED = "diverged"
@@ -73,7 +74,7 @@ def finetune_with(
     logs: DataSource,
     order: FinetuneRequest,
     out: str | Path,
-    callbacks: FinetuneCallbacks | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """As `edp.workflows.transfer.finetune`, with a unit for each method that trains; this process judges them.
 
@@ -83,13 +84,12 @@ def finetune_with(
         logs: recordings of the target.
         order: methods and settings.
         out: run folder; what was trained in it goes on.
-        callbacks: called on the way.
+        progress: receiver of the progress; its units are methods.
 
     Raises:
         EdpError: as `finetune`; `UnitError` from elsewhere.
         Diverged: the training of the method that is kept diverged.
     """
-    callbacks = callbacks or FinetuneCallbacks()
     names = trained_methods(source, order)
     changes = [change if isinstance(change, str) else dict(change) for change in order.changes]
     where = {
@@ -104,11 +104,11 @@ def finetune_with(
         units.append(WorkUnit(f"{__name__}:train_method_there", label, arguments, keys_of(logs), where))
 
     def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-        callbacks.on_note(f"trained: {unit.arguments['name']}, {done} of {len(units)}")
+        progress.note(f"trained: {unit.arguments['name']}, {done} of {len(units)}")
 
     run_units(units, workforce, on_done=note)
     _check_seen(Path(out))
-    return finetune(source, logs, order, out, callbacks)
+    return finetune(source, logs, order, out, progress)
 
 
 def train_method_there(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any]:

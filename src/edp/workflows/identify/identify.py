@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,13 @@ from edp.networks.twin.grey.elements import Elements
 from edp.networks.twin.greybox import POLYNOMIALS, GreyBox, GreyTwin
 from edp.networks.twin.kinds import KINDS, AutoTwin
 from edp.networks.twin.residual import Residual
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.signals import Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine, parse_machine
 from edp.storage import check_writable, write_bytes, write_json
 from edp.storage.paths import is_there
-from edp.training.free_run import FreeRunProgress
 from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.identification.bodies import Poses, linked_bodies, realised
 from edp.training.identification.elements import (
@@ -46,13 +46,13 @@ from edp.training.identification.mapping import GreyParts
 from edp.training.identification.rows import TOLD, IdentifiedNumber, body_rows, line_comments, number_rows
 from edp.training.identification.stability import covariance
 from edp.training.identification.tie import MachineTie, deviations, kept_back, nearest
+from edp.training.progress_steps import free_run_steps
 from edp.training.twin_bundle import load_twin
 from edp.wording import figure
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 Doubles = NDArray[np.float64]
-Tell = Callable[[str], None]
 OIL = "OilTemperature"
 FREEZING = 273.15
 LAST_STAGES = 2
@@ -105,8 +105,7 @@ def identify(
     machine: str = "M22",
     experiment: TwinExperiment | None = None,
     run: str | Path | None = None,
-    on_event: Callable[[FreeRunProgress], None] | None = None,
-    on_step: Tell | None = None,
+    progress: Progress = SILENT,
 ) -> Identified:
     """Find the machine of the simulator whose numbers are those of the logs, and write its file.
 
@@ -118,20 +117,19 @@ def identify(
         machine: name or file of the guess; its pins, lengths and bores hold, and what the logs do not tell.
         experiment: settings of a grey box, its fit and the division of the logs; by default `GreyBox`'s.
         run: run folder of a grey box of these logs, in place of a fit.
-        on_event: called with progress of the fit.
-        on_step: called with what begins.
+        progress: receiver of what begins; the units of a fit are rounds.
 
     Raises:
         EdpError: logs, guess, settings or run that do not fit each other, or an identified machine that cannot be;
             nothing is written then.
     """
-    tell, target = on_step or (lambda text: None), _new_file(out)
+    target = _new_file(out)
     if run is not None and experiment is not None:
         raise ConfigError(
             f"--run {run} comes with settings; a run keeps its own: leave --config and --set out, or --run to fit anew"
         )
     base = load_machine(machine)
-    tell("reading logs")
+    progress.note("reading logs")
     recordings = source.read()
     loaded = None if run is None else _of_run(run)
     settings = experiment or load_twin_experiment(None, ["twin.kind=greybox"])
@@ -149,15 +147,15 @@ def identify(
     scales, judge = fit_scales(channels, data.train) if loaded is None else loaded[0].scales, settings.judge
     check_runs(channels, scales, grey.prefix_ticks, data.test, judge.seconds, judge.starts)
     if loaded is None:
-        fitted = _fitted(base, machine, grey, (channels, data, settings.training.seed), (on_event, tell))
+        fitted = _fitted(base, machine, grey, (channels, data, settings.training.seed), progress)
     else:
         check_same_linkage(loaded[0], base, machine)
         fitted = _informed(loaded[0], data, settings.training.seed)
     parts = parts_of(fitted.twin, fitted.elements, base, celsius)
     notes += _notes(parts)
-    tell("fitting the machine itself to free runs")
-    fit = _refined(base, parts, fitted, (data, settings), on_event)
-    tell("asking what parts of the logs, and runs of other lengths, would say")
+    progress.note("fitting the machine itself to free runs")
+    fit = _refined(base, parts, fitted, (data, settings), progress)
+    progress.note("asking what parts of the logs, and runs of other lengths, would say")
     spread = covariance(fit.twin, fit.tie, fit.theta, data.train, settings.training.seed)
     machine_found, rows, doubts = _machine(fit, spread, data)
     notes += doubts
@@ -171,7 +169,7 @@ def identify(
             f"the identified machine cannot be ({error}); the logs do not fit machine {base.name}: check units, map, "
             "and pins and bores of --machine"
         ) from error
-    tell("driving both machines by the commands of held-out recordings")
+    progress.note("driving both machines by the commands of held-out recordings")
     scores = _scores(fitted, (base, written), parts, (data, settings))
     write_bytes(target, text.encode())
     facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
@@ -231,14 +229,13 @@ def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
 
 
 def _fitted(
-    base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], report: Any
+    base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], progress: Progress
 ) -> _Fitted:
     """A grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed.
 
     `machine` is the name or file of `base`.
     """
     channels, data, seed = logs
-    on_event, tell = report
     elements = excavator_elements(channels, base)
     full = np.array(full_commands(channels, elements, base), np.float32)
     spec = replace(spec, cylinders=elements.cylinders, valves=elements.valves, pumps=elements.pumps)
@@ -246,8 +243,8 @@ def _fitted(
     spec = replace(spec, linkage=machine) if spec.degrees == POLYNOMIALS else spec
     begun = spec.start(channels, fit_scales(channels, data.train), data.train, seed)
     twin = GreyTwin(channels, begun.scales, spec, (begun.table, begun.wiring), begun.numbers, full)
-    tell("fitting a grey box to free runs")
-    fit = fit_grey_box(twin, data.train, data.validation, seed, on_event)
+    progress.note("fitting a grey box to free runs")
+    fit = fit_grey_box(twin, data.train, data.validation, seed, free_run_steps(progress))
     return _Fitted(fit.twin, elements, fit.information)
 
 
@@ -267,7 +264,7 @@ def _refined(
     parts: GreyParts,
     fitted: _Fitted,
     logs: tuple[Prepared, TwinExperiment],
-    on_event: Callable[[FreeRunProgress], None] | None,
+    progress: Progress,
 ) -> _Tied:
     """The machine fitted to free runs through its grey box."""
     data, settings = logs
@@ -278,7 +275,7 @@ def _refined(
     twin = fitted.twin
     spec = replace(twin.spec, fit=last)
     tied = GreyTwin(twin.channels, twin.scales, spec, (twin.table, twin.wiring), tie.numbers(tie.begin), twin.full)
-    result = fit_grey_box(tied, data.train, data.validation, settings.training.seed + 1, on_event, tie)
+    result = fit_grey_box(tied, data.train, data.validation, settings.training.seed + 1, free_run_steps(progress), tie)
     every = replace(twin.spec, fit=fit)
     end = GreyTwin(twin.channels, twin.scales, every, (twin.table, twin.wiring), tie.numbers(result.theta), twin.full)
     return _Tied(end, tie, result.theta, result.information)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,15 @@ from edp.errors import BundleError, ConfigError
 from edp.evaluation.context import Contexts, context_errors
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
+from edp.progress import SILENT, Progress
 from edp.storage import write_json
 from edp.storage.runs import Run, check_claimable
-from edp.training import TrainingProgress, load_bundle
+from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.pretraining.methods import PRETRAININGS
 from edp.training.pretraining.methods.base import HasModel
 from edp.training.pretraining.spec import MetaSpec
+from edp.training.progress_steps import training_steps
 from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
 
 RESULT = "foundation.json"
@@ -58,8 +59,7 @@ def pretrain(
     experiment: Experiment,
     order: Pretrain,
     out: str | Path,
-    on_event: Callable[[TrainingProgress], None] | None = None,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Train one network over many machines and judge it on others; the same call goes on after a stop.
 
@@ -70,8 +70,7 @@ def pretrain(
         experiment: the settings, with a split by machine.
         order: the method.
         out: run folder.
-        on_event: called with progress of the training.
-        on_step: called with a sentence before each step of the judgement.
+        progress: receiver of the progress; the units of the training are epochs.
 
     Returns:
         The content of ``foundation.json``: machines of each part and errors by context on those that test.
@@ -102,9 +101,8 @@ def pretrain(
         chosen = strategy
         strategy_factory = StrategyFactory(facts, lambda prepared: chosen, frozen)
     with Run(out, "pretraining") as run:
-        network = train(source, experiment, run, on_event, strategy_factory, data).predictor
-        if on_step is not None:
-            on_step("judging on machines that were never seen")
+        network = train(source, experiment, run, training_steps(progress), strategy_factory, data).predictor
+        progress.note("judging on machines that were never seen")
         contexts = context_errors(network, data.test, data.target_kinds)
         result = _result(order, experiment, data, contexts)
         write_json(run.file(RESULT), result)

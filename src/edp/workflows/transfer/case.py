@@ -14,9 +14,10 @@ from edp.data.series import Series
 from edp.logs.source import DataSource
 from edp.networks.losses import Smoothness
 from edp.networks.predictor import Predictor
+from edp.progress import SILENT, Progress
 from edp.storage.runs import Run
-from edp.training import TrainingProgress
 from edp.training.optimizers import OptimizerSpec, Soap
+from edp.training.progress_steps import training_steps
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import TrainingStrategy
 from edp.training.transfer.centring import Centred
@@ -39,7 +40,7 @@ class TransferCase:
         experiment: settings of the source with the target's split.
         spec: phases, rates and regularisers.
         folder: of the method's run, or that run, opened.
-        tell: called with the name of a training and its event.
+        progress: receiver of the progress of its trainings.
     """
 
     source: SourceModel
@@ -48,7 +49,7 @@ class TransferCase:
     experiment: Experiment
     spec: FinetuneSpec
     folder: Path | Run
-    tell: Callable[[str, TrainingProgress], None]
+    progress: Progress = SILENT
 
     def train(
         self,
@@ -84,11 +85,10 @@ class TransferCase:
         experiment = replace(self.experiment, training=training)
         own = self.folder.path if isinstance(self.folder, Run) else self.folder
         folder = own / "phases" / phase if phase else self.folder
+        progress = self.progress.stage(phase) if phase else self.progress
         # The source's validation part counts too where both domains are to be kept.
         data = replace(self.data, validation=[*self.data.validation, *judged])
-        return train(
-            self.logs, experiment, folder, lambda event: self.tell(name, event), strategy_factory, data
-        ).predictor
+        return train(self.logs, experiment, folder, training_steps(progress), strategy_factory, data).predictor
 
     def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:
         """How a network is trained on, see `tuned`."""

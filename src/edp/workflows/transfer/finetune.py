@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,11 +18,12 @@ from edp.data.prepared import Prepared, prepare
 from edp.errors import ConfigError
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
+from edp.progress import SILENT, Progress
 from edp.signals import KINDS
 from edp.storage import write_bytes, write_json
 from edp.storage.headers import FILES, digests_of
 from edp.storage.runs import Run, check_claimable
-from edp.training import Diverged, TrainingProgress
+from edp.training import Diverged
 from edp.training.bundle import weights_digest
 from edp.training.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
 from edp.training.transfer.spec import FinetuneSpec
@@ -36,21 +36,6 @@ KIND, RESULT, SHOWN = "transfer", "transfer.json", "transfer_predictions.safeten
 BEFORE = "direct"
 RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
 """Methods by their former names; ``edp replay`` judges a log with an adapted network and mixes no data."""
-
-
-@dataclass(frozen=True)
-class FinetuneCallbacks:
-    """Called on the way.
-
-    Attributes:
-        on_note: with a sentence.
-        on_training: with the name of a training and its event.
-        on_method: with the name of a method before it begins, how many came before it and how many there are.
-    """
-
-    on_note: Callable[[str], None] = lambda text: None
-    on_training: Callable[[str, TrainingProgress], None] = lambda name, event: None
-    on_method: Callable[[str, int, int], None] = lambda name, done, count: None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +82,7 @@ def finetune(
     logs: DataSource,
     order: FinetuneRequest,
     out: str | Path,
-    callbacks: FinetuneCallbacks | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Train a network of one machine on for another, judge it beside baselines, and write a run folder.
 
@@ -109,7 +94,7 @@ def finetune(
         logs: recordings of the target.
         order: methods and settings.
         out: run folder.
-        callbacks: called on the way.
+        progress: receiver of the progress; its units are methods.
 
     Returns:
         The content of ``transfer.json``.
@@ -119,20 +104,20 @@ def finetune(
         Diverged: the training of the method that is kept diverged.
     """
     check_claimable(out, KIND)
-    callbacks = callbacks or FinetuneCallbacks()
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
     names, notes = _able(begun, order)
     data, repair_notes = target_data(begun, logs, experiment, order)
     notes += repair_notes
     for note in notes:
-        callbacks.on_note(note)
+        progress.note(note)
     results: dict[str, Made] = {}
     with Run(out, KIND) as run:
+        methods = progress.stage("method", len(names))
         for number, name in enumerate(names):
-            callbacks.on_method(name, number, len(names))
+            methods.note(name)
             folder = run if name == order.method else _baseline_folder(run.path, name)
-            case = TransferCase(begun, logs, data, experiment, order.spec, folder, callbacks.on_training)
+            case = TransferCase(begun, logs, data, experiment, order.spec, folder, methods)
             try:
                 results[name] = METHODS[name]().make(case)
             except Diverged as end:
@@ -140,7 +125,8 @@ def finetune(
                 if name == order.method:
                     raise
                 notes.append(f"{METHODS[name].label} is left out: {end}")
-                callbacks.on_note(notes[-1])
+                progress.note(notes[-1])
+            methods.step(number + 1)
         result, shown = _result(begun, data, experiment, order, results)
         result |= {"logs": logs.label, "notes": notes}
         write_bytes(run.file(SHOWN), save(shown))
@@ -180,7 +166,7 @@ def train_method(source: str | Path, logs: DataSource, order: FinetuneRequest, o
     experiment = target_experiment(begun, order.changes)
     data, _ = target_data(begun, logs, experiment, order)
     with Run(out, KIND) if name == order.method else nullcontext(_baseline_folder(Path(out), name)) as folder:
-        case = TransferCase(begun, logs, data, experiment, order.spec, folder, lambda training, event: None)
+        case = TransferCase(begun, logs, data, experiment, order.spec, folder)
         METHODS[name]().make(case)
 
 

@@ -184,7 +184,7 @@ class TwinChoice:
                 with part_of(self.run, self._part(name, which)) as own:
                     yield replace(self._whole, data=data).fitted(spec, own)
 
-        self.fit.tell(f"fitting {name}")
+        self.fit.progress.note(f"fitting {name}")
         return [self._attempt(described(spec), spec, fitted, rival, FAR_BEHIND)]
 
     def _recurrent(self) -> list[TwinCandidate]:
@@ -244,10 +244,10 @@ class TwinChoice:
                 seeded = replace(training, seed=seed)
                 jobs.append(MemberTraining(label, member, fold.train, fold.validation, seeded, folder))
             for which, fit in zip(some, whole.train_members(jobs, whole.on_event), strict=True):
-                self.fit.tell(f"trained {label}: fold {which + 1} of {len(self.folds)}")
+                self.fit.progress.note(f"trained {label}: fold {which + 1} of {len(self.folds)}")
                 yield FittedFormulation(form.alone(), fit)
 
-        self.fit.tell(f"training {label}")
+        self.fit.progress.note(f"training {label}")
         return self._attempt(label, form, fitted, rival, most)
 
     def _part(self, name: str, which: int) -> str:

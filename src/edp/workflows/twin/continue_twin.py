@@ -184,7 +184,7 @@ class ContinuedTwin:
         training = shortened(self.fit.experiment.training, share)
         train, validation = self.fit.data.train, self.fit.data.validation
         label = f"{sum(training.updates):,} further updates"
-        self.fit.tell(label)
+        self.fit.progress.note(label)
         jobs = []
         for which, member in enumerate(separated(start)):
             own = member.static and member.static.refitted(train)

@@ -18,12 +18,14 @@ from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.residual import Residual, ResidualTwin
+from edp.progress import SILENT, Progress
 from edp.sandbox.helpers import Helpers
 from edp.storage.runs import KeyedRun
 from edp.training.elements_fit import fit_elements
 from edp.training.free_run import FittedTwin, FreeRunProgress
 from edp.training.free_run_members import MemberTraining, fit_members, noted_progress, noting_member, one_by_one
 from edp.training.grey_fit import fit_grey_box
+from edp.training.progress_steps import free_run_steps
 from edp.training.residual_fit import fit_residual
 
 
@@ -56,8 +58,7 @@ class TwinFit:
         scales: fitted to the training part.
         data: prepared series.
         experiment: the settings.
-        on_event: called with progress of a training on free runs.
-        tell: called with what begins.
+        progress: receiver of what begins; the units of a training are updates.
         helpers: processes that train members of an average side by side; none: one after the other.
     """
 
@@ -65,9 +66,13 @@ class TwinFit:
     scales: TwinScales
     data: Prepared
     experiment: TwinExperiment
-    on_event: Callable[[FreeRunProgress], None] | None
-    tell: Callable[[str], None]
+    progress: Progress = SILENT
     helpers: Helpers | None = None
+
+    @property
+    def on_event(self) -> Callable[[FreeRunProgress], None]:
+        """Listener of the trainings."""
+        return free_run_steps(self.progress)
 
     def fitted(self, spec: TwinSpec, run: KeyedRun | None) -> FittedFormulation:
         """One formulation, fitted.
@@ -77,7 +82,7 @@ class TwinFit:
         """
         seed, parts = self.experiment.training.seed, (self.data.train, self.data.validation)
         if isinstance(spec, Recurrent):
-            self.tell("training on free runs")
+            self.progress.note("training on free runs")
             static = spec.static_map(self.channels, self.scales, self.data.train)
             shared = (self.channels, self.scales, static)
             training = self.experiment.training
@@ -86,22 +91,22 @@ class TwinFit:
         started = time.process_time()
         twin = spec.start(self.channels, self.scales, self.data.train, seed)
         if isinstance(twin, ElementsTwin):
-            self.tell("fitting the elements to free runs")
+            self.progress.note("fitting the elements to free runs")
             lumped = fit_elements(twin, *parts, seed, self.on_event)
             return FittedFormulation(spec, FittedTwin(lumped.twin, lumped.history, lumped.seconds), lumped.rows)
         if not isinstance(twin, GreyTwin):
             return FittedFormulation(spec, FittedTwin(twin, [], time.process_time() - started))
-        self.tell("fitting the grey box to free runs")
+        self.progress.note("fitting the grey box to free runs")
         grey = fit_grey_box(twin, *parts, seed, self.on_event)
         numbers = datasheet(grey.twin.table, grey.twin.numbers, grey.information)
         # With as many stretches as were chosen: a bundle says how many numbers it has.
         settled = grey.twin.spec
         if not (isinstance(grey.twin, ResidualTwin) and isinstance(spec, Residual)):
             return FittedFormulation(settled, FittedTwin(grey.twin, grey.history, grey.seconds), numbers)
-        self.tell("training the network on top of the grey box")
+        self.progress.note("training the network on top of the grey box")
         network = fit_residual(grey.twin, spec, *parts, self.experiment.training, self.on_event, run)
         if not network.helps:
-            self.tell("the network does not help on the validation part: the grey box stays alone")
+            self.progress.note("the network does not help on the validation part: the grey box stays alone")
         fitted = FittedTwin(network.twin, grey.history + network.history, grey.seconds + network.seconds)
         return FittedFormulation(settled, fitted, numbers, {"residual": network.facts()})
 

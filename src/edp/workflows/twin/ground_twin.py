@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from edp.networks.twin import TWINS
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
 from edp.networks.twin.grey.ground import check_grounded
 from edp.networks.twin.greybox import GreyBox
+from edp.progress import SILENT, Progress
 from edp.storage import object_with, read_json, write_bytes, write_json
 from edp.storage.paths import is_file_at
 from edp.storage.runs import Run, run_key
@@ -37,7 +37,7 @@ def ground_twin(
     experiment: TwinExperiment,
     out: str | Path,
     start: str | Path | None,
-    tell: Callable[[str], None],
+    progress: Progress = SILENT,
 ) -> tuple[TwinBundle, bool]:
     """Fit a law of the ground and write a run folder: the twin of `start` with it, settings, datasheet.
 
@@ -48,7 +48,7 @@ def ground_twin(
         experiment: settings that name a ground.
         out: run folder; a finished one is read.
         start: run folder of a grey box with a known linkage.
-        tell: called with what begins.
+        progress: receiver of what begins.
 
     Returns:
         The twin, and whether it was finished before.
@@ -58,14 +58,14 @@ def ground_twin(
     """
     base, linkage = _base(start)
     experiment = base.settled(experiment)
-    tell("reading recordings")
+    progress.note("reading recordings")
     channels, data = prepared_twin(source.read(), experiment)
     base.check(channels, data.train)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment), "from": base.digest}, data.digest)
     with Run.create(out, "twin", key, twin_toml(experiment)) as run:
         if run.is_finished:
             return load_twin(run.path), True
-        tell(f"fitting the ground '{experiment.ground}' to forces along the logs")
+        progress.note(f"fitting the ground '{experiment.ground}' to forces along the logs")
         twin = check_grounded(base.bundle.twin)
         fitted = fit_ground(experiment.ground, twin, data.train, data.validation, linkage)
         rows = [*_known_rows(base.folder), *fitted.law.rows()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor, describe
 from edp.networks.running import stream_predictions
 from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinSpec
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.signals import KINDS, Channel
 from edp.storage import check_writable, make_folder, write_bytes, write_json
@@ -49,7 +50,7 @@ def judge_twin(
     experiment: TwinExperiment,
     data: Prepared,
     labels: Mapping[str, str],
-    tell: Callable[[str], None],
+    progress: Progress = SILENT,
 ) -> tuple[dict[str, Any], FreeRuns]:
     """Scores of a twin and its floors on the test part, by label, and the free runs of the twin.
 
@@ -59,17 +60,17 @@ def judge_twin(
             has seen both.
         data: prepared series.
         labels: see `driving_labels`.
-        tell: called with what begins.
+        progress: receiver of what begins.
     """
     twin, spec = bundle.twin, experiment.judge
-    tell("free runs of the twin")
+    progress.note("free runs of the twin")
     runs = free_runs(twin, data.test, spec.seconds, spec.starts)
     scores = {"twin": free_run_scores(runs, spec, bundle.intervals, labels) | _ahead(twin, data, spec)}
     inputs = [part.inputs for part in data.test]
     if beyond := commands_beyond(bundle.provenance.get(RANGES), twin.channels, inputs):
         scores["twin"]["beyond"] = beyond
     for name in spec.floors:
-        tell(f"free runs of {name}")
+        progress.note(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
         taught, seed = [*data.train, *data.validation], experiment.training.seed
         try:
@@ -77,7 +78,7 @@ def judge_twin(
             floor_runs = free_runs(floor, data.test, spec.seconds, spec.starts)
         except (ConfigError, DataError, NotFiniteError) as problem:
             # What such a log is too short for is no rival on it, and no reason to have no twin.
-            tell(f"the floor {name} is left out: {problem}")
+            progress.note(f"the floor {name} is left out: {problem}")
             continue
         scores[name] = free_run_scores(floor_runs, spec, None, labels) | _ahead(floor, data, spec)
     return scores, runs
@@ -146,7 +147,7 @@ def evaluate_twin(
     run: str | Path,
     source: DataSource | None = None,
     predictor_run: str | Path | None = None,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress = SILENT,
 ) -> Path:
     """Judge a twin anew: on its held-out recordings, or on other ones, all of which are judged.
 
@@ -154,7 +155,7 @@ def evaluate_twin(
         run: run folder of a twin.
         source: other recordings.
         predictor_run: run folder of a look-ahead predictor; its error stands beside the twin's, at the same moments.
-        on_step: called with what begins.
+        progress: receiver of what begins.
 
     Returns:
         The folder with ``free_run.json``: the run folder, or one in it for `source`.
@@ -162,12 +163,11 @@ def evaluate_twin(
     Raises:
         EdpError: no twin, recordings that changed since, or a predictor that predicts nothing that the twin answers.
     """
-    tell = on_step or (lambda text: None)
     folder = Path(run)
     bundle = load_twin(folder)
     check_writable(folder)
     experiment = load_twin_experiment(folder / "config.toml")
-    tell("reading recordings")
+    progress.note("reading recordings")
     recordings = DataSource.from_plain(bundle.provenance["data"]["reader"]).read()
     channels, data = prepared_twin(recordings, experiment)
     if data.digest != bundle.provenance["data"]["digest"]:
@@ -181,9 +181,9 @@ def evaluate_twin(
         recordings = [matched(channels, recording) for recording in source.read()]
         data = replace(data, test=[channels.task().series(recording) for recording in recordings])
         target = make_folder(folder / f"on_{source.short_name}")
-    scores, runs = judge_twin(bundle, experiment, data, driving_labels(recordings), tell)
+    scores, runs = judge_twin(bundle, experiment, data, driving_labels(recordings), progress)
     if predictor_run is not None:
-        tell("the look-ahead predictor")
+        progress.note("the look-ahead predictor")
         beside = beside_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.judge)
         scores["twin"]["beside"] = beside
     write_scores(target, scores, runs, bundle.intervals)

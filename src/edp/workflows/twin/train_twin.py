@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.networks.twin.recurrent_members import scales_for
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
@@ -33,7 +34,6 @@ from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
-from edp.training.free_run import FreeRunProgress
 from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import OIL_C, STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
@@ -68,8 +68,7 @@ def train_twin(
     source: DataSource,
     experiment: TwinExperiment,
     out: str | Path,
-    on_event: Callable[[FreeRunProgress], None] | None = None,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress = SILENT,
     workers: int = 1,
     start: str | Path | None = None,
 ) -> TrainedTwin:
@@ -80,8 +79,7 @@ def train_twin(
         source: where the recordings are.
         experiment: the settings.
         out: run folder.
-        on_event: called with progress of the training.
-        on_step: called with what begins.
+        progress: receiver of what begins; the units of a training are updates.
         workers: processes that train the networks of an average side by side; 0 for one a core. The twin has the same
             bits with any number.
         start: run folder of a recurrent twin that goes on with these recordings, or with a `ground` of a grey box
@@ -91,11 +89,10 @@ def train_twin(
         EdpError: the recordings, settings or folder cannot be used; what was on disk stays.
     """
     check_claimable(out, "twin")
-    tell = on_step or (lambda text: None)
     if experiment.ground:
-        grounded, finished = ground_twin(source, experiment, out, start, tell)
+        grounded, finished = ground_twin(source, experiment, out, start, progress)
         return TrainedTwin(grounded, dict(grounded.scores), finished)
-    tell("reading recordings")
+    progress.note("reading recordings")
     base = None if start is None else BaseTwin.of(start)
     if base is not None:
         experiment = base.settled(experiment)
@@ -114,14 +111,14 @@ def train_twin(
         if run.is_finished:
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
-        fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell, helpers)
+        fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, progress, helpers)
         result = _chosen(fit, KeyedRun(run, key), base)
         fitted = result.fitted
         run.write_history(fitted.history)
         if result.datasheet:
             write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": result.datasheet})
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
-        tell("calibrating intervals")
+        progress.note("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
         provenance = (
             training_provenance(source, data, experiment.training.seed, 1, fitted.seconds)
@@ -132,7 +129,7 @@ def train_twin(
         before = None if base is None else base.bundle.provenance.get(RANGES)
         provenance[RANGES] = command_ranges(channels, [*data.train, *data.validation], before)
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
-        scores, runs = judge_twin(bundle, experiment, data, labels, tell)
+        scores, runs = judge_twin(bundle, experiment, data, labels, progress)
         write_scores(run.path, scores, runs, intervals)
         write_json(run.path / STEPS, step_responses(bundle.twin, data.test))
         bundle = replace(bundle, scores=scores)
