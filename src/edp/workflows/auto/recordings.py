@@ -20,7 +20,7 @@ from edp.logs.source import DataSource
 from edp.recording import FloatArray, Recording
 from edp.signals import Kind
 from edp.storage.memory import check_setting
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.auto.candidates import LEAST_SPAN, Amount, Foundation
 from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.train_evaluate import prepare_data
@@ -122,7 +122,7 @@ def divide(recordings: Sequence[Recording], settings: AutoSettings) -> tuple[Aut
     if uneven is not None:
         blocks, why = uneven
         return replace(settings, split=blocks), [
-            f"{why[0].upper()}{why[1:]}: blocks of {figure(blocks.block_s, 3)} s test in turn (split.kind decides "
+            f"{why[0].upper()}{why[1:]}: blocks of {typed(blocks.block_s, 3)} s test in turn (split.kind decides "
             "otherwise)."
         ]
     return replace(settings, split=by_time), []
@@ -241,7 +241,7 @@ def check_size(data: Prepared) -> None:
     outputs = len(data.task.horizons) * len(data.task.targets)
     check_setting(
         8 * COPIES * ticks * outputs,
-        f"the preset auto, which compares its candidates on all {figure(ticks / data.task.rate_hz / 3600)} h of "
+        f"the preset auto, which compares its candidates on all {typed(ticks / data.task.rate_hz / 3600)} h of "
         "training",
         "train with --preset standard, which reads a store piece by piece, or give a data-set file of some logs",
     )
