@@ -18,16 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from common import (
-    DATA,
-    WORK,
-    Bench,
-    PrintedProgress,
-    benchmark,
-    kept,
-    option,
-    table,
-)
+from common import DATA, WORK, Bench, PrintedProgress, benchmark, kept, option, table
 from edp.config.twin import load_twin_experiment
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
