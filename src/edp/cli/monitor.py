@@ -109,7 +109,8 @@ def fit(
         spent = f"{duration(fitted.seconds)} of processor time"
         if workers != 1:
             spent = f"{duration(facts['wall_s'])} by {facts['workers']} processes"
-        out.print(f"fitted in {spent}; monitor in {folder}")
+        fitted_text = "was fitted before, nothing to do" if fitted.is_read else f"fitted in {spent}"
+        out.print(f"{fitted_text}; monitor in {folder}")
         out.print(f"next: edp monitor run {folder} LOGS")
 
     emit(as_json, facts, show)

@@ -17,7 +17,7 @@ from edp.monitor.monitor import Monitor
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.signals import KINDS, Channel
-from edp.wording import figure
+from edp.wording import figure, percent
 
 FOUND_SHARE = 0.8
 """Fraction of the trials in which a change of the stated size must be found."""
@@ -111,7 +111,7 @@ class FoundSize:
 
     def sentence(self) -> str:
         """Return the finding in words."""
-        share = f"{self.share:.0%} of {self.trials} trial{'s' if self.trials > 1 else ''}"
+        share = f"{percent(self.share)} of {self.trials} trial{'s' if self.trials > 1 else ''}"
         what = f"a {self.change} of {self.channel} by {self.amount()}"
         if self.within_s is None:
             return f"{what}, the largest tried, is found in {share} only"
@@ -333,7 +333,7 @@ def unseen_line(sizes: Sequence[FoundSize]) -> str:
         parts.append(f"a {rows[0].change} {named}{', and others' if len(rows) > _SHOWN else ''}")
     return (
         f"with {figure(sizes[0].minutes, 3)} healthy minutes {'; '.join(parts)} would not have been found in "
-        f"{FOUND_SHARE:.0%} of trials"
+        f"{percent(FOUND_SHARE)} of trials"
     )
 
 

@@ -25,7 +25,7 @@ from edp.logs.proposal.names import (
     words_of,
 )
 from edp.signals import TABLE_A1, VOCABULARY, ChannelMap, Kind, SignalMap
-from edp.wording import typed
+from edp.wording import percent, typed
 
 SURE = 0.85
 """Confidence from which nothing needs to be checked."""
@@ -229,7 +229,7 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
     """A column that holds no motion: a constant, a counter, a label; None for all others."""
     if behaviour.beside and not is_known(name):
         return ColumnGuess(
-            name, "", "remark", _NO_KIND, 0.85, f"filled in {behaviour.filled:.1%} of the rows", "not taken"
+            name, "", "remark", _NO_KIND, 0.85, f"filled in {percent(behaviour.filled)} of the rows", "not taken"
         )
     if behaviour.constant:
         value = _EMPTY if not behaviour.filled else f"always {typed(behaviour.high)}"

@@ -41,7 +41,7 @@ from edp.monitor.residuals.flow_curves import (
 from edp.monitor.residuals.flow_fit import fit_chambers, fit_oil_range
 from edp.recording import Recording
 from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
-from edp.wording import figure
+from edp.wording import figure, percent
 
 PREFIX = "flow:"
 NUMBERS = ("values", "slopes", "lines", "doubts")
@@ -149,7 +149,7 @@ class FlowBalances(ResidualSource):
         if not share:
             return ""
         return (
-            f"balances of flow are silent in {share:.0%} of it: '{name}' is outside {figure(self.oil.low)} to "
+            f"balances of flow are silent in {percent(share)} of it: '{name}' is outside {figure(self.oil.low)} to "
             f"{figure(self.oil.high)} K, which healthy logs cover"
         )
 

@@ -53,7 +53,7 @@ from edp.training.identification.tie import MachineTie, deviations, kept_back, n
 from edp.training.progress_steps import free_run_steps
 from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
-from edp.wording import typed
+from edp.wording import percent, typed
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
 from edp.workflows.twin.prepare_twin import prepared_twin
 
@@ -395,7 +395,7 @@ def _notes(parts: GreyParts) -> list[str]:
         notes.append("commands of second spools are not logged: conflux_extend and conflux_retract are 0 there")
     far = [share for share in parts.reach if share < 0.9]
     if far:
-        notes.append(f"commands reach {min(far):.0%} of the full pilot only; curves beyond are extrapolated")
+        notes.append(f"commands reach {percent(min(far))} of the full pilot only; curves beyond are extrapolated")
     notes.append("masses are not told apart from where they sit: inertia and gravity of the joints are")
     notes.append("pump flow and power are told times the volumetric efficiency, which is the guess's")
     return notes
@@ -436,7 +436,7 @@ def _head(base: Machine, rows: Sequence[IdentifiedNumber], notes: Sequence[str])
     return [
         f"Identified from logs by edp identify: {told_count} of {len(rows)} numbers are told, {rough_count} roughly.",
         "Behind a number: an approximate 95 % interval, from how far parts of the logs and runs of other lengths",
-        f"differ ('roughly' where it is wider than {TOLD:.0%}), or that the number is kept. Numbers without a comment",
-        f"are those of machine {base.name}, bodies but for their lengths excepted.",
+        f"differ ('roughly' where it is wider than {percent(TOLD)}), or that the number is kept. Numbers without a",
+        f"comment are those of machine {base.name}, bodies but for their lengths excepted.",
         *notes,
     ]

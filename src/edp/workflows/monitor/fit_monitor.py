@@ -59,6 +59,7 @@ class FittedMonitor:
         seconds: processor time of this process.
         folder: where it lies; None where it was not saved.
         sessions: blocks of those that set the limit.
+        is_read: whether the folder held the finished monitor already.
         one_machine: it knows the machine of the logs so well that others of its series raise alarms.
     """
 
@@ -68,6 +69,7 @@ class FittedMonitor:
     folder: Path | None = None
     sessions: tuple[SessionBlocks, ...] = ()
     one_machine: bool = False
+    is_read: bool = False
 
     @property
     def finds(self) -> list[str]:
@@ -128,7 +130,8 @@ def _read_fitted(folder: Path, experiment: MonitorExperiment) -> FittedMonitor:
     monitor = load_monitor(folder)
     provenance = monitor.provenance
     alone = _fits_one_machine(experiment, monitor.sources)
-    return FittedMonitor(monitor, tuple(provenance["doubtful"]), provenance["seconds"], folder, one_machine=alone)
+    doubtful, seconds = tuple(provenance["doubtful"]), provenance["seconds"]
+    return FittedMonitor(monitor, doubtful, seconds, folder, one_machine=alone, is_read=True)
 
 
 def _fits_one_machine(experiment: MonitorExperiment, sources: Sequence[ResidualSource]) -> bool:
