@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.features import Derived, FeatureSet
@@ -377,9 +378,9 @@ def test_a_disk_that_fills_while_a_store_is_built_loses_nothing(logs, tmp_path, 
     with pytest.raises(StorageError, match=r"No space left on device; free space"):
         DataSource.of(logs).store(tmp_path / "new")
     monkeypatch.setattr(building, "_stored", real)
-    reached = []
-    DataSource.of(logs).store(tmp_path / "new", on_progress=reached.append)
-    assert reached[0].logs == 3
+    reached = NotedProgress()
+    DataSource.of(logs).store(tmp_path / "new", progress=reached)
+    assert reached.steps[0] == 3
     assert [one.digest for one in read_store(tmp_path / "new")] == [one.digest for one in read_data_set(logs)]
 
 

@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.data.features import FeatureSet
 from edp.data.prepared import prepare
@@ -158,12 +159,12 @@ def test_a_log_that_cannot_be_read_is_listed_and_tried_again(logs, tmp_path):
 def test_a_damaged_record_of_a_stopped_build_is_made_again(logs, tmp_path, monkeypatch, damage):
     monkeypatch.setattr("edp.logs.store.building.BATCH_LOG_BYTES", 1)
 
-    def stop(progress):
-        if progress.logs == 2:
+    def stop(done, **values):
+        if done == 2:
             raise Stopped
 
     with pytest.raises(Stopped):
-        build(logs, tmp_path / "store", on_progress=stop)
+        build(logs, tmp_path / "store", progress=NotedProgress(stop))
     record = sorted((tmp_path / "store" / "rows").glob("*.json"))[0]
     if isinstance(damage, bytes):
         record.write_bytes(damage)
@@ -189,18 +190,18 @@ class Stopped(Exception):
 def test_a_build_that_was_stopped_goes_on(logs, tmp_path, monkeypatch, after):
     monkeypatch.setattr("edp.logs.store.building.BATCH_LOG_BYTES", 1)
 
-    def stop(progress):
-        if progress.logs >= after:
+    def stop(done, **values):
+        if done >= after:
             raise Stopped
 
     with pytest.raises(Stopped):
-        build(logs, tmp_path / "store", on_progress=stop)
+        build(logs, tmp_path / "store", progress=NotedProgress(stop))
     assert is_store(tmp_path / "store")
     with pytest.raises(DataError, match=r"is half built: .* give the same `edp store build` again"):
         DataSource.of(tmp_path / "store").read()
-    reached = []
-    build(logs, tmp_path / "store", on_progress=reached.append)
-    assert reached[0].logs == after
+    reached = NotedProgress()
+    build(logs, tmp_path / "store", progress=reached)
+    assert reached.steps[0] == after
     assert_same(read_store(tmp_path / "store"), read_data_set(logs))
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
 from edp.cli.progress import shown_progress
 from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, source_of
@@ -114,12 +114,10 @@ def _finetune_fleet(
     bundle: Path, store: Path, folder: Path, order: PersonalOrder, workforce: Workforce, as_json: bool
 ) -> None:
     """Fine-tune for every machine of a store, with a progress display, and print what it came to."""
-    from edp.cli.fleet import MachineDisplay
     from edp.workflows.fleet.personal import errors_by_machine, finetune_fleet
 
-    with progress(as_json) as shown:
-        on_machine = MachineDisplay(shown, Steps(as_json), "finetune").on_machine
-        content = finetune_fleet(workforce, bundle, store, order, folder, on_machine)
+    with shown_progress("finetune", as_json) as progress:
+        content = finetune_fleet(workforce, bundle, store, order, folder, progress)
 
     def show() -> None:
         rows = [(name, *(figure(error) for error in errors)) for name, *errors in errors_by_machine(content)]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.progress import shown_progress
 from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.storage.paths import full_path
 
@@ -41,9 +42,8 @@ def report(
     from edp.workflows.fleet.judge_fleet import PAGE, FleetQuestion, report_fleet
 
     question = FleetQuestion(network=network, store=store, deltas=deltas, monitor=monitor)
-    with progress(as_json) as shown:
-        on_machine = MachineDisplay(shown, Steps(as_json), "judge").on_machine
-        facts = report_fleet(workforce_of(workers, cluster, open_cluster), question, folder, on_machine)
+    with shown_progress("judge", as_json) as progress:
+        facts = report_fleet(workforce_of(workers, cluster, open_cluster), question, folder, progress)
     page = full_path(folder / PAGE)
 
     def show() -> None:
@@ -81,16 +81,3 @@ def network(
         out.print(f"next: edp export {written} --to c --out exported")
 
     emit(as_json, {"bundle": str(written), "machine": machine}, show)
-
-
-class MachineDisplay:
-    """Shows which machine is done."""
-
-    def __init__(self, shown: Any, steps: Steps, what: str) -> None:
-        self.shown, self.steps, self.what = shown, steps, what
-        self.bar = shown.add_task(what, total=None, note="")
-
-    def on_machine(self, name: str, done: int, count: int) -> None:
-        """Show one machine."""
-        self.shown.update(self.bar, total=count, completed=done, note=name)
-        self.steps.say(f"{self.what}: {name}, {count_text(done, count)}")

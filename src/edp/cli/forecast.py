@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, emit, out, progress, table
+from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.progress import shown_progress
 from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.errors import count_of
 from edp.wording import figure
@@ -42,14 +43,8 @@ def forecast(
     """
     from edp.workflows.twin import forecast_logs
 
-    with progress(as_json) as shown:
-        bar, steps = shown.add_task("forecast", total=None, note="reading logs"), Steps(as_json)
-
-        def note(name: str, number: int, of: int) -> None:
-            shown.update(bar, total=of, completed=number - 1, note=name)
-            steps.say(f"forecast: log {count_text(number, of)}, {name}")
-
-        result = forecast_logs(run, source_of(data, signal_map, repair), ahead, folder, answer, gain, note)
+    with shown_progress("forecast", as_json) as progress:
+        result = forecast_logs(run, source_of(data, signal_map, repair), ahead, folder, answer, gain, progress)
     facts = {
         "folder": str(folder),
         "logs": len(result.files),

@@ -18,6 +18,7 @@ WORDS = {
     "free_run_error": "free-run error {} deviations",
     "targets_per_s": "{} targets/s",
     "validation_mae": "validation MAE {}",
+    "refused": "{} refused",
 }
 """Text of each value that a step may have, for its figure."""
 
@@ -131,6 +132,10 @@ class StageDisplay:
         texts = [self.outer._path()] if self.outer is not None else []
         return ", ".join(text for text in (*texts, self._phrase()) if text)
 
+    def _stated(self) -> list[tuple[str, float]]:
+        """Return the values of the last step that the text states: a count of zero is left out."""
+        return [(name, value) for name, value in self.values.items() if name in WORDS and (value or name != "refused")]
+
     def _phrase(self) -> str:
         if self.total is None:
             return self.text or self.name
@@ -139,7 +144,7 @@ class StageDisplay:
             return f"{count_text(self.done, self.total, '/')} {self.display.counted}{now}"
         if self.text:
             return f"{self.name} {count_text(self.done + 1, self.total)}, {self.text}"
-        values = [WORDS[name].format(_figure(name, value)) for name, value in self.values.items() if name in WORDS]
+        values = [WORDS[name].format(_figure(name, value)) for name, value in self._stated()]
         return ", ".join([f"{self.name} {count_text(self.done, self.total, '/')}", *values])
 
 

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, count_text, emit, err, listing, out, progress, table
+from edp.cli.console import JsonFlag, emit, err, listing, out, table
 from edp.cli.inspect import FAULTY
+from edp.cli.progress import shown_progress
 from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 from edp.errors import count_of
 from edp.wording import number
 
 if TYPE_CHECKING:
-    from edp.logs.store import StoreIndex, StoreProgress
+    from edp.logs.store import StoreIndex
 
 MOST_REFUSED = 20
 """Refused logs that are printed; the index has all of them."""
@@ -58,22 +59,13 @@ def build(
     Example: `edp store build logs/ --map mine.toml --out store`, then `edp train store --out runs/first`
     """
     source = source_of(data, signal_map, repair)
-    with progress(as_json) as shown:
-        bar, steps = shown.add_task("store", total=None, note="listing logs"), Steps(as_json)
-
-        def note(reached: StoreProgress) -> None:
-            refused = f", {reached.refused} refused" if reached.refused else ""
-            shown.update(
-                bar, total=reached.of, completed=reached.logs, note=f"{count_of(reached.logs, 'log')}{refused}"
-            )
-            steps.say(f"store: logs {count_text(reached.logs, reached.of)}{refused}")
-
+    with shown_progress("store", as_json) as progress:
         if cluster:
             from edp.workflows.fleet.storing import store_with
 
-            index = store_with(workforce_of(workers, cluster, open_cluster, usual=0), source, folder, note)
+            index = store_with(workforce_of(workers, cluster, open_cluster, usual=0), source, folder, progress)
         else:
-            index = source.store(folder, workers or os.cpu_count() or 1, note)
+            index = source.store(folder, workers or os.cpu_count() or 1, progress)
     _show(index, folder, as_json)
     if index.refused:
         err.print(

@@ -22,11 +22,12 @@ from edp.logs.quality.quality import inspect
 from edp.logs.quality.sketches import Sketches, sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
-from edp.logs.store.building import StoredLog, StoreProgress, build_store
+from edp.logs.store.building import StoredLog, build_store
 from edp.logs.store.index import StoreIndex, is_store, read_index
 from edp.logs.store.opening import read_store
 from edp.logs.store.remote import is_remote_store, local_store
 from edp.logs.units import with_kinds, without_derived_kinds
+from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
@@ -242,9 +243,7 @@ class DataSource:
         sketches.all = [replace(one, name=names[i]) for one, i in zip(sketches.all, sketched, strict=True)]
         return compare([replace(report, name=name) for report, name in zip(reports, names)], sketches)
 
-    def store(
-        self, folder: str | Path, workers: int = 1, on_progress: Callable[[StoreProgress], None] | None = None
-    ) -> StoreIndex:
+    def store(self, folder: str | Path, workers: int = 1, progress: Progress = SILENT) -> StoreIndex:
         """Read the logs into a store; see `edp.logs.store.build_store`."""
         if self.stored:
             raise ConfigError(f"'{self.path}' is a store already; give the logs that it is to be built from")
@@ -265,7 +264,7 @@ class DataSource:
             )
             for log in self.logs()
         ]
-        return build_store(stored, folder, workers, on_progress)
+        return build_store(stored, folder, workers, progress)
 
     def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
         recordings = self.read()

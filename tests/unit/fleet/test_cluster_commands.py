@@ -67,7 +67,7 @@ class Plug:
 
 
 class PullingProgress(SilentProgress):
-    """Progress whose first note pulls a plug."""
+    """Progress that pulls a plug."""
 
     def __init__(self, plug):
         self.plug = plug
@@ -75,6 +75,11 @@ class PullingProgress(SilentProgress):
     def note(self, sentence):
         """Pull the plug."""
         self.plug.pull()
+
+    def step(self, done, **values):
+        """Pull the plug once something is done."""
+        if done:
+            self.plug.pull()
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +100,7 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     plug.mend()
 
     source = DataSource.of(one / "logs")
-    store_with(there, source, tmp_path / "store", lambda progress: progress.logs and plug.pull())
+    store_with(there, source, tmp_path / "store", PullingProgress(plug))
     source.store(one / "store", 1)
     digests = [[entry.digest for entry in read_store(folder / "store")] for folder in (tmp_path, one)]
     assert digests[0] == digests[1]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.data.coverage import Coverage
 from edp.errors import ConfigError, DataError, StorageError
@@ -107,10 +108,10 @@ def test_a_store_whose_disk_fills_in_a_unit_goes_on_where_it_was(small_logs, her
 
 def test_a_store_built_in_units_holds_the_same_recordings_and_reads_nothing_twice(small_logs, here, tmp_path):
     source = DataSource.of(small_logs)
-    told = []
-    index = store_with(here, source, tmp_path / "store", told.append)
+    told = NotedProgress()
+    index = store_with(here, source, tmp_path / "store", told)
     assert index.hours() == pytest.approx(0.01)
-    assert [progress.logs for progress in told][-1] == 4
+    assert told.steps[-1] == 4
     DataSource.of(small_logs).store(tmp_path / "usual", 1)
     for ours, usual in zip(read_store(tmp_path / "store"), read_store(tmp_path / "usual"), strict=True):
         assert (ours.name, ours.digest, dict(ours.meta)) == (usual.name, usual.digest, dict(usual.meta))

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageError
 from edp.jobs import Workforce
@@ -71,10 +72,11 @@ def test_each_machine_of_a_store_has_a_delta_that_is_nearly_its_fine_tuning(own,
 def test_a_machine_that_is_done_is_not_done_again(own, run, store, monkeypatch, tmp_path):
     shutil.copytree(own, tmp_path / "own")
     monkeypatch.setattr(personal, "target_data", lambda *_: pytest.fail("a machine was done twice"))
-    told = []
-    content = finetune_fleet(HERE, run, store, ORDER, tmp_path / "own", lambda *done: told.append(done))
+    told = NotedProgress()
+    content = finetune_fleet(HERE, run, store, ORDER, tmp_path / "own", told)
     assert content == read_fleet(own)
-    assert told[-1][1:] == (6, 6)
+    assert told.stages == [("machine", 6)]
+    assert told.steps[-1] == 6
 
 
 def test_the_network_of_one_machine_is_a_bundle(own, run, tmp_path):

@@ -28,7 +28,7 @@ from edp.training.transfer.both_domains import BothDomains, BothSpec
 from edp.training.transfer.strategies import LowRank
 from edp.training.warm_start import WarmStart
 from edp.workflows.train_evaluate import evaluate, train
-from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec, finetune
+from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec, finetune
 from edp.workflows.transfer.case import tuned as tuning
 from edp.workflows.transfer.scores import errors_of, measure, skew
 from edp.workflows.transfer.source import read_source, target_experiment, task_settings

@@ -39,6 +39,7 @@ from edp.logs.store.index import (
     without_seal,
     write_plain,
 )
+from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Digest
 from edp.sandbox.helpers import Helpers
 from edp.settings.tree import plain_tree
@@ -134,20 +135,11 @@ class LogBatch:
         return f"logs from '{self.logs[0][1].path}' on"
 
 
-@dataclass(frozen=True)
-class StoreProgress:
-    """How far a build is: logs that are read, of how many, and how many of them were refused."""
-
-    logs: int
-    of: int
-    refused: int
-
-
 def build_store(
     logs: Sequence[StoredLog],
     folder: str | Path,
     workers: int = 1,
-    on_progress: Callable[[StoreProgress], None] | None = None,
+    progress: Progress = SILENT,
 ) -> StoreIndex:
     """Read logs into a store; what it has already is kept, what was changed is read again.
 
@@ -155,7 +147,7 @@ def build_store(
         logs: in any order.
         folder: of the store; a new one, an unfinished one, or one to add logs to.
         workers: processes that read side by side.
-        on_progress: told after each batch.
+        progress: receiver of the progress; its units are logs.
 
     Returns:
         the index of the store. Logs that cannot be read are listed in it as refused, and are tried again next time.
@@ -174,14 +166,12 @@ def build_store(
         check_writable(make_folder(top / ROWS))
         remove_unfinished(top / ROWS)
         remove_unfinished(top)
-        return _built(_distinct(logs), top, workers, on_progress or (lambda progress: None))
+        return _built(_distinct(logs), top, workers, progress)
     finally:
         release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
 
 
-def _built(
-    logs: dict[str, StoredLog], top: Path, workers: int, on_progress: Callable[[StoreProgress], None]
-) -> StoreIndex:
+def _built(logs: dict[str, StoredLog], top: Path, workers: int, progress: Progress) -> StoreIndex:
     before = read_index(top) if is_file_at(top / INDEX) else StoreIndex()
     index = _without_replaced(_without_lost(before, top), logs)
     for record in _records_beside(top, index):
@@ -191,12 +181,13 @@ def _built(
     missing = {key: log for key, log in logs.items() if key not in stored}
     batches = _batches(missing, top, workers)
     done = len(logs) - len(missing)
-    on_progress(StoreProgress(done, len(logs), 0))
+    read = progress.stage("log", len(logs))
+    read.step(done)
     with Helpers(workers, _died) as helpers:
         for batch, record in zip(batches, helpers.ordered(store_batch, batches)):
             index = _with_record(index, record, logs)
             done += len(batch.logs)
-            on_progress(StoreProgress(done, len(logs), len(index.refused)))
+            read.step(done, refused=len(index.refused))
     order = {key: number for number, key in enumerate(logs)}
     # As the logs are in order; those of earlier builds first.
     recordings = sorted(index.recordings, key=lambda entry: order.get(entry.log_key, -1))

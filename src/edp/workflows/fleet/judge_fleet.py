@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from edp.jobs.units import UnitResult, WorkUnit, forget_units, run_units
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.networks.running import stream_errors
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.fleet.facts import FleetFacts, fleet_facts
 from edp.report.fleet.page import write_fleet_page
@@ -63,7 +64,7 @@ def report_fleet(
     workforce: Workforce,
     question: FleetQuestion,
     out: str | Path,
-    on_machine: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
 ) -> FleetFacts:
     """Judge every machine, and write ``fleet_report.json`` and a page.
 
@@ -71,7 +72,7 @@ def report_fleet(
         workforce: who judges; nodes see all folders under the same paths.
         question: network, store, deltas, monitor.
         out: folder of the report.
-        on_machine: called with the name of a machine that is done, how many are, and how many there are.
+        progress: receiver of the progress; its units are machines.
 
     Raises:
         EdpError: a network, store or monitor that cannot be used, or a folder that cannot be written.
@@ -83,9 +84,11 @@ def report_fleet(
     digest = weights_digest(bundle.predictor)
     units = [_unit(machine, digest, question, deltas.get(machine.name)) for machine in machines]
 
+    machines_done = progress.stage("machine", len(units))
+
     def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-        if on_machine is not None:
-            on_machine(str(unit.arguments["machine"]), done, len(units))
+        machines_done.note(str(unit.arguments["machine"]))
+        machines_done.step(done)
 
     results = run_units(units, workforce, folder / UNITS, note)
     pairs = zip(machines, results, strict=True)

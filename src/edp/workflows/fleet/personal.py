@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from edp.jobs import Workforce
 from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
+from edp.progress import SILENT, Progress
 from edp.signals import KINDS
 from edp.storage import make_folder, object_with, read_object, write_bytes, write_json
 from edp.storage.ledger import TrainingIdentity, WithState
@@ -70,7 +71,7 @@ def finetune_fleet(
     store: str | Path,
     order: PersonalOrder,
     out: str | Path,
-    on_machine: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Fine-tune a network for each machine of a store, and keep what changed.
 
@@ -83,7 +84,7 @@ def finetune_fleet(
         store: recordings that say their machine.
         order: method, settings, bytes.
         out: folder for ``fleet.json`` and ``deltas``.
-        on_machine: called with the name of a machine that is done, how many are, and how many there are.
+        progress: receiver of the progress; its units are machines.
 
     Returns:
         The content of ``fleet.json``. A machine whose logs do not go with the network is in it with the reason.
@@ -99,9 +100,11 @@ def finetune_fleet(
     key = run_key({"fleet": asdict(order), "base": digest}, "")
     units = [_unit(machine, digest, source, store, order) for machine in machines]
 
+    machines_done = progress.stage("machine", len(units))
+
     def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-        if on_machine is not None:
-            on_machine(str(unit.arguments["machine"]), done, len(units))
+        machines_done.note(str(unit.arguments["machine"]))
+        machines_done.step(done)
 
     with Run.create(out, "fleet", key) as run:
         results = run_units(units, workforce, run.file(UNITS), note)

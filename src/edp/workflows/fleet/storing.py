@@ -6,7 +6,7 @@ The build proper then finds these records as those of a build that was stopped, 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -17,9 +17,10 @@ from edp.jobs import Workforce
 from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource
-from edp.logs.store import StoreIndex, StoreProgress
+from edp.logs.store import StoreIndex
 from edp.logs.store.building import BATCH_LOG_BYTES, BATCHES_A_WORKER, MOST_FILES, LogBatch, StoredLog, store_batch
 from edp.logs.store.index import INDEX, LOCK, ROWS, is_store, read_index, rows_path
+from edp.progress import SILENT, Progress
 from edp.settings.tree import build, plain_tree
 from edp.signals import SignalMap
 from edp.storage import check_writable, hold, make_folder, read_object, release
@@ -34,7 +35,7 @@ def store_with(
     workforce: Workforce,
     source: DataSource,
     folder: str | Path,
-    on_progress: Callable[[StoreProgress], None] | None = None,
+    progress: Progress = SILENT,
 ) -> StoreIndex:
     """As `edp.logs.source.DataSource.store`, by a workforce.
 
@@ -42,7 +43,7 @@ def store_with(
         workforce: who reads the logs; nodes see logs and store under the same paths.
         source: logs.
         folder: of the store.
-        on_progress: told after each batch.
+        progress: receiver of the progress; its units are logs.
 
     Raises:
         EdpError: as `DataSource.store`, or the nodes do not see logs or store.
@@ -54,11 +55,11 @@ def store_with(
         lock = hold(top / LOCK)
         try:
             check_writable(make_folder(top / ROWS))
-            _read_batches(logs, top, workforce, on_progress or (lambda progress: None))
+            _read_batches(logs, top, workforce, progress)
         finally:
             release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
     # It enters what the units left, and says what stands against a folder that is no store.
-    return source.store(folder, 1, on_progress)
+    return source.store(folder, 1, progress)
 
 
 def stored_logs(source: DataSource) -> list[StoredLog]:
@@ -79,13 +80,12 @@ def keys_of(source: DataSource) -> str:
     return " ".join([*keys, *(log.key for log in stored_logs(source))])
 
 
-def _read_batches(
-    logs: dict[str, StoredLog], top: Path, workforce: Workforce, on_progress: Callable[[StoreProgress], None]
-) -> None:
+def _read_batches(logs: dict[str, StoredLog], top: Path, workforce: Workforce, progress: Progress) -> None:
     there = _stored_keys(top)
     missing = {key: log for key, log in logs.items() if key not in there}
     batches = _batches(missing, top, workforce.count if not workforce.cluster else SIDE_BY_SIDE)
     units = [_unit(batch) for batch in batches]
+    read = progress.stage("log", len(logs))
     counted = {"logs": len(logs) - len(missing), "refused": 0}
 
     def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
@@ -96,7 +96,7 @@ def _read_batches(
             )
         counted["logs"] += len(unit.arguments["logs"])
         counted["refused"] += int(result.values["refused"])
-        on_progress(StoreProgress(counted["logs"], len(logs), counted["refused"]))
+        read.step(counted["logs"], refused=counted["refused"])
 
     run_units(units, workforce, on_done=note)
 

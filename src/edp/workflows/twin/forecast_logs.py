@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
 from edp.networks.twin.forecast import CHOICE_LOGS, check_gain, check_horizons, choose_gain, forecast
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.common.picture import file_name
 from edp.signals import Channel
@@ -54,7 +55,7 @@ def forecast_logs(
     out: str | Path,
     answers: Sequence[str] = (),
     gain: float | None = None,
-    on_log: Callable[[str, int, int], None] | None = None,
+    progress: Progress = SILENT,
 ) -> ForecastLogs:
     """Write logs anew with a channel for each forecast of a twin: ``CylVels_1_in_10`` is CylVels_1 in ten ticks.
 
@@ -69,7 +70,7 @@ def forecast_logs(
         answers: what is forecast; empty: the velocities.
         gain: of the observer; None: chosen on logs from which the twin learned, where these are among them, else on
             the first ones.
-        on_log: called with the name of a log before it is read, its number and how many there are.
+        progress: receiver of the progress; its units are logs.
 
     Raises:
         EdpError: logs of other channels or another rate, a channel that the twin does not answer, or a folder in use.
@@ -84,11 +85,10 @@ def forecast_logs(
     recordings = source.read()
     if gain is None:
         gain = _chosen_gain(bundle, recordings, horizons)
-    names, errors = [], []
+    names, errors, logs = [], [], progress.stage("log", len(recordings))
     with replacing_folder(out) as folder:
         for number, logged in enumerate(recordings, start=1):
-            if on_log is not None:
-                on_log(logged.name, number, len(recordings))
+            logs.note(logged.name)
             recording = _checked(twin, logged)
             values, measured, settled = _forecasts(twin, recording, horizons, columns, gain)
             errors.append(_errors(values, measured, horizons, settled))
@@ -96,6 +96,7 @@ def forecast_logs(
             # The name comes from a file: as it is, it could be a path out of the folder, or that of another log.
             names.append(f"{number:04d}_{file_name(recording.name)}.parquet")
             write_recording(extended, folder / names[-1])
+            logs.step(number)
     channels = tuple(channel.name for channel in _channels(twin, horizons, columns))
     files = tuple(Path(out) / name for name in names)
     return ForecastLogs(files, channels, gain, _scores(twin, errors, horizons, columns))
