@@ -9,7 +9,7 @@ SIDE_BY_SIDE = -n $(WORKERS) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 READY := .venv/.ready
 INSTALL := pip install --quiet --no-deps
-BENCHMARKS = $(shell grep -l '__main__' benchmarks/*.py)
+BENCHMARKS = $(shell grep -l '^@benchmark' benchmarks/*.py)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup lock demo docs check test test-slow lint bench system-packages clean

@@ -10,8 +10,8 @@ A change makes the future harder to know for any predictor: how much is shown by
 
 The options' defaults were chosen on other recordings of these scenarios (seed 50) than those that count here (seed 90).
 
-A grey box of the machine as it was follows the machine, too (`adaptation_follower.py`, the C code of `edp export --to
-follower`), alone and before the correction above, without and with a thermometer in the oil.
+A grey box of the machine as it was follows the machine, too (the C code of `edp export --to follower`), alone and
+before the correction above, without and with a thermometer in the oil.
 
 Rivals on the same ticks: no adaptation; offset and gain of each predicted change, by recursive least squares; the whole
 last layer's features by recursive least squares with forgetting and no bounds, from the backbone's representation.
@@ -24,8 +24,8 @@ adaptation sees inputs and predictions only, and those of such a network are wor
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,34 +33,49 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptation_follower import WAYS, Follower, fitted_grey
-from common import Verdict, finish, parser, table, verdict
+from board import BOARD, M7, QEMU_M7, build_image, listed_sources, on_board, run, run_image, sizes_on_m7
+from common import DATA_AND_PARTS, ROOT, Bench, benchmark, option, table
 from controller_cycles import PROGRAM
 from edp.config.experiment import load_experiment
+from edp.config.twin import load_twin_experiment
+from edp.data.oil import oil_celsius
 from edp.data.scaling import Scaler
 from edp.data.series import Series
 from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
-from edp.ir.rls import Adaptation, AdaptationSpec
+from edp.export.follower import FollowerParts, write_follower
+from edp.export.follower.parts import GOLDEN_TICKS
+from edp.ir.rls import Adaptation, AdaptationSpec, RlsCorrector
 from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import Predictor, build_model
 from edp.networks.running import stream_hidden, stream_predictions
+from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.greybox import GreyTwin
+from edp.networks.twin.tuned import TunedSpec
+from edp.recording import Recording
 from edp.sim.machine import machine_files
+from edp.storage import make_folder
 from edp.training import load_bundle, save_bundle
 from edp.training.bundle import Bundle
-from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin, save_twin
+from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin, plant_bundle, save_twin
 from edp.workflows.adaptation import fit_adaptation, motion_s
+from edp.workflows.adaptation.with_twin import correction_of
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set, train
-from embedded_step import on_board
-from twin import QUICK_FIT
+from edp.workflows.twin.prepare_twin import prepared_twin
+from twin import QUICK_FIT, fitted_linkage
 
 PROGRAMS = ("gcc", "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
 
-DRIVERS = Path(__file__).parents[1] / "tests/export"
+DRIVERS = ROOT / "tests/export"
 DAY = 8_640_000
 Rows = NDArray[np.float64]
+
+
+FLAGS = ("-std=gnu99", "-O2", "-ffp-contract=off", "-I.")
+WAYS = ("follower", "follower, adapted", "follower with thermometer", "follower with thermometer, adapted")
+COLD_C = 20.0
+"""Of the oil in the logs of the grey box."""
 
 
 @dataclass(frozen=True)
@@ -179,6 +194,78 @@ def driven(folder: Path, part: Series) -> tuple[Rows, Rows]:
     return numbers[:, :targets], numbers[:, targets : 2 * targets]
 
 
+def fitted_grey(recordings: Sequence[Recording], fit: GreyFitSpec, seed: int) -> tuple[GreyTwin, float]:
+    """A grey box of the machine before its change, told the linkage and wrong bodies; processor s of its fit."""
+    channels, data = prepared_twin(list(recordings), load_twin_experiment(None, ("twin.kind=greybox",)))
+    return fitted_linkage((channels, fit_scales(channels, data.train), data), seed, fit)
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """The C code of a follower, compiled.
+
+    Attributes:
+        parts: what it is made of.
+        folder: of the program.
+    """
+
+    parts: FollowerParts
+    folder: Path
+
+    @staticmethod
+    def built(twin: GreyTwin, bundle: Bundle, law: Adaptation, folder: Path) -> Follower:
+        """Write and compile it; its self-test must pass."""
+        spec = TunedSpec(oil_c=COLD_C)
+        limit = correction_of(twin, law, bundle.task, spec).limit
+        parts = FollowerParts("a grey box", twin, spec, bundle.task.targets, law.horizons, limit)
+        write_follower(parts, plant_bundle(TwinBundle(twin.spec, twin)), "follower", folder)
+        made = Follower(parts, folder)
+        run(["gcc", *FLAGS, *listed_sources(folder), "host_test.c", "-lm", "-o", "program"], folder)
+        print(run(["./program"], folder).strip())
+        return made
+
+    def moved(self, recording: Recording, base: Rows, measured_oil: bool) -> tuple[Rows, Rows]:
+        """Predictions of one horizon, moved ``(time, target)``, and factors of the groups at the end."""
+        part = self.parts.twin.channels.task().series(recording)
+        oil = oil_celsius(recording) if measured_oil else np.full(part.samples, np.nan)
+        rows = np.concatenate([part.inputs, part.targets, oil[:, None], base], axis=1).astype(np.float32)
+        done = subprocess.run(
+            [self.folder / "program", "stream", "1000"], input=rows.tobytes(), check=True, capture_output=True
+        )
+        numbers = np.frombuffer(done.stdout, np.float32).reshape(part.samples, -1).astype(float)
+        targets = base.shape[1]
+        return numbers[:, :targets], numbers[-1, targets + len(self.parts.twin.channels.velocities) : -1]
+
+    def ways(self, recording: Recording, series: Series, base: Rows, law: Adaptation, warm: int) -> dict[str, Any]:
+        """Predictions of each of `WAYS`, and the factors that were found."""
+        found: dict[str, Any] = {}
+        for way, measured in (("follower", False), ("follower with thermometer", True)):
+            found[way], factors = self.moved(recording, base, measured)
+            found[f"{way}, adapted"] = linear(law, series, found[way], warm)
+            found[f"factors, {way}"] = factors
+        return found
+
+    def cost(self) -> dict[str, int]:
+        """Instructions of a tick on a Cortex-M7 with one run of a stretch a tick, and bytes."""
+        skipped = self.parts.twin.prefix_ticks + 2 * self.parts.spec.learn_ticks
+        sources = listed_sources(self.folder)
+        build_image(self.folder, M7, [*sources, BOARD / "follow.c"], "-DRUNS=1u", f"-DSKIPPED={skipped}u")
+        mean, most, *_ = run_image(self.folder, QEMU_M7)
+        flash, state = sizes_on_m7(self.folder, sources, "follower.h", "follower_state")
+        return {
+            "instructions": int(mean), "most_instructions": int(most), "flash_bytes": flash, "state_bytes": state,
+            "golden_ticks": GOLDEN_TICKS,
+        }  # fmt: skip
+
+
+def linear(law: Adaptation, series: Series, base: Rows, warm: int) -> Rows:
+    """Predictions ``(time, target)`` behind the linear correction, which learns from what the follower leaves."""
+    adapter, made = RlsCorrector(law), np.empty_like(base)
+    for tick, (x, y) in enumerate(zip(series.inputs, base.astype(np.float32), strict=True)):
+        made[tick] = adapter.step(x, y[None], fresh=tick + 1 >= warm)[0][0]
+    return made
+
+
 @dataclass(frozen=True, eq=False)
 class Recovered:
     """MAE of each way by scenario, mean over recordings and each, and factors that the follower found at the end."""
@@ -266,40 +353,34 @@ def attacked(bundle: Bundle, bank: NDArray[np.float32], ticks: int) -> list[floa
     return [float(word) for word in done.stdout.split()]
 
 
-def main() -> None:
-    arguments_of = parser(__doc__ or "", PROGRAMS)
-    arguments_of.add_argument("--short", action="store_true", help="60 min, three recordings, an hour of the adversary")
-    arguments = arguments_of.parse_args()
-    form = "quick" if arguments.quick else "short" if arguments.short else "full"
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.data or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        study(folder, form, arguments.seed)
-
-
-def study(folder: Path, form: str, seed: int) -> None:
-    size, quick, cases = SIZES[form], form == "quick", machines(folder)
+@benchmark(
+    DATA_AND_PARTS,
+    option("--short", action="store_true", help="60 min, three recordings, an hour of the adversary"),
+    programs=PROGRAMS,
+)
+def main(bench: Bench) -> object:
+    form = "quick" if bench.quick else "short" if bench.options.short else "full"
+    folder, seed, size, cases = bench.folder, bench.seed, SIZES[form], machines(bench.folder)
     bundle, law, grey = prepared(folder, cases["before"], size, seed)
     tests = {
         name: simulated(folder / f"test {name}", case, size.test_minutes, size.tests, seed + 90)
         for name, case in cases.items()
     }
     with tempfile.TemporaryDirectory() as temporary:
-        program = Path(temporary) / "network"
-        program.mkdir()
+        program = make_folder(Path(temporary) / "network")
         built(bundle, program, DRIVERS / "adaptation_driver.c")
         follower = Follower.built(grey, bundle, law, Path(temporary) / "follower")
         found = recovery(bundle, law, tests, program, follower, size.behind_s)
         cost = follower.cost()
     print(f"a tick of the follower on a Cortex-M7: {cost}")
     attainable = retrained(folder, cases, tests, (size, law, seed))
-    details = {
+    check_recovered(bench, found.mae)
+    check_followers(bench, found.mae, attainable)
+    adversary = check_costs_and_attacks(bench, bundle, tests["before"], size.ticks)
+    return {
         "form": form, "mae": found.mae, "each": found.each, "factors": found.factors, "options": law.to_plain(),
-        "follower on a Cortex-M7": cost, "trained after the change": attainable,
+        "follower on a Cortex-M7": cost, "trained after the change": attainable, "adversary": adversary,
     }  # fmt: skip
-    verdicts = [*judged(found.mae, quick), *judged_followers(found.mae, attainable, quick)]
-    verdicts += costs_and_attacks(bundle, tests["before"], (size, seed, quick), details)
-    finish("adaptation", verdicts, seed, details)
 
 
 def prepared(folder: Path, before: tuple[str, str], size: Size, seed: int) -> tuple[Bundle, Adaptation, GreyTwin]:
@@ -332,46 +413,39 @@ def retrained(
     return attainable
 
 
-def costs_and_attacks(
-    bundle: Bundle, bank_of: DataSource, how: tuple[Size, int, bool], details: dict[str, Any]
-) -> list[Verdict]:
-    """Instructions of a tick, and what an adversary does to the correction; written into `details`, too."""
-    size, seed, quick = how
+def check_costs_and_attacks(bench: Bench, bundle: Bundle, bank_of: DataSource, ticks: int) -> dict[str, Any]:
+    """Instructions of a tick, and what an adversary does to the correction; returns the latter."""
     without, with_ = instructions(bundle)
-    verdicts = [verdict("instructions of a tick, with over without", with_, without, "<= 1.1", "1", quick)]
+    bench.check("instructions of a tick, with over without", with_, without, "<= 1.1", "1")
     bank = bundle.task.series(bank_of.read()[0]).inputs
     names = ("corrected", "worst", "not_finite", "repairs", "beyond", "without", "with", "worst_turn", "taken_back")
-    attack = dict(zip(names, attacked(narrow(bundle, seed), bank, size.ticks), strict=True))
-    details["adversary"] = attack | {"ticks": size.ticks}
-    print(f"adversary, {size.ticks / 360_000:g} h: {attack}")
+    attack = dict(zip(names, attacked(narrow(bundle, bench.seed), bank, ticks), strict=True))
+    print(f"adversary, {ticks / 360_000:g} h: {attack}")
     wrong = attack["not_finite"] + attack["repairs"] + attack["beyond"]
-    verdicts.append(verdict("faults under the adversary, against one", wrong, 1.0, "<= 0", "faults", quick))
-    verdicts.append(verdict("largest correction over its limit", attack["worst"], 1.0, "<= 1.000001", "1", quick))
-    verdicts.append(verdict("error under the adversary, with over without", attack["with"], attack["without"],
-                            "<= 1.05", "units", quick))  # fmt: skip
-    return verdicts
+    bench.check("faults under the adversary, against one", wrong, 1.0, "<= 0", "faults")
+    bench.check("largest correction over its limit", attack["worst"], 1.0, "<= 1.000001", "1")
+    name = "error under the adversary, with over without"
+    bench.check(name, attack["with"], attack["without"], "<= 1.05", "units")
+    return attack | {"ticks": ticks}
 
 
-def judged_followers(found: dict[str, dict[str, float]], attainable: dict[str, float], quick: bool) -> list[Verdict]:
+def check_followers(bench: Bench, found: dict[str, dict[str, float]], attainable: dict[str, float]) -> None:
     """Of the loss that a change is to the network, what the follower has not; in clay, over what training wins."""
-    verdicts, before = [], found["before"]
+    before = found["before"]
     for name, ways in found.items():
         if name not in ("before", "clay"):
             loss = ways["frozen"] - before["frozen"]
             for way in ("follower, adapted", "follower with thermometer, adapted"):
-                kept = loss - (ways[way] - before[way])
-                question = f"{name}: {way}: of the change alone"
-                verdicts.append(verdict(question, kept, loss, ">= 0.5", "mm/s recovered", quick))
+                left = loss - (ways[way] - before[way])
+                bench.check(f"{name}: {way}: of the change alone", left, loss, ">= 0.5", "mm/s recovered")
         elif name in attainable:
-            won = ways["frozen"] - ways["follower, adapted"]
-            verdicts.append(verdict("clay: follower, adapted: over what training wins", won,
-                                    ways["frozen"] - attainable[name], ">= 0.8", "mm/s recovered", quick))  # fmt: skip
-    return verdicts
+            won, wanted = ways["frozen"] - ways["follower, adapted"], ways["frozen"] - attainable[name]
+            bench.check("clay: follower, adapted: over what training wins", won, wanted, ">= 0.8", "mm/s recovered")
 
 
-def judged(found: dict[str, dict[str, float]], quick: bool) -> list[Verdict]:
+def check_recovered(bench: Bench, found: dict[str, dict[str, float]]) -> None:
     """A verdict a change; the table shows all ways."""
-    before, verdicts, rows = found["before"], [], []
+    before, rows = found["before"], []
     for name, ways in found.items():
         loss = ways["frozen"] - before["frozen"]
         for way, mae in ways.items():
@@ -381,11 +455,9 @@ def judged(found: dict[str, dict[str, float]], quick: bool) -> list[Verdict]:
             shares = (gained / loss, change / loss) if loss else ("", "")
             rows.append([name, way, mae, *shares])
         if loss:
-            verdicts.append(verdict(f"{name}: recovered of the loss", ways["frozen"] - ways["adapted"], loss,
-                                    ">= 0.5", "mm/s recovered", quick))  # fmt: skip
+            gained = ways["frozen"] - ways["adapted"]
+            bench.check(f"{name}: recovered of the loss", gained, loss, ">= 0.5", "mm/s recovered")
     table(["scenario", "way", "MAE mm/s", "recovered", "of the change"], rows)
-    sys.stdout.flush()
-    return verdicts
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ The recordings are no part of the repository: their folder is given by --shared 
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 import time
@@ -23,17 +22,17 @@ from typing import Any
 
 import numpy as np
 
-from common import Verdict, finish, parser, table, verdict
+from common import EXAMPLES, SHARED, Bench, benchmark, option, table
 from edp.evaluation.baselines import BASELINES
 from edp.settings.tree import read_toml
 from edp.storage import read_json
 from edp.workflows.auto import load_auto, train_auto
 from edp.workflows.compression import DistilRequest, DistilSpec, distil
 from edp.workflows.train_evaluate import DataSource, evaluate
-from real_recordings import EXAMPLES, QUICK, QUICK_SETS, rmse, shared_folder
 
 KEPT = 0.1
 """How far the test error may lie from the promise."""
+QUICK_SETS, QUICK = ("sjoberg.toml", "tanks.toml"), ("auto.minutes=0.05",)
 STUDENT_UNITS, STUDENT_LOSS = 64, 0.02
 """Width of a student's two perceptrons, and how much more error than its committee it may have."""
 
@@ -114,6 +113,11 @@ def train_set(entry: dict[str, Any], seed: int, changes: Sequence[str], distille
     return Training(scores, choice, facts["chosen"], promise, seconds, taught, size)
 
 
+def rmse(scores: dict[str, Any], model: str, target: str, horizon: int) -> float:
+    """Root-mean-square error of a model in report units."""
+    return float(scores["models"][model]["overall"][str(horizon)][target]["rmse"])
+
+
 def tasks_of(entry: dict[str, Any], trainings: Sequence[Training]) -> list[Task]:
     """Medians over the seeds of one set."""
     tasks = []
@@ -131,23 +135,8 @@ def tasks_of(entry: dict[str, Any], trainings: Sequence[Training]) -> list[Task]
         floor = min(persistence, linear)
         student = [rmse(scores, "network", target, horizon) for scores in taught]
         of_student = float(np.median(student)) if student else None
-        tasks.append(
-            Task(
-                entry["title"],
-                target,
-                horizon,
-                ours,
-                floor,
-                errors[best],
-                best,
-                promise,
-                low,
-                high,
-                told,
-                shown,
-                of_student,
-            )
-        )
+        where, promised = (entry["title"], target, horizon), (promise, low, high, told)
+        tasks.append(Task(*where, ours, floor, errors[best], best, *promised, shown, of_student))
     return tasks
 
 
@@ -165,61 +154,36 @@ def median_of(errors: Sequence[dict[str, Any]], horizon: int, target: str) -> fl
     return float(np.median([one[str(horizon)][target] for one in errors]))
 
 
-def verdicts_of(tasks: Sequence[Task], quick: bool) -> list[Verdict]:
+def check(bench: Bench, tasks: Sequence[Task]) -> None:
     """How many tasks meet each goal, of how many; the means."""
     count = len(tasks)
     titles = list(dict.fromkeys(task.title for task in tasks))
-    sets = [
-        math.exp(float(np.mean([math.log(task.ours / task.floor) for task in tasks if task.title == title])))
-        for title in titles
-    ]
-    mean = math.exp(float(np.mean(np.log(sets))))
-    met = {
-        "tasks at most 1.00 of the linear floor": sum(task.ours <= task.floor for task in tasks),
-        "tasks at most 1.00 of the best rival": sum(task.ours <= task.rival for task in tasks),
-        "tasks whose promise is within 10 % of the test error": sum(
-            abs(task.promise / task.ours - 1) <= KEPT for task in tasks
-        ),
-    }
-    met |= {
-        "tasks whose promised skill (error over the linear model's) is within 10 % of that on the test part": sum(
-            abs(task.skill_promised / task.skill - 1) <= KEPT for task in tasks
-        ),
-        "tasks whose test error lies in the promise's 90 % interval": sum(
-            task.low <= task.ours <= task.high for task in tasks
-        ),
-    }
-    goals = (count, count - 2, count - 5, count - 5, round(0.9 * count))
-    rows = [
-        verdict(name, number, goal, ">= 1", "tasks", quick)
-        for (name, number), goal in zip(met.items(), goals, strict=True)
-    ]
-    rows.append(verdict("error relative to the floor, geometric mean over sets", mean, 1.0, "<= 0.8", "ratio", quick))
+    logs = [float(np.mean([math.log(t.ours / t.floor) for t in tasks if t.title == title])) for title in titles]
+    mean = math.exp(float(np.mean(logs)))
+    skill = "promised skill (error over the linear model's) is within 10 % of that on the test part"
+    for name, goal, met in (
+        ("at most 1.00 of the linear floor", count, [t.ours <= t.floor for t in tasks]),
+        ("at most 1.00 of the best rival", count - 2, [t.ours <= t.rival for t in tasks]),
+        ("whose promise is within 10 % of the test error", count - 5,
+         [abs(t.promise / t.ours - 1) <= KEPT for t in tasks]),
+        (f"whose {skill}", count - 5, [abs(t.skill_promised / t.skill - 1) <= KEPT for t in tasks]),
+        ("whose test error lies in the promise's 90 % interval", round(0.9 * count),
+         [t.low <= t.ours <= t.high for t in tasks]),
+    ):  # fmt: skip
+        bench.check(f"tasks {name}", sum(met), goal, ">= 1", "tasks")
+    bench.check("error relative to the floor, geometric mean over sets", mean, 1.0, "<= 0.8", "ratio")
     students = [task.student / task.ours for task in tasks if task.student is not None]
     if students:
         close = sum(ratio <= 1 + STUDENT_LOSS for ratio in students)
-        name = "students at most 2 % behind their committee"
-        rows.append(verdict(name, close, count - 5, ">= 1", "tasks", quick))
+        bench.check("students at most 2 % behind their committee", close, count - 5, ">= 1", "tasks")
     worst = max(task.ours / task.rival for task in tasks)
-    rows.append(verdict("worst error relative to the best rival", worst, 1.0, "<= 1.02", "ratio", quick))
-    return rows
+    bench.check("worst error relative to the best rival", worst, 1.0, "<= 1.02", "ratio")
 
 
 def show(tasks: Sequence[Task], notes: dict[str, dict[str, Any]]) -> None:
     """Print a row a task, and a row a set."""
-    headings = [
-        "set",
-        "target",
-        "k",
-        "ours",
-        "ours/floor",
-        "best rival",
-        "ours/rival",
-        "promise/ours",
-        "90 % from",
-        "to",
-    ]
-    headings += ["skill promised", "skill", "student/ours"]
+    headings = ["set", "target", "k", "ours", "ours/floor", "best rival", "ours/rival", "promise/ours"]
+    headings += ["90 % from", "to", "skill promised", "skill", "student/ours"]
     lines = []
     for t in tasks:
         ratios = (t.ours / t.floor, t.rival_name, t.ours / t.rival, t.promise / t.ours, t.low, t.high)
@@ -234,26 +198,21 @@ def show(tasks: Sequence[Task], notes: dict[str, dict[str, Any]]) -> None:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
-    options = parser(__doc__ or "")
-    options.add_argument("--shared", type=Path, default=None, help="folder of the recordings (else $EDP_SHARED_DATA)")
-    options.add_argument("--seeds", type=int, default=5, help="how many seeds, from --seed on")
-    options.add_argument("--workers", type=int, default=1, help="trainings side by side, each a process of its own")
-    chosen = options.parse_args(arguments)
-    if shared_folder(chosen.shared) is None:
-        return
-    seeds = range(chosen.seed, chosen.seed + (1 if chosen.quick else chosen.seeds))
+@benchmark(
+    SHARED,
+    option("--seeds", type=int, default=5, help="how many seeds, from --seed on"),
+    option("--workers", type=int, default=1, help="trainings side by side, each a process of its own"),
+)
+def main(bench: Bench) -> object:
+    seeds = range(bench.seed, bench.seed + (1 if bench.quick else bench.options.seeds))
     entries = read_toml(EXAMPLES / "leagues.toml")["floors"]
-    entries = [entry for entry in entries if not chosen.quick or entry["data"] in QUICK_SETS]
-    changes = QUICK if chosen.quick else ()
+    entries = [entry for entry in entries if not bench.quick or entry["data"] in QUICK_SETS]
+    changes = QUICK if bench.quick else ()
     tasks: list[Task] = []
     notes: dict[str, dict[str, Any]] = {}
     # Processes of their own, so that the compiled parts and pools of one training are not those of another.
-    with ProcessPoolExecutor(chosen.workers, mp_context=get_context("spawn")) as pool:
-        begun = [
-            [pool.submit(train_set, entry, seed, changes, not chosen.quick) for seed in seeds] for entry in entries
-        ]
+    with ProcessPoolExecutor(bench.options.workers, mp_context=get_context("spawn")) as pool:
+        begun = [[pool.submit(train_set, entry, s, changes, not bench.quick) for s in seeds] for entry in entries]
         for entry, futures in zip(entries, begun, strict=True):
             trainings = [future.result() for future in futures]
             of_set, notes[entry["title"]] = tasks_of(entry, trainings), notes_of(trainings)
@@ -261,8 +220,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(flush=True)
             tasks += of_set
     show(tasks, notes)
-    kept = {"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}
-    finish("auto_preset", verdicts_of(tasks, chosen.quick), chosen.seed, json.loads(json.dumps(kept)))
+    check(bench, tasks)
+    return {"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}
 
 
 if __name__ == "__main__":

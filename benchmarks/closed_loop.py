@@ -1,19 +1,14 @@
-"""How far is the bucket tip off in closed loop, and does tuning on a model carry over to the plant?
+"""How far is the bucket tip off in closed loop, under predictive control on a twin?
 
-Machine M22 in free air, six lines on which nothing was tuned. PI with feed-forward through the measured valve map
-against the inversion of a look-ahead predictor and of a twin; then with oil at 65 degC, dead bands 3 points wider, and
-noise of velocities and pressures five times as large, all with the models of the plant as it was. The score is the
-position error to the reference of the same time; the distance to the path stands beside it.
+Predictive control stands beside a PI loop that is tuned in the same run and an inversion of the twin, on three draws of
+six lines on which nothing was tuned: the machine as it was, then with oil at 65 degC, dead bands 3 points wider, noise
+of velocities and pressures five times as large, and in loam, all with the models of the plant as it was. The score is
+the position error to the reference of the same time; the distance to the path stands beside it.
 
-Part nmpc sets predictive control on a well-trained twin beside a PI loop that is tuned in the same run and an
-inversion, on three draws of six lines, with the same variants, in loam, and on C14 after 20 minutes of its logs. Part
-o4 asks whether gains that are better on that twin, a one-step network, a static valve map or ARX are better on the
-plant; part o4_other the same for C14 in loam, of models of 5, 20 and 45 min of its logs. Part grey asks parts nmpc, but
-for C14, and o4 of a grey box with a known linkage, fitted to 45 min of logs in free air, in place of the network: parts
-grey and o4_grey. Part grey_other does so for C14: predictive control on a grey box of 20 min of its logs in free air;
-o4_grey_other asks gains in loam of grey boxes of 5, 20 and 45 min, o4_ground of the one of 20 min with a ground that it
-learned from as many minutes in loam, on the plant with four draws of the ground. Their models are trained where --data
-has none: 3 h of recordings, some ten processor minutes.
+Part nmpc does so on a well-trained recurrent twin of M22, and on C14 after 20 minutes of its logs. Part grey takes a
+grey box of M22 with a known linkage, fitted to 45 min of logs in free air, in place of the network; part grey_other
+one of C14 from 20 min of its logs in free air. Models are trained where --data has none: 3 h of recordings, some ten
+processor minutes.
 
 Results are kept part by part, `closed_loop_PART.json`; of another seed, with other logs and fits of the models but the
 same lines, in `closed_loop_PART_seedN.json`.
@@ -21,247 +16,342 @@ same lines, in `closed_loop_PART_seedN.json`.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
+import hashlib
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 import closed_loop_models as models_of
-import closed_loop_nmpc as nmpc_of
-import closed_loop_tuning as tuning_of
 from closed_loop_models import Models
-from common import Verdict, finish, in_folder, parser, table, verdict
-from edp.config.control import ControlExperiment
-from edp.config.experiment import load_experiment
-from edp.config.twin import load_twin_experiment
-from edp.control.controllers import CONTROLLERS
+from common import DATA_AND_PARTS, Bench, benchmark, kept, option, table
+from edp.config.control import ControlExperiment, load_control_experiment
+from edp.control.controllers import CONTROLLERS, ControllerSpec
+from edp.control.loop import run_loop
 from edp.control.models import ControlModels
+from edp.control.plant import interface_of
+from edp.control.plants import plant_of
 from edp.control.tasks import TASKS
-from edp.logs.source import DataSource
-from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.sim.machine.machine_checks import MACHINE_FILE
 from edp.sim.machine.machine_files import load_machine
-from edp.training.twin_bundle import load_twin
+from edp.storage import make_folder
 from edp.workflows.control import ControlBench, ControlSources
-from edp.workflows.train_evaluate import train
-from edp.workflows.twin import train_twin
+from edp.workflows.control.tune_gains import TUNED, TuningSpec, tune_gains
 
-MACHINE = "M22"
-LEAD_TICKS = 20
-PARTS = ("lines", "nmpc", "grey", "grey_other", "o4", "o4_grey", "o4_other", "o4_grey_other", "o4_ground")
+PARTS = ("nmpc", "grey", "grey_other")
+MACHINE, OTHER = "M22", "C14"
+DEAD_BAND, NOISE = 0.03, 5.0
+NOISY = ("velocity", "pressure", "joint_rate_deg")
+LOAM = "sandy_loam"
+DRAWS = (0, 100, 200)
+"""First seeds of three draws of lines, each with noise of its own; tunings use seeds from 1,000,000 on."""
+LEAST_MM = 1e-3
+PLAN = (2, 3, 4, 8, 14, 29)
+"""Blocks of the judged plan on a network, 0.6 s, 0.4 s by default: better on unjudged lines, slower."""
+ATTITUDE_M = 2.0
+"""Weight of the attitude on a grey box, 1 m by default: on unjudged lines less error of the attitude, the same path."""
 
 
 @dataclass(frozen=True)
-class Size:
-    """How much is simulated, trained and run."""
+class LoopSize:
+    """How much is run.
 
-    minutes: float
-    recordings: int
+    Attributes:
+        lines: a draw.
+        draws: of lines.
+        trials: of the tuning of the PI loop.
+        tuned_lines: that it is tuned on.
+        variants: how many of them, the machine as it was among them.
+    """
+
     lines: int
+    draws: int
+    trials: int
+    tuned_lines: int
     variants: int
-    predictor: tuple[str, ...]
-    twin: tuple[str, ...]
 
 
-FULL = Size(90.0, 45, 6, 4, (), ("twin.kind=recurrent", "twin.units=48", "training.updates=[600,600,400,200]"))
-QUICK = Size(
-    *(3.0, 6, 1, 1),
-    ("training.epochs=1", "training.updates=20"),
-    ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1,0.3]", "training.updates=[20,20]"),
-)
+FULL = LoopSize(6, 3, 40, 5, 6)
+QUICK = LoopSize(1, 1, 3, 1, 2)
 
 
-def main() -> None:
-    arguments_of = parser(__doc__ or "")
-    arguments_of.add_argument("--part", choices=["all", *PARTS], default="all")
-    arguments_of.add_argument("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines")
-    arguments_of.add_argument("--variants", type=int, choices=range(2, 7), default=6, help="of the plant, last ones")
-    arguments = arguments_of.parse_args()
-    chosen = PARTS if arguments.part == "all" else (arguments.part,)
+@dataclass(frozen=True)
+class Variant:
+    """A plant that the controllers are run on.
 
-    def run(folder: Path) -> None:
-        # One folder: parts share recordings and models.
-        for part in chosen:
-            measured(part, arguments, folder)
+    Attributes:
+        machine: name, or file.
+        options: of the environment's reset.
+        material: soil of the task.
+        other: whether it is the other machine, with a valve map, gains and a twin of its own.
+    """
 
-    in_folder(arguments.data, run)
-
-
-def measured(part: str, arguments: argparse.Namespace, folder: Path) -> None:
-    """One part, whose results are kept in a file of its own."""
-    quick, seed = arguments.quick, arguments.seed
-    size = QUICK if quick else FULL
-    full = replace(nmpc_of.FULL, draws=arguments.draws, variants=arguments.variants)
-    of_loops = nmpc_of.QUICK if quick else full
-    of_tuning = tuning_of.QUICK if quick else tuning_of.FULL
-    models = Models(folder, models_of.QUICK if quick else models_of.FULL, seed)
-    details: dict[str, Any] = {"size": asdict(size)}
-    verdicts: list[Verdict] = []
-    if part == "lines":
-        details[part] = lines(folder, trained(folder, size, seed), size)
-        verdicts = line_verdicts(details[part], quick)
-    elif part == "nmpc":
-        details[part], verdicts = predictive(models, of_loops, quick, seed)
-    elif part == "grey":
-        grey = models.grey(models_of.QUICK_GREY if quick else models_of.GREY)
-        details[part], verdicts = predictive(models, of_loops, quick, seed, grey)
-    elif part == "o4_grey":
-        if quick:  # A grey box of three minutes of logs has not been where the lines begin.
-            return
-        details[part] = {"twin": tuning_of.tuning_on(models.grey(models_of.GREY), of_tuning, seed)}
-        verdicts = tuning_of.tuning_verdicts(details[part], quick)
-    elif part == "grey_other":
-        details[part], verdicts = grey_other(models, of_loops, quick, seed)
-    elif part == "o4_grey_other":
-        details[part], verdicts = o4_grey_other(models, of_tuning, quick, seed)
-    elif part == "o4_ground":
-        details[part], verdicts = o4_ground(models, of_tuning, quick, seed)
-    elif part == "o4":
-        details[part] = tuning_of.tuning(models, of_tuning, seed)
-        verdicts = tuning_of.tuning_verdicts(details[part], quick)
-    else:
-        details[part] = tuning_of.tuning_other(models, of_tuning, seed)
-        verdicts = tuning_of.other_verdicts(details[part], models.size.other, quick)
-    finish(f"closed_loop_{part}{f'_seed{seed}' if seed else ''}", verdicts, seed, details, keep=not quick)
+    machine: str = MACHINE
+    options: Mapping[str, Any] | None = None
+    material: str = ""
+    other: bool = False
 
 
-def predictive(
-    models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int, own: Path | None = None
-) -> tuple[dict[str, Any], list[Verdict]]:
-    """Figures of part nmpc, or with a twin of its `own` of part grey, and its verdicts."""
-    twin = own or models.twin()
-    # On unjudged lines a plan of 0.6 s was better with the network, and no better with the grey box.
-    options = {"attitude_m": nmpc_of.ATTITUDE_M} if own else {"blocks": nmpc_of.PLAN}
-    spec = CONTROLLERS["nmpc"](**options)
-    ahead = models_of.ahead_errors(models, twin, spec.load if own else 0.0)
-    rows = nmpc_of.loops(models, size, seed, spec, own)
-    times = nmpc_of.solve_times(twin, spec, min(2, size.lines))
-    verdicts = nmpc_of.loop_verdicts(rows, quick)
-    verdicts.append(verdict("nmpc, processor time of a tick, p99", times["p99"], 2.0, "<= 1", "ms", quick))
-    for ticks, goal in ((20, 2.0), (50, 4.0)):
-        for part in ("all", "all, load estimated", "free air") if own else ("all",):
-            name = f"velocities {ticks} ticks ahead, told the commands, {part}"
-            verdicts.append(verdict(name, ahead[part][str(ticks)], goal, "<= 1", "mm/s", quick))
-    return {"ahead_mm_s": ahead, "loops": rows, "tick_ms": times, "size": asdict(size)}, verdicts
+AS_IT_WAS = ("as it was", Variant())
+OTHER_NAME = "C14 after minutes of its logs"
 
 
-def grey_other(models: Models, size: nmpc_of.LoopSize, quick: bool, seed: int) -> tuple[dict[str, Any], list[Verdict]]:
-    """C14: predictive control on a grey box of minutes of its logs."""
-    name, run = nmpc_of.OTHER_NAME, models.other_grey(models.size.other[0], _grey_fit(quick))
-    spec = CONTROLLERS["nmpc"](attitude_m=nmpc_of.ATTITUDE_M)
-    named = (name, nmpc_of.variants(models.folder)[name])
-    rows = {name: nmpc_of.on_variant(models.folder, named, size, seed, spec, run)}
-    return {"loops": rows, "size": asdict(size)}, nmpc_of.loop_verdicts(rows, quick)
-
-
-def o4_grey_other(models: Models, size: tuning_of.TuningSize, quick: bool, seed: int) -> tuple[Any, list[Verdict]]:
-    """C14: gains in loam on grey boxes of more and fewer minutes of its logs in free air."""
-    minutes = sorted(models.size.other)
-    runs = {f"grey box of {count} min": models.other_grey(count, _grey_fit(quick)) for count in minutes}
-    rows, verdicts = tuning_of.tuning_in_soil(runs, size, seed), list[Verdict]()
-    for name in runs:
-        verdicts += tuning_of.tuning_verdicts({"twin": rows[name]}, quick, f", C14 in loam, {name}")
-    return rows, verdicts
-
-
-def o4_ground(models: Models, size: tuning_of.TuningSize, quick: bool, seed: int) -> tuple[Any, list[Verdict]]:
-    """C14: gains in loam on a grey box with a ground, beside what its ground explains of forces along logs."""
-    run = models.other_grounded(models.size.other[0], _grey_fit(quick))
-    rows = tuning_of.tuning_in_soil({"twin": run}, size, seed)
-    where = ", C14 in loam, grey box with a ground"
-    verdicts = tuning_of.tuning_verdicts(rows, quick, where)
-    grounds = tuning_of.over_grounds(size, seed, rows["twin"])
-    verdicts += tuning_of.tuning_verdicts({"twin": grounds}, quick, f"{where}, mean over draws of the ground")
-    facts = {"grounds": grounds, "ground": load_twin(run).provenance["ground"], "settings": asdict(size)}
-    return rows | facts, verdicts
-
-
-def _grey_fit(quick: bool) -> tuple[str, ...]:
-    return (models_of.QUICK_GREY if quick else models_of.GREY).fit
-
-
-def trained(folder: Path, size: Size, seed: int) -> dict[str, Path]:
-    """Run folders of the models of part lines, ``predictor`` and ``twin``; finished ones are read."""
-    source = folder / "data"
-    order = SimulationOrder(minutes=size.minutes, recordings=size.recordings, seed=seed + 11)
-    simulate_data_set(source, order)
-    changes = (f"task.horizons=[{LEAD_TICKS}]", "training.threads=1", *size.predictor)
-    train(DataSource.of(source), load_experiment(None, "quick", changes), folder / "predictor")
-    train_twin(DataSource.of(source), load_twin_experiment(None, size.twin), folder / "twin")
-    return {name: folder / name for name in ("predictor", "twin")}
-
-
-def lines(folder: Path, runs: Mapping[str, Path], size: Size) -> dict[str, dict[str, Any]]:
-    """Figures by variant and controller: errors a line, lever travel and times."""
-    pi, inversion = CONTROLLERS["pi"](), CONTROLLERS["inversion"]()
-    experiment = ControlExperiment(task=TASKS["grade"](), controller=pi, machine=MACHINE, loops=size.lines)
-    known = ControlBench(experiment, ControlSources(twin=runs["twin"], predictor=runs["predictor"])).models
-    contenders = {
-        "pi": (pi, known),
-        "inversion of a predictor": (inversion, ControlModels(predictor=known.predictor)),
-        "inversion of a twin": (inversion, ControlModels(twin=known.twin)),
-    }
-    wider = nmpc_of.wider_dead_band(folder)
+def variants(folder: Path) -> dict[str, Variant]:
+    """By name; the models of all but the last are those of the plant as it was."""
     sensors = asdict(load_machine(MACHINE).sensors)
-    variants: dict[str, tuple[str, dict[str, Any]]] = {
-        "as it was": (MACHINE, {}),
-        "oil at 65 degC": (MACHINE, {"oil_temperature": 65.0}),
-        "dead bands 3 points wider": (str(wider), {}),
-        "noise five times as large": (
-            MACHINE,
-            {"sensors": {name: nmpc_of.NOISE * sensors[name] for name in nmpc_of.NOISY}},
-        ),
+    return {
+        AS_IT_WAS[0]: AS_IT_WAS[1],
+        "oil at 65 degC": Variant(options={"oil_temperature": 65.0}),
+        "dead bands 3 points wider": Variant(machine=str(wider_dead_band(folder))),
+        "noise five times as large": Variant(options={"sensors": {name: NOISE * sensors[name] for name in NOISY}}),
+        "in loam": Variant(material=LOAM),
+        OTHER_NAME: Variant(machine=OTHER, other=True),
     }
-    rows: dict[str, dict[str, Any]] = {}
-    for variant, (machine, options) in list(variants.items())[: size.variants]:
-        rows[variant] = {}
-        for name, (spec, models) in contenders.items():
-            bench = ControlBench(replace(experiment, machine=machine), ControlSources(), models, options)
-            results = bench.results(spec)
-            scores = [result.score for result in results]
-            times = 1e6 * np.concatenate([result.solve_s for result in results])
-            rows[variant][name] = {
-                "position_rms_mm": [score.position_rms_mm for score in scores],
-                "position_p95_mm": [score.position_p95_mm for score in scores],
-                "path_rms_mm": [score.path_rms_mm for score in scores],
-                "attitude_rms_deg": [score.attitude_rms_deg for score in scores],
-                "lever_travel": [score.lever_travel for score in scores],
-                "energy_kj": [score.energy_kj for score in scores],
-                "violations": sum(sum(score.violations.values()) for score in scores),
-                "step_us": {"median": float(np.median(times)), "p99": float(np.percentile(times, 99.0))},
-            }
-    show_lines(rows)
+
+
+def wider_dead_band(folder: Path) -> Path:
+    """A machine file of M22 with wider dead bands of the main spools."""
+    machine = load_machine(MACHINE)
+    valves = machine.valves
+    bands = {
+        name: tuple(band + DEAD_BAND for band in getattr(valves, name))
+        for name in ("dead_band_extend", "dead_band_retract")
+    }
+    path = folder / "wider.toml"
+    path.write_text(tomli_w.dumps(MACHINE_FILE.plain(replace(machine, valves=replace(valves, **bands)))))
+    return path
+
+
+def tuned_pi(folder: Path, machine: str, size: LoopSize, seed: int) -> ControllerSpec:
+    """Gains of the PI loop tuned on the plant itself, along lines of their own; a finished tuning is read."""
+    run = folder / f"tuned_{machine.lower()}_{size.trials}_{size.tuned_lines}"
+    if (run / TUNED).is_file():
+        return load_control_experiment(run / TUNED).controller
+    experiment = ControlExperiment(task=TASKS["grade"](), controller=CONTROLLERS["pi"](), machine=machine, loops=1)
+    spec = TuningSpec(trials=size.trials, loops=size.tuned_lines, seed=seed)
+    plant = ControlSources()
+    return tune_gains(experiment, run, plant, plant, spec).best
+
+
+def loops(
+    models: Models, size: LoopSize, seed: int, nmpc: ControllerSpec, own: Path | None = None
+) -> dict[str, dict[str, Any]]:
+    """Figures by variant and controller.
+
+    Args:
+        models: of the benchmark.
+        size: how much is run.
+        seed: of the tuning of the PI loop.
+        nmpc: predictive controller.
+        own: run folder of the twin of M22 in place of the recurrent one; the other machine has none then.
+    """
+    folder, rows = models.folder, {}
+    named = list(variants(folder).items())[: 5 if own else 6]
+    # The last ones: the other machine is always among them.
+    for name, variant in [AS_IT_WAS, *named[1:][1 - size.variants :]]:
+        twin = models.other_twin() if variant.other else own or models.twin()
+        rows[name] = on_variant(folder, (name, variant), size, seed, nmpc, twin)
     return rows
 
 
-def show_lines(rows: Mapping[str, Mapping[str, Any]]) -> None:
-    heads = ["variant", "controller", "position, mm", "worst line", "path, mm", "attitude, deg", "levers", "step, us"]
+def on_variant(
+    folder: Path, named: tuple[str, Variant], size: LoopSize, seed: int, nmpc: ControllerSpec, twin: Path
+) -> dict[str, Any]:
+    """Figures by controller of one variant, with one twin of its machine; see `loops`."""
+    name, variant = named
+    machine = OTHER if variant.other else MACHINE
+    experiment = ControlExperiment(task=TASKS["grade"](), controller=nmpc, machine=machine, loops=1)
+    known = ControlBench(experiment, ControlSources(twin=twin)).models
+    contenders = {"pi": (tuned_pi(folder, machine, size, seed), known), "nmpc": (nmpc, known)}
+    if name == AS_IT_WAS[0]:
+        contenders["inversion of the twin"] = (CONTROLLERS["inversion"](), ControlModels(twin=known.twin))
+    row = {who: judged(folder, variant, size, *what) for who, what in contenders.items()}
+    show(name, row)
+    return row
+
+
+def judged(
+    folder: Path, variant: Variant, size: LoopSize, spec: ControllerSpec, models: ControlModels
+) -> dict[str, Any]:
+    """Figures of a controller on a variant, a list entry a line; draws that are in the folder already are read."""
+    figures: dict[str, Any] = {}
+    for first in DRAWS[: size.draws]:
+        told = (variant, size.lines, spec, first, _fingerprint(models))
+        key = hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
+        path = make_folder(folder / "loops") / f"{CONTROLLERS.name_of(spec)}_{key}.json"
+        for name, values in kept(path, lambda first=first: drawn(variant, size, spec, models, first)).items():
+            figures[name] = figures.get(name, type(values)()) + values
+    times = figures.pop("step_ms")
+    return figures | {"step_ms": {"median": float(np.median(times)), "p99": float(np.percentile(times, 99.0))}}
+
+
+def _fingerprint(models: ControlModels) -> str:
+    """Of the numbers of valve map and twin: loops of other models are other loops."""
+    state = hashlib.blake2b(digest_size=8)
+    arrays = {} if models.twin is None else models.twin.arrays()
+    if models.valve_map is not None:
+        arrays = arrays | {"speeds": models.valve_map.speeds, "levers": models.valve_map.levers}
+    for name, values in sorted(arrays.items()):
+        state.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    return state.hexdigest()
+
+
+def drawn(variant: Variant, size: LoopSize, spec: ControllerSpec, models: ControlModels, first: int) -> dict[str, Any]:
+    """Figures of a controller along a draw of lines."""
+    experiment = ControlExperiment(
+        task=TASKS["grade"](material=variant.material),
+        controller=spec,
+        machine=variant.machine,
+        loops=size.lines,
+        seed=first,
+    )
+    results = ControlBench(experiment, ControlSources(), models, variant.options).results()
+    scores = [result.score for result in results]
+    return {
+        "path_rms_mm": [score.path_rms_mm for score in scores],
+        "position_rms_mm": [score.position_rms_mm for score in scores],
+        "attitude_rms_deg": [score.attitude_rms_deg for score in scores],
+        "lever_travel": [score.lever_travel for score in scores],
+        "energy_kj": [score.energy_kj for score in scores],
+        "violations": sum(sum(score.violations.values()) for score in scores),
+        "events": sum(len(result.events) for result in results),
+        "step_ms": (1e3 * np.concatenate([result.solve_s for result in results])).round(4).tolist(),
+    }
+
+
+def show(variant: str, by_name: Mapping[str, Mapping[str, Any]]) -> None:
+    heads = [variant, "path, mm", "worst", "position, mm", "worst", "attitude, deg", "levers", "violations"]
+    heads += ["ms", "p99"]
     printed = [
         [
-            variant, name, mean(row["position_rms_mm"]), max(row["position_rms_mm"]), mean(row["path_rms_mm"]),
-            mean(row["attitude_rms_deg"]), mean(row["lever_travel"]), row["step_us"]["median"],
+            name, mean(row["path_rms_mm"]), max(row["path_rms_mm"]), mean(row["position_rms_mm"]),
+            max(row["position_rms_mm"]), mean(row["attitude_rms_deg"]), mean(row["lever_travel"]), row["violations"],
+            row["step_ms"]["median"], row["step_ms"]["p99"],
         ]
-        for variant, by_name in rows.items()
         for name, row in by_name.items()
     ]  # fmt: skip
     table(heads, printed)
 
 
-def line_verdicts(rows: Mapping[str, Mapping[str, Any]], quick: bool) -> list[Verdict]:
-    verdicts = []
-    for variant, by_name in rows.items():
-        rival = mean(by_name["pi"]["position_rms_mm"])
-        for name, row in by_name.items():
-            if name != "pi":
-                ours = mean(row["position_rms_mm"])
-                verdicts.append(verdict(f"{name} against pi, {variant}", ours, rival, "<= 0.6", "mm", quick))
-    return verdicts
+class Stopwatch:
+    """A controller, and the processor time of each of its steps, whatever else the machine does."""
+
+    def __init__(self, controller: Any) -> None:
+        self._controller = controller
+        self.seconds: list[float] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._controller, name)
+
+    def step(self, observation: Any, tick: int, *verdict: Any) -> Any:
+        """One tick."""
+        began = time.thread_time()
+        levers = self._controller.step(observation, tick, *verdict)
+        self.seconds.append(time.thread_time() - began)
+        return levers
 
 
-def mean(values: list[float]) -> float:
+def solve_times(twin: Path, spec: ControllerSpec, lines: int) -> dict[str, float]:
+    """Processor time of a tick of the predictive controller on a twin, ms."""
+    experiment = ControlExperiment(task=TASKS["grade"](), controller=spec, machine=MACHINE, loops=lines)
+    bench = ControlBench(experiment, ControlSources(twin=twin))
+    ticks = max(task.reference.ticks for task in bench.tasks) + 1
+    env = plant_of(MACHINE, ticks / experiment.rate_hz, experiment.rate_hz)
+    watches = []
+    for task in bench.tasks:
+        watches.append(Stopwatch(experiment.controller.build(interface_of(env), task.limits, bench.models)))
+        run_loop(env, watches[-1], task, task.seed)  # type: ignore[arg-type]
+    times = 1e3 * np.concatenate([watch.seconds for watch in watches])
+    row = {"median": float(np.median(times)), "p99": float(np.percentile(times, 99.0)), "ticks": len(times)}
+    print(f"processor time of a tick of nmpc: {row['median']:.2f} ms, p99 {row['p99']:.2f} ms")
+    return row
+
+
+def check(bench: Bench, rows: Mapping[str, Mapping[str, Any]]) -> None:
+    """Against the goals of the issue, and against the PI loop of the same run."""
+
+    def ask(name: str, ours: float, bound: float, unit: str = "mm") -> None:
+        bench.check(name, ours, bound, "<= 1", unit)
+
+    if AS_IT_WAS[0] in rows:
+        first = rows[AS_IT_WAS[0]]
+        nmpc = first["nmpc"]
+        ask("nmpc, path error, mean", mean(nmpc["path_rms_mm"]), 3.0)
+        ask("nmpc, path error, worst line", max(nmpc["path_rms_mm"]), 5.0)
+        ask("nmpc, position error, mean", mean(nmpc["position_rms_mm"]), 6.0)
+        ask("nmpc, attitude error, mean", mean(nmpc["attitude_rms_deg"]), 0.2, "deg")
+        ask("inversion of the twin, path error, mean", mean(first["inversion of the twin"]["path_rms_mm"]), 6.0)
+    bounds = {"in loam": 7.0, OTHER_NAME: 4.0}
+    for name, by_name in rows.items():
+        ours = mean(by_name["nmpc"]["path_rms_mm"])
+        if name != "as it was":
+            ask(f"nmpc, path error, mean, {name}", ours, bounds.get(name, 1.5 * 3.0))
+        ask(f"nmpc, path error, {name}, against pi", ours, max(LEAST_MM, mean(by_name["pi"]["path_rms_mm"])))
+        position = [mean(by_name[who]["position_rms_mm"]) for who in ("nmpc", "pi")]
+        ask(f"nmpc, position error, {name}, against pi", *position)
+        pairs = zip(by_name["nmpc"]["path_rms_mm"], by_name["pi"]["path_rms_mm"], strict=True)
+        worst = max(own / max(LEAST_MM, rival) for own, rival in pairs)
+        ask(f"nmpc, path error over that of pi, {name}, on the line where it is largest", worst, 1.0, "1")
+    violated = sum(row["violations"] for by_name in rows.values() for row in by_name.values())
+    ask("violated limits, all controllers and variants, plus one", violated + 1.0, 1.0, "1")
+
+
+def mean(values: Sequence[float]) -> float:
     return float(np.mean(values))
+
+
+@benchmark(
+    DATA_AND_PARTS,
+    option("--part", choices=["all", *PARTS], default="all"),
+    option("--draws", type=int, choices=[1, 2, 3], default=3, help="of six lines"),
+    option("--variants", type=int, choices=range(2, 7), default=6, help="of the plant, last ones"),
+)
+def main(bench: Bench) -> None:
+    # One folder: parts share recordings and models.
+    for part in PARTS if bench.options.part == "all" else (bench.options.part,):
+        seed = f"_seed{bench.seed}" if bench.seed else ""
+        bench.name = f"closed_loop_{part}{seed}"
+        bench.finish({part: measured(bench, part)})
+
+
+def measured(bench: Bench, part: str) -> dict[str, Any]:
+    """Figures of one part."""
+    size = QUICK if bench.quick else replace(FULL, draws=bench.options.draws, variants=bench.options.variants)
+    models = Models(bench.folder, models_of.QUICK if bench.quick else models_of.FULL, bench.seed)
+    grey = models_of.QUICK_GREY if bench.quick else models_of.GREY
+    if part == "grey_other":
+        return grey_other(bench, models, size, grey.fit)
+    return predictive(bench, models, size, models.grey(grey) if part == "grey" else None)
+
+
+def predictive(bench: Bench, models: Models, size: LoopSize, own: Path | None) -> dict[str, Any]:
+    """Figures of part nmpc, or with a grey box of its `own` of part grey."""
+    twin = own or models.twin()
+    # On unjudged lines a plan of 0.6 s was better with the network, and no better with the grey box.
+    spec = CONTROLLERS["nmpc"](**({"attitude_m": ATTITUDE_M} if own else {"blocks": PLAN}))
+    ahead = models_of.ahead_errors(models, twin, spec.load if own else 0.0)
+    rows = loops(models, size, bench.seed, spec, own)
+    times = solve_times(twin, spec, min(2, size.lines))
+    check(bench, rows)
+    bench.check("nmpc, processor time of a tick, p99", times["p99"], 2.0, "<= 1", "ms")
+    for ticks, goal in ((20, 2.0), (50, 4.0)):
+        for part in ("all", "all, load estimated", "free air") if own else ("all",):
+            name = f"velocities {ticks} ticks ahead, told the commands, {part}"
+            bench.check(name, ahead[part][str(ticks)], goal, "<= 1", "mm/s")
+    return {"ahead_mm_s": ahead, "loops": rows, "tick_ms": times, "size": asdict(size)}
+
+
+def grey_other(bench: Bench, models: Models, size: LoopSize, fit: Sequence[str]) -> dict[str, Any]:
+    """C14: predictive control on a grey box of minutes of its logs."""
+    name, run = OTHER_NAME, models.other_grey(fit)
+    spec = CONTROLLERS["nmpc"](attitude_m=ATTITUDE_M)
+    rows = {name: on_variant(models.folder, (name, variants(models.folder)[name]), size, bench.seed, spec, run)}
+    check(bench, rows)
+    return {"loops": rows, "size": asdict(size)}
 
 
 if __name__ == "__main__":

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from common import table
 from edp.config.twin import load_twin_experiment
@@ -23,7 +20,7 @@ from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training.twin_bundle import load_twin
 from edp.workflows.twin import train_twin
 from edp.workflows.twin.prepare_twin import prepare_twin
-from twin import WRONG
+from twin import write_guess
 
 MIX: Mapping[str, float] = {
     "isolated": 0.15,
@@ -40,18 +37,9 @@ JUDGED = (
     *("judge.seconds=20", "judge.at_s=[1.0,5.0,10.0]", "judge.covered_at_s=[0.1,1.0,10.0]", "judge.floors=[]"),
     *("judge.ahead_ticks=20", "training.patience=0"),
 )
-BESIDE = {"one_step": "one-step network", "static": "static map", "arx": "ARX"}
-"""Models that stand beside the twin, and their names in words."""
 AHEAD = (1, 5, 10, 20, 50)
 """Ticks ahead of measured ports at which the twin is judged, told the commands."""
 GROUND = ("dry_sand", "sandy_loam", "clay")
-
-
-ONE_STEP = (
-    *("twin.kind=recurrent", "twin.units=64", "training.lengths_s=[0.1]", "training.updates=[2000]"),
-    *("training.measured_share=0.99", "training.mixed_share=0.0"),
-)
-"""A network that is trained on measured feedback all but alone."""
 
 
 @dataclass(frozen=True)
@@ -85,26 +73,18 @@ class ModelSize:
         minutes: of M22.
         recordings: of M22.
         twin: settings of its twin.
-        one_step: settings of the network that is trained on measured feedback alone.
-        other: minutes of C14 from which a twin goes on; the first for the controllers, all for tuning.
+        other: minutes of C14 from which a twin goes on.
     """
 
     minutes: float
     recordings: int
     twin: tuple[str, ...]
-    one_step: tuple[str, ...]
-    other: tuple[int, ...]
+    other: int
 
 
-FULL = ModelSize(
-    *(180.0, 60, ("twin.kind=recurrent", "twin.units=96")),
-    ONE_STEP,
-    (20, 5, 45),
-)
+FULL = ModelSize(180.0, 60, ("twin.kind=recurrent", "twin.units=96"), 20)
 QUICK = ModelSize(
-    *(20.0, 20, ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1,0.3]", "training.updates=[20,20]")),
-    ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1]", "training.updates=[10]"),
-    (5,),
+    *(20.0, 20, ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1,0.3]", "training.updates=[20,20]")), 5
 )
 
 
@@ -123,11 +103,7 @@ class Models:
     def recordings(self) -> DataSource:
         """Of M22, in free air and in soil."""
         order = SimulationOrder(
-            minutes=self.size.minutes,
-            recordings=self.size.recordings,
-            seed=self.seed + 11,
-            mix=MIX,
-            materials=SOILS,
+            minutes=self.size.minutes, recordings=self.size.recordings, seed=self.seed + 11, mix=MIX, materials=SOILS
         )
         return self._simulated("recordings", order)
 
@@ -142,68 +118,28 @@ class Models:
         )
         return self._grey(self._simulated("air", order), "m22", self.folder / "guess.toml", "grey_twin", size.fit)
 
-    def other_grey(self, minutes: int, fit: Sequence[str]) -> Path:
-        """The like of C14 from minutes of its own logs in free air, and nothing of M22."""
-        source, guess = self._of_other("air", minutes, 41, MIX, "air"), self.folder / "guess_c14.toml"
-        return self._grey(source, "c14", guess, f"c14_grey_{minutes}", fit)
+    def other_grey(self, fit: Sequence[str]) -> Path:
+        """The grey box of C14 from minutes of its own logs in free air, and nothing of M22."""
+        name, order = f"c14_air_{self.size.other}", self._of_other(41, {"air": 1.0})
+        guess = self.folder / "guess_c14.toml"
+        return self._grey(self._simulated(name, order), "c14", guess, f"c14_grey_{self.size.other}", fit)
 
-    def other_grounded(self, minutes: int, fit: Sequence[str]) -> Path:
-        """That of C14 with a ground, which it learned from as many minutes of grading and digging in loam."""
-        start = self.other_grey(minutes, fit)
-        source = self._of_other("loam", minutes, 61, {"grading": 0.5, "dig": 0.5}, "sandy_loam")
-        name = f"c14_grounded_{minutes}"
-        train_twin(source, load_twin_experiment(None, ("ground=drag",)), self.folder / name, start=start)
-        return self.folder / name
+    def other_twin(self) -> Path:
+        """The twin of M22 gone on with minutes of C14 in free air and in soil."""
+        name, settings = f"c14_{self.size.other}", [one for one in self.size.twin if not one.startswith("twin.")]
+        return self._twin(self._simulated(name, self._of_other(21, SOILS)), f"{name}_twin", settings, self.twin())
 
-    def _of_other(self, name: str, minutes: int, draw: int, mix: Mapping[str, float], material: str) -> DataSource:
-        """Logs of C14 in one material."""
-        order = SimulationOrder(
-            machine="C14",
-            minutes=float(minutes),
-            recordings=max(5, minutes // 2),
-            seed=self.seed + draw,
-            mix=mix,
-            materials={material: 1.0},
-        )
-        return self._simulated(f"c14_{name}_{minutes}", order)
+    def _of_other(self, draw: int, materials: Mapping[str, float]) -> SimulationOrder:
+        """Logs of C14."""
+        minutes = self.size.other
+        return SimulationOrder(
+            machine="C14", minutes=float(minutes), recordings=max(5, minutes // 2), seed=self.seed + draw, mix=MIX,
+            materials=materials,
+        )  # fmt: skip
 
     def _grey(self, source: DataSource, machine: str, guess: Path, name: str, fit: Sequence[str]) -> Path:
-        told = tomllib.loads((resources.files("edp.sim") / "machines" / f"{machine}.toml").read_text(encoding="utf-8"))
-        for key, factors in WRONG.items():
-            bodies = told["bodies"]
-            bodies[key] = [value * factor for value, factor in zip(bodies[key], factors, strict=True)]
-        guess.write_text(tomli_w.dumps(told), encoding="utf-8")
+        write_guess(machine, guess)
         return self._twin(source, name, ("twin.kind=greybox", f"twin.linkage={guess}", *fit))
-
-    def beside(self, name: str) -> Path:
-        """A model of `BESIDE` that stands beside the twin of M22."""
-        settings = self.size.one_step if name == "one_step" else (f"twin.kind={name}",)
-        return self._twin(self.recordings(), name, settings)
-
-    def other_twin(self, minutes: int) -> Path:
-        """The twin of M22 gone on with minutes of C14."""
-        return self._twin(
-            self._other_logs(minutes), f"c14_{minutes}_twin", tuple(_training(self.size.twin)), self.twin()
-        )
-
-    def other_beside(self, name: str, minutes: int) -> Path:
-        """A model that stands beside it, on the same minutes of C14: the one-step network of M22 goes on with them."""
-        source, own = self._other_logs(minutes), f"c14_{minutes}_{name}"
-        if name == "one_step":
-            return self._twin(source, own, tuple(_training(self.size.one_step)), self.beside(name))
-        return self._twin(source, own, (f"twin.kind={name}",))
-
-    def _other_logs(self, minutes: int) -> DataSource:
-        """Logs of C14 in free air and in soil."""
-        order = SimulationOrder(
-            machine="C14",
-            minutes=float(minutes),
-            recordings=max(5, minutes // 2),
-            seed=self.seed + 21,
-            mix=MIX,
-            materials=SOILS,
-        )
-        return self._simulated(f"c14_{minutes}", order)
 
     def _simulated(self, name: str, order: SimulationOrder) -> DataSource:
         simulate_data_set(self.folder / name, order, workers=1)
@@ -213,11 +149,6 @@ class Models:
         experiment = load_twin_experiment(None, (*settings, *JUDGED))
         train_twin(source, experiment, self.folder / name, workers=1, start=start)
         return self.folder / name
-
-
-def _training(settings: Sequence[str]) -> list[str]:
-    """Settings without those of the formulation."""
-    return [change for change in settings if not change.startswith("twin.")]
 
 
 def ahead_errors(models: Models, run: Path, load: float = 0.0) -> dict[str, Any]:

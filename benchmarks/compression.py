@@ -18,14 +18,13 @@ from __future__ import annotations
 import argparse
 import shutil
 import statistics
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import controller_memory
 import program_bytes
-from common import Verdict, finish, parser, table, verdict
+from common import DATA, WORK, Bench, benchmark, option, table
 from edp.config.experiment import Experiment, load_experiment
 from edp.evaluation.controller import Budget
 from edp.training import load_bundle
@@ -123,16 +122,14 @@ def memory(row: Judged) -> int:
     return row.resource_usage.ram_bytes - row.resource_usage.parameter_bytes
 
 
-def verdicts_of(
-    found: Sequence[CompressionResult], objects: Sequence[dict[str, int]], horizon: int, quick: bool
-) -> list[Verdict]:
+def check(bench: Bench, found: Sequence[CompressionResult], objects: Sequence[dict[str, int]], horizon: int) -> None:
     """The goals at one horizon: the largest of what is taken, the median of errors over the seeds.
 
     Args:
+        bench: of the run.
         found: the searches.
         objects: of each search what was compiled; empty where nothing was.
         horizon: in ticks.
-        quick: whether this is the short form.
     """
     best = [one.best for one in found if one.best is not None]
     if len(best) < len(found):
@@ -147,67 +144,61 @@ def verdicts_of(
         taken = [(one["constants"], one["state"] + one["stack"]) for one in objects]
     bytes_, used = (max(column) for column in zip(*taken, strict=True))
     cycles = max(row.resource_usage.cycles[2] for row in best)
-    told = [
-        verdict(f"k={horizon}: constants", bytes_, 100_000, "<= 1.0", "bytes", quick),
-        verdict(f"k={horizon}: cycles, high estimate, M4F", cycles, BUDGET.cycles, "<= 1.0", "cycles", quick),
-        verdict(f"k={horizon}: state and stack", used, MEMORY, "<= 1.0", "bytes", quick),
-        verdict(f"k={horizon}: sealed test set MAE against the teacher", boxed("chosen"), boxed("teacher"), "<= 1.05",
-                "mm/s", quick),
-    ]  # fmt: skip
+    name = f"k={horizon}:"
+    bench.check(f"{name} constants", bytes_, 100_000, "<= 1.0", "bytes")
+    bench.check(f"{name} cycles, high estimate, M4F", cycles, BUDGET.cycles, "<= 1.0", "cycles")
+    bench.check(f"{name} state and stack", used, MEMORY, "<= 1.0", "bytes")
+    against = "sealed test set MAE against the teacher"
+    bench.check(f"{name} {against}", boxed("chosen"), boxed("teacher"), "<= 1.05", "mm/s")
     tight = [[row for row in one.rows if row.fits and row.resource_usage.cycles[2] <= TIGHT] for one in found]
     if all(tight):
         error = statistics.median(min(row.error for row in rows) for rows in tight)
-        told.append(verdict(f"k={horizon}: validation MAE within {TIGHT:,} cycles", error, 1.0, "<= 1.1", "1", quick))
+        bench.check(f"{name} validation MAE within {TIGHT:,} cycles", error, 1.0, "<= 1.1", "1")
     rivals = {row.name for one in found for row in one.rows if row.number_format != FORMAT}
     if rivals:
-        errors = [[row.error for one in found for row in one.rows if row.name == name] for name in rivals]
+        errors = [[row.error for one in found for row in one.rows if row.name == way] for way in rivals]
         rival = min(map(statistics.median, errors))
         ours = statistics.median(row.error for row in best)
-        told.append(verdict(f"k={horizon}: validation MAE against the best of Table 4.9's ways", ours, rival, "<= 1.0",
-                            "of the teacher's", quick))  # fmt: skip
-    return told
+        against = "validation MAE against the best of Table 4.9's ways"
+        bench.check(f"{name} {against}", ours, rival, "<= 1.0", "of the teacher's")
 
 
-def main() -> None:
-    made = parser(__doc__ or "")
-    made.add_argument("--work", type=Path, default=None, help="folder that keeps data and runs")
-    made.add_argument("--units", type=int, nargs="*", default=[], help="widths of the smaller networks; default 68")
-    made.add_argument(
-        "--recipes", nargs="+", default=list(RECIPES), choices=RECIPES, help="how they are made; default all"
-    )
-    made.add_argument("--updates", type=int, default=4000, help="of the teacher and of each student")
-    made.add_argument("--minutes", type=float, default=300.0, help="minutes of simulated recordings")
-    made.add_argument("--horizons", type=int, nargs="+", default=[10, 1])
-    made.add_argument("--seeds", type=int, default=2)
-    arguments = made.parse_args()
-    arguments.units = arguments.units or ([24] if arguments.quick else [68])
-    quick = arguments.quick
+@benchmark(
+    WORK,
+    DATA,
+    option("--units", type=int, nargs="*", default=[], help="widths of the smaller networks; default 68"),
+    option("--recipes", nargs="+", default=list(RECIPES), choices=RECIPES, help="how they are made; default all"),
+    option("--updates", type=int, default=4000, help="of the teacher and of each student"),
+    option("--minutes", type=float, default=300.0, help="minutes of simulated recordings"),
+    option("--horizons", type=int, nargs="+", default=[10, 1]),
+    option("--seeds", type=int, default=2),
+)
+def main(bench: Bench) -> object:
+    quick, folder, data, arguments = bench.quick, bench.folder, bench.data, bench.options
+    arguments.units = arguments.units or ([24] if quick else [68])
     horizons, seeds = ([10], 1) if quick else (arguments.horizons, arguments.seeds)
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.work or Path(temporary)
-        data = arguments.data or folder / "data"
-        minutes, recordings = (4.0, 6) if quick else (arguments.minutes, int(arguments.minutes / 3))
-        simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=recordings))
-        searches: dict[int, list[CompressionResult]] = {horizon: [] for horizon in horizons}
-        objects: dict[int, list[dict[str, int]]] = {horizon: [] for horizon in horizons}
-        for seed in range(arguments.seed, arguments.seed + seeds):
-            for horizon in horizons:
-                found = one(DataSource.of(data), horizon, seed, folder, arguments)
-                searches[horizon].append(found)
-                chosen = folder / f"k{horizon}_seed{seed}" / "chosen_w8a16"
-                objects[horizon].append(compiled(found.best, chosen) if found.best else {})
-                print(f"\nk = {horizon}, seed {seed}: validation part; * is chosen", flush=True)
-                table(["network", "MAE mm/s", "over teacher %", "parameters", "bytes", "format", "cycles", "budget"],
-                      rows_of(found, horizon))  # fmt: skip
-                box = found.held_out_test["scores"] if found.best else {}
-                print("compiled:", objects[horizon][-1])
-                print("sealed test set:", {name: round(score[str(horizon)]["mae"], 4) for name, score in box.items()})
-    verdicts = [v for k, found in searches.items() for v in verdicts_of(found, objects[k], k, quick)]
-    kept = {
+    minutes, recordings = (4.0, 6) if quick else (arguments.minutes, int(arguments.minutes / 3))
+    simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=recordings))
+    searches: dict[int, list[CompressionResult]] = {horizon: [] for horizon in horizons}
+    objects: dict[int, list[dict[str, int]]] = {horizon: [] for horizon in horizons}
+    for seed in range(bench.seed, bench.seed + seeds):
+        for horizon in horizons:
+            found = one(DataSource.of(data), horizon, seed, folder, arguments)
+            searches[horizon].append(found)
+            chosen = folder / f"k{horizon}_seed{seed}" / "chosen_w8a16"
+            objects[horizon].append(compiled(found.best, chosen) if found.best else {})
+            print(f"\nk = {horizon}, seed {seed}: validation part; * is chosen", flush=True)
+            table(["network", "MAE mm/s", "over teacher %", "parameters", "bytes", "format", "cycles", "budget"],
+                  rows_of(found, horizon))  # fmt: skip
+            box = found.held_out_test["scores"] if found.best else {}
+            print("compiled:", objects[horizon][-1])
+            print("sealed test set:", {name: round(score[str(horizon)]["mae"], 4) for name, score in box.items()})
+    for k, found in searches.items():
+        check(bench, found, objects[k], k)
+    return {
         f"k={k}": [facts_of(one, k, made_of) for one, made_of in zip(found, objects[k], strict=True)]
         for k, found in searches.items()
     }
-    finish("compression", verdicts, arguments.seed, kept)
 
 
 if __name__ == "__main__":

@@ -5,9 +5,14 @@ The grey box of M22 of `closed_loop.py --part grey` (fitted where --data has non
 is graded by the controller in Python; its observations are fed to the compiled one, whose levers are compared tick by
 tick from the same memory. Then the compiled one grades the 18 lines of `closed_loop.py` in free air and in loam.
 
-Time, instructions and their cycles on a Cortex-M7 are measured as in `control_step.py`. The table of the Cortex-M4
-knows no double precision, in which this controller computes: the careful estimate adds 2 cycles to each product or sum
-in it and 16 to each division or root, and takes no second instruction a cycle.
+Time is processor time on this computer, one thread, a tick at a time. Instructions are counted by Callgrind here, and
+by QEMU on a Cortex-M7 with double precision, the mean over ticks behind the first 25. Ticks of a small plan are traced
+on the emulated M7, and each instruction is given its cycles on a Cortex-M4 as in `controller_cycles.py` (double
+precision counts as single); a Cortex-M7 takes 0.5 of these cycles at best and 0.68 as a rule
+(`edp.evaluation.controller`). That table knows no double precision, in which this controller computes: the careful
+estimate adds 2 cycles to each product or sum in it and 16 to each division or root, and takes no second instruction a
+cycle. Memory has no wait states in this estimate: on a board the numbers of the twin must lie in cache or tightly
+coupled memory.
 """
 
 from __future__ import annotations
@@ -17,92 +22,205 @@ import re
 import subprocess
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import closed_loop as loops
 import closed_loop_models as models_of
-import closed_loop_nmpc as nmpc_of
-import control_step as step_of
-from common import finish, in_folder, kept, parser, table, verdict
-from control_step_rival import Rival
+from board import M7, QEMU_M7, build_image, callgrind, listed_sources, run, run_image, sizes_on_m7
+from common import DATA_AND_PARTS, Bench, benchmark, kept, option, table
 from controller_cycles import traced_image
 from edp.config.control import ControlExperiment
 from edp.control.controllers import CONTROLLERS
+from edp.control.controllers.nmpc import PredictiveControl
 from edp.control.loop import run_loop
-from edp.control.tasks import TASKS
+from edp.control.models import ControlModels
+from edp.control.plant import interface_of
+from edp.control.plants import plant_of
+from edp.control.tasks import TASKS, draw_task
+from edp.control.tasks.grade import Grade
+from edp.control.valve_map import ValveMap
 from edp.evaluation.controller import CORES
-from edp.export.controller import write_controller
+from edp.export.controller import ControllerParts, write_controller
+from edp.sim.excitation.levers import speed_table
 from edp.storage import make_folder
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.workflows.control import ControlBench, ControlSources
-from edp.workflows.control.export_controller import parts_of
+from edp.workflows.control.export_controller import golden_loop, parts_of
+from edp.workflows.control.kept import KeptController
 
-PROGRAMS = ("gcc", "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
+PROGRAMS = ("gcc", "valgrind", "arm-none-eabi-gcc", "arm-none-eabi-size", "arm-none-eabi-objdump", "qemu-system-arm")
 
+WARM, MOST = 25, 120
+"""Ticks before anything is counted (the look-back begins after 20), and of the loop that is kept."""
+CLOCK_MHZ, TICK_MS = 480.0, 10.0
+FLAGS = ("-std=gnu99", "-O2", "-ffp-contract=off", "-fno-tree-loop-vectorize", "-I.")
 PLANS = ((2, 3, 4, 6, 10, 15), (3, 7, 10, 20), (4, 12, 24))
 GRADED = {
     "as it was": ("", CONTROLLERS["nmpc"]()),
-    "in loam": (nmpc_of.LOAM, CONTROLLERS["nmpc"]()),
+    "in loam": (loops.LOAM, CONTROLLERS["nmpc"]()),
     "as it was, attitude_m = 2": ("", CONTROLLERS["nmpc"](attitude_m=2.0)),
-    "in loam, attitude_m = 2": (nmpc_of.LOAM, CONTROLLERS["nmpc"](attitude_m=2.0)),
+    "in loam, attitude_m = 2": (loops.LOAM, CONTROLLERS["nmpc"](attitude_m=2.0)),
 }
 """Plants and controllers; the heavier weight of the attitude was chosen on lines that are not judged."""
 DOUBLE = (2, 16)
 """Cycles that a product or sum, and a division or root, may take more in double precision on a Cortex-M7."""
-RIVAL_TICKS = (30, 60, 90)
-"""Of the loop, at which CasADi solves the same problem."""
 TRACED, SHORT = (2, 3), (2, 4, 6)
 """Ticks of two traces, and the plan that is traced: 3 million instructions of one tick are as many lines."""
 
 
-def main() -> None:
-    arguments_of = parser(__doc__ or "", PROGRAMS)
-    arguments_of.add_argument("--twin", type=Path, default=None, help="run folder of a grey box, in place of a fit")
-    arguments = arguments_of.parse_args()
-    found: dict[str, Any] = {}
+PROGRAM = """
+#include "machine_control.h"
+#include "machine_control_golden.h"
+#include <stdio.h>
+#ifdef __arm__
+#define SYST_CSR (*(volatile uint32_t *)0xE000E010u)
+#define SYST_RVR (*(volatile uint32_t *)0xE000E014u)
+#define SYST_CVR (*(volatile uint32_t *)0xE000E018u)
+#else
+#include <time.h>
+static double now_us(void) {
+    struct timespec t;
+    (void)clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &t);
+    return 1e6 * (double)t.tv_sec + 1e-3 * (double)t.tv_nsec;
+}
+#endif
+static machine_control control;
+static const edp_reference reference = {GOLDEN_ROWS, golden_strokes, golden_tip};
+int main(void) {
+    float levers[EDP_AXES];
+    unsigned long long total = 0u;
+    (void)total;
+    (void)machine_control_begin(&control, golden_measured[0], &reference);
+    for (unsigned tick = 0; tick < TICKS; tick++) {
+#if defined(__arm__) && defined(COUNTED)
+        SYST_RVR = 0xFFFFFFu;
+        SYST_CVR = 0u;
+        SYST_CSR = 5u;
+        const uint32_t start = SYST_CVR;
+#elif defined(TIMED)
+        const double start = now_us();
+#endif
+        (void)machine_control_step(&control, golden_measured[tick], levers);
+#if defined(__arm__) && defined(COUNTED)
+        total += (tick < SKIPPED) ? 0u : (((start - SYST_CVR) & 0xFFFFFFu) * 40u);
+#elif defined(TIMED)
+        (void)printf("%.3f %u\\n", now_us() - start, (unsigned)control.iterations);
+#endif
+    }
+#ifdef COUNTED
+    (void)printf("%lu", (unsigned long)(total / (TICKS - SKIPPED)));
+#endif
+    return (int)(control.neutral + control.fallbacks);
+}
+"""
 
-    def measure(folder: Path) -> None:
-        models = models_of.Models(folder, models_of.FULL, arguments.seed)
-        run = arguments.twin or models.grey(models_of.QUICK_GREY if arguments.quick else models_of.GREY)
-        twin, own = load_twin(run), make_folder(folder / "controllers")
-        # What a run of this benchmark has left here is read.
-        found.update(kept(own / "costs.json", lambda: costs(twin, own, arguments.seed, arguments.quick)))
-        found["rival"] = kept(own / "rival.json", lambda: rivalled(twin, own / "rival", arguments.seed))
-        found["lines"] = kept(own / "lines.json", lambda: graded(run, twin, own / "lines", arguments.quick))
 
-    in_folder(arguments.data, measure)
-    first = found["plans"][0]
-    rows = [
+@benchmark(
+    DATA_AND_PARTS, option("--twin", type=Path, help="run folder of a grey box, in place of a fit"), programs=PROGRAMS
+)
+def main(bench: Bench) -> object:
+    models = models_of.Models(bench.folder, models_of.FULL, bench.seed)
+    run_of = bench.options.twin or models.grey(models_of.QUICK_GREY if bench.quick else models_of.GREY)
+    twin, own = load_twin(run_of), make_folder(bench.folder / "controllers")
+    # What a run of this benchmark has left here is read.
+    found = kept(own / "costs.json", lambda: costs(twin, own, bench.seed, bench.quick))
+    found["lines"] = kept(own / "lines.json", lambda: graded(run_of, twin, own / "lines", bench.quick))
+    first, air = found["plans"][0], found["lines"]["as it was"]
+    for name, ours, goal, unit in (
         ("p99 of a tick in C on this machine", found["host_us"]["p99"] / 1000.0, 2.0, "ms"),
-        ("estimated ms on a Cortex-M7 at 480 MHz, as a rule", first["typical_ms"], step_of.TICK_MS, "ms"),
-        ("the same, careful", first["careful_ms"], step_of.TICK_MS, "ms"),
+        ("estimated ms on a Cortex-M7 at 480 MHz, as a rule", first["typical_ms"], TICK_MS, "ms"),
+        ("the same, careful", first["careful_ms"], TICK_MS, "ms"),
         ("largest difference of a lever from that in Python, from the same memory", found["lever"], 2e-3, "1"),
-    ]
-    air = found["lines"]["as it was"]
-    rows += [
         ("path error in C, mean of the lines in free air", float(np.mean(air["path_rms_mm"])), 3.0, "mm"),
         ("p99 of a tick in C along the lines", air["tick_ms"]["p99"], 2.0, "ms"),
-    ]
-    rival = found["rival"]
-    name = "a tick of the controller in C against one iteration of CasADi's sqpmethod"
-    ratio = verdict(name, rival["ours_ms"], float(np.median(rival["rival_ms"])), "<= 0.1", "ms", arguments.quick)
-    verdicts = [verdict(name, ours, goal, "<= 1", unit, arguments.quick) for name, ours, goal, unit in rows]
-    finish("control_step_grey", [ratio, *verdicts], arguments.seed, found)
+    ):
+        bench.check(name, ours, goal, "<= 1", unit)
+    return found
+
+
+class LoopBench:
+    """One line on the simulator, and what controllers on it export.
+
+    Args:
+        seed: of the line.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.env = plant_of("M22", 40.0, 100.0)
+        self.plant = interface_of(self.env)
+        self.valves = ValveMap(*speed_table(self.env.machine))
+        self.task = Grade(length_m=(0.8, 1.0), speed_m_s=0.4, lead_s=0.2, hold_s=0.2)
+        self.drawn = draw_task(self.task, self.plant.geometry, 100.0, seed)
+        self._observed: np.ndarray | None = None
+
+    def exported(
+        self, twin: TwinBundle, blocks: tuple[int, ...], folder: Path, **options: float
+    ) -> tuple[KeptController, ControllerParts]:
+        """A controller on this twin, written as C with the loop of the first one."""
+        spec = PredictiveControl(blocks=blocks, **options)
+        models = ControlModels(self.valves, twin.twin)
+        experiment = ControlExperiment(task=self.task, controller=spec)
+        if self._observed is None:
+            controller = spec.build(self.plant, self.drawn.limits, models)
+            result = run_loop(self.env, controller, self.drawn, 0)
+            self._observed = result.recording.values[:MOST, : len(self.plant.channels)].astype(float)
+        reference = self.drawn.reference
+        kept = KeptController(experiment, self.plant, models, twin, self._observed,
+                              np.zeros((len(self._observed), 3)), reference.strokes, reference.tip)  # fmt: skip
+        parts = parts_of(experiment, self.plant, models, twin)
+        write_controller(replace(parts, golden=golden_loop(parts, kept)), "machine", folder)
+        (folder / "program.c").write_text(PROGRAM)
+        return kept, parts
+
+
+def host_times(folder: Path) -> np.ndarray:
+    """Microseconds of processor and iterations of each tick behind the first ones, the fastest of three runs each."""
+    run(["gcc", *FLAGS, "-DTIMED", f"-DTICKS={MOST}u", *controller_sources(folder), "-lm", "-o", "timed"], folder)
+    runs = [np.array([line.split() for line in run(["./timed"], folder).splitlines()], float) for _ in range(3)]
+    best = runs[0].copy()
+    best[:, 0] = np.min([each[:, 0] for each in runs], axis=0)
+    return best[WARM:]
+
+
+def host_instructions(folder: Path) -> int:
+    """Instructions of a tick on this computer."""
+    counts = []
+    for ticks in (WARM, WARM + 20):
+        run(["gcc", *FLAGS, f"-DTICKS={ticks}u", *controller_sources(folder), "-lm", "-o", "program"], folder)
+        counts.append(callgrind(folder))
+    return (counts[1] - counts[0]) // 20
+
+
+def controller_sources(folder: Path) -> list[str]:
+    """The program, and the C files of the controller."""
+    return ["program.c", *listed_sources(folder)]
+
+
+def built_for_m7(folder: Path, *flags: str) -> None:
+    build_image(folder, M7, controller_sources(folder), "-fno-tree-loop-vectorize", *flags)
+
+
+def m7_instructions(folder: Path) -> int:
+    """Executed instructions of a tick on the M7, the mean over four behind the first ones."""
+    built_for_m7(folder, "-DCOUNTED", f"-DTICKS={WARM + 4}u", f"-DSKIPPED={WARM}u")
+    return int(run_image(folder, QEMU_M7)[-1])
 
 
 def costs(twin: TwinBundle, folder: Path, seed: int, quick: bool) -> dict[str, Any]:
     """Figures of the default plan, and costs by plan."""
-    bench = step_of.LoopBench(seed)
+    loop = LoopBench(seed)
     plans, host, lever, calls = [], np.zeros((1, 2)), 0.0, 0
     each: Mapping[str, float] = {}
     for blocks in PLANS[:1] if quick else PLANS:
         own = folder / "_".join(map(str, blocks))
-        bench.exported(twin, blocks, own)
+        loop.exported(twin, blocks, own)
         if not plans:
-            host, calls, lever = step_of.host_times(own), step_of.callgrind(own), self_test(own)
-            bench.exported(twin, SHORT, folder / "short")
+            host, calls, lever = host_times(own), host_instructions(own), self_test(own)
+            loop.exported(twin, SHORT, folder / "short")
             each = cycles_of(folder / "short")
         plans.append(on_m7(own, blocks, each))
     table(
@@ -166,10 +284,10 @@ def graded(run: Path, twin: TwinBundle, folder: Path, quick: bool) -> dict[str, 
     for name, (material, spec) in list(GRADED.items())[: 1 if quick else None]:
         rows[name] = row = {"path_rms_mm": [], "position_rms_mm": [], "attitude_rms_deg": [], "violations": 0}
         compiled: list[Compiled] = []
-        for first in nmpc_of.DRAWS[:1] if quick else nmpc_of.DRAWS:
+        for first in loops.DRAWS[:1] if quick else loops.DRAWS:
             experiment = ControlExperiment(
                 task=TASKS["grade"](material=material), controller=spec, machine="M22",
-                loops=1 if quick else nmpc_of.FULL.lines, seed=first,
+                loops=1 if quick else loops.FULL.lines, seed=first,
             )  # fmt: skip
             bench = ControlBench(experiment, ControlSources(twin=run))
             library = as_library(bench, experiment, twin, folder / name.replace(" ", "_"))
@@ -196,33 +314,19 @@ def graded(run: Path, twin: TwinBundle, folder: Path, quick: bool) -> dict[str, 
     return rows
 
 
-def rivalled(twin: TwinBundle, folder: Path, seed: int) -> dict[str, Any]:
-    """Milliseconds of CasADi's `sqpmethod` and of the C on one problem, and how far their steps are apart.
-
-    Forces are not estimated here: the exported form of the twin has none to be told of.
-    """
-    bench = step_of.LoopBench(seed)
-    recorded, parts = bench.exported(twin, PLANS[0], folder / "c", load=0.0)
-    rival = Rival(recorded, parts, folder / "casadi")
-    spent, apart = rival.compare(recorded, RIVAL_TICKS)
-    host = step_of.host_times(folder / "c")
-    print(f"CasADi's sqpmethod: {np.median(spent):.1f} ms an iteration, its step within {apart:.1e} m/s of ours")
-    return {"rival_ms": spent, "apart_m_s": apart, "ours_ms": float(np.median(host[:, 0])) / 1000.0}
-
-
 def as_library(bench: ControlBench, experiment: ControlExperiment, twin: TwinBundle, folder: Path) -> Path:
     """The controller of a bench as a shared library; valve maps of other draws are others."""
     own = folder / str(experiment.seed)
     write_controller(parts_of(experiment, bench.plant, bench.models, twin), "machine", own)
     (own / "program.c").write_text("")
-    sources = step_of.sources_of(own)[1:]
-    step_of.run(["gcc", *step_of.FLAGS, "-fPIC", "-shared", *sources, "-lm", "-o", "machine.so"], own)
+    sources = listed_sources(own)
+    run(["gcc", *FLAGS, "-fPIC", "-shared", *sources, "-lm", "-o", "machine.so"], own)
     return own / "machine.so"
 
 
 def self_test(folder: Path) -> float:
     """Largest difference of a lever that the exported test has seen; it must pass."""
-    step_of.run(["gcc", *step_of.FLAGS, *step_of.sources_of(folder)[1:], "host_test.c", "-lm", "-o", "tested"], folder)
+    run(["gcc", *FLAGS, *listed_sources(folder), "host_test.c", "-lm", "-o", "tested"], folder)
     said = subprocess.run(["./tested"], cwd=folder, capture_output=True, text=True, check=False)
     worst = re.search(r"difference of a lever: (\S+)", said.stdout)
     if said.returncode or worst is None:
@@ -236,8 +340,8 @@ def cycles_of(folder: Path) -> dict[str, float]:
     for name, double in {"table": (0, 0), "careful": DOUBLE}.items():
         counts = []
         for ticks in TRACED:
-            step_of.built_for_m7(folder, f"-DTICKS={ticks}u")
-            counts.append(traced_image(folder, step_of.QEMU, double))
+            built_for_m7(folder, f"-DTICKS={ticks}u")
+            counts.append(traced_image(folder, QEMU_M7, double))
         (few, short), (many, long) = counts
         found[name] = (long - short) / (many - few)
     return found
@@ -245,28 +349,14 @@ def cycles_of(folder: Path) -> dict[str, float]:
 
 def on_m7(folder: Path, blocks: tuple[int, ...], each: Mapping[str, float]) -> dict[str, Any]:
     """Instructions, milliseconds and bytes."""
-    core, count = CORES["cortex_m7"], step_of.m7_instructions(folder)
-    ms = count / (step_of.CLOCK_MHZ * 1000.0)
-    flash, state = sizes_of(folder)
+    core, count = CORES["cortex_m7"], m7_instructions(folder)
+    ms = count / (CLOCK_MHZ * 1000.0)
+    flash, state = sizes_on_m7(folder, listed_sources(folder), "machine_control.h", "machine_control")
     return {
         "blocks": blocks, "instructions": count, "low_ms": ms * each["table"] * core.low,
         "typical_ms": ms * each["table"] * core.typical, "careful_ms": ms * each["careful"],
         "flash_bytes": flash, "state_bytes": state,
     }  # fmt: skip
-
-
-def sizes_of(folder: Path) -> tuple[int, int]:
-    """Bytes of code and constants on a Cortex-M7, and of the state."""
-    made = []
-    for source in step_of.sources_of(folder)[1:]:
-        made.append(f"{Path(source).stem}_m7.o")
-        step_of.run(["arm-none-eabi-gcc", *step_of.FLAGS, *step_of.M7, "-c", source, "-o", made[-1]], folder)
-    lines = step_of.run(["arm-none-eabi-size", *made], folder).splitlines()[1:]
-    flash = sum(int(line.split()[0]) + int(line.split()[1]) for line in lines)
-    (folder / "state.c").write_text('#include "machine_control.h"\nchar state[sizeof(machine_control)];\n')
-    step_of.run(["arm-none-eabi-gcc", *step_of.FLAGS, *step_of.M7, "-c", "state.c", "-o", "state_m7.o"], folder)
-    told = step_of.run(["arm-none-eabi-size", "state_m7.o"], folder).splitlines()[1]
-    return flash, int(told.split()[2])
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from common import finish, parser, table, verdict
+from board import M4, QEMU_M4, build_image, on_board, run, sources_of
+from common import Bench, benchmark, option, table
 from edp.config.experiment import load_experiment
 from edp.data.scaling import Scaler
 from edp.data.task import Task
@@ -33,11 +34,10 @@ from edp.networks import build_model
 from edp.networks.predictor import ModelSpec
 from edp.signals import TABLE_A1, Kind
 from edp.training.bundle import Bundle
-from embedded_step import BOARD, M4, make, on_board, sources_of, whole
+from embedded_step import make, whole
 
 PROGRAMS = ("arm-none-eabi-gcc", "arm-none-eabi-objdump", "qemu-system-arm")
 
-QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting-config", "enable=on,target=native")
 TRACE = ("-singlestep", "-d", "exec,nochain", "-D", "/dev/stderr")
 PROGRAM = """
 #include "predictor.h"
@@ -102,13 +102,11 @@ def fixed_cycles(word: str, operands: str) -> tuple[int, bool]:
 
 
 # Words that end like a condition and have none.
-TAKEN = set(
-    re.findall(
-        r"\w+",
-        "muls bics lsls movs adcs sbcs vmls vfms vnmls vfnms smmls mls teq umlal smlal vcvt svc bls bcs bcc bvs bvc "
-        "blt ble bge bgt bhi bmi bpl beq bne",
-    )
-)
+TAKEN = {
+    "muls", "bics", "lsls", "movs", "adcs", "sbcs", "vmls", "vfms", "vnmls", "vfnms", "smmls", "mls", "teq", "umlal",
+    "smlal", "vcvt", "svc", "bls", "bcs", "bcc", "bvs", "bvc", "blt", "ble", "bge", "bgt", "bhi", "bmi", "bpl", "beq",
+    "bne",
+}  # fmt: skip
 
 
 def disassembled(folder: Path, double: tuple[int, int] = (0, 0)) -> dict[int, tuple[int, bool, bool, int]]:
@@ -118,11 +116,9 @@ def disassembled(folder: Path, double: tuple[int, int] = (0, 0)) -> dict[int, tu
         folder: with ``image.elf``.
         double: cycles that a product or sum, and a division or root, takes more in double precision.
     """
-    said = subprocess.run(
-        ["arm-none-eabi-objdump", "-d", "image.elf"], cwd=folder, check=True, capture_output=True, text=True
-    )
+    said = run(["arm-none-eabi-objdump", "-d", "image.elf"], folder)
     found = {}
-    for line in said.stdout.splitlines():
+    for line in said.splitlines():
         match = LINE.match(line)
         if match is None:
             continue
@@ -139,10 +135,8 @@ def disassembled(folder: Path, double: tuple[int, int] = (0, 0)) -> dict[int, tu
 
 def traced(folder: Path, ticks: int) -> tuple[int, int]:
     """Instructions and cycles of so many ticks from reset, start-up included."""
-    sources = ["ticks.c", *sources_of(folder), str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
-    flags = ["-std=gnu11", "-O2", "-ffp-contract=off", *M4, "-I.", f"-DTICKS={ticks}", "-T", str(BOARD / "mps2.ld")]
-    subprocess.run(["arm-none-eabi-gcc", *flags, *sources], cwd=folder, check=True, capture_output=True)
-    return traced_image(folder, QEMU)
+    build_image(folder, M4, ["ticks.c", *sources_of(folder)], f"-DTICKS={ticks}")
+    return traced_image(folder, QEMU_M4)
 
 
 def traced_image(folder: Path, emulator: tuple[str, ...], double: tuple[int, int] = (0, 0)) -> tuple[int, int]:
@@ -216,16 +210,14 @@ def parts_of(bundle: Bundle) -> tuple[int, int]:
     return sum(c.per_column + c.per_prediction + c.pooling for c in costs), sum(c.width_out for c in costs)
 
 
-def main() -> None:
-    made = parser(__doc__ or "", PROGRAMS)
-    made.add_argument("--fit", action="store_true", help="print two numbers of each format, fitted")
-    arguments = made.parse_args()
+@benchmark(option("--fit", action="store_true", help="print two numbers of each format, fitted"), programs=PROGRAMS)
+def main(bench: Bench) -> object:
     rows, ratios = [], collections.defaultdict(list)
     fits: dict[str, list[tuple[int, int, int]]] = collections.defaultdict(list)
-    for name, bundle in networks(arguments.quick, arguments.seed).items():
+    for name, bundle in networks(bench.quick, bench.seed).items():
         estimates = {entry.number_format: entry.cycles["cortex_m4f"] for entry in footprint(bundle.predictor).estimates}
         for number_format in FORMATS:
-            running = whole(bundle, arguments.seed) if number_format == "w8a16" else replace(bundle)
+            running = whole(bundle, bench.seed) if number_format == "w8a16" else replace(bundle)
             instructions, each = a_tick(running)
             cycles = round(instructions * each)
             low, _, high = estimates[number_format]
@@ -236,17 +228,16 @@ def main() -> None:
             rows.append([name, number_format, macs, instructions, cycles, each, low, low / cycles, high])
     table(["network", "numbers", "MACs", "instructions", "cycles", "per instruction", "estimate", "over counted",
            "high estimate"], rows)  # fmt: skip
-    verdicts = []
     for number_format, found in ratios.items():
         worst = max(found, key=lambda ratio: abs(np.log(ratio)))
-        verdicts.append(verdict(f"{number_format}: largest ratio of estimate and counted cycles, either way",
-                                max(worst, 1 / worst), 1.0, "<= 1.15", "1", arguments.quick))  # fmt: skip
-        if arguments.fit:
+        name = f"{number_format}: largest ratio of estimate and counted cycles, either way"
+        bench.check(name, max(worst, 1 / worst), 1.0, "<= 1.15", "1")
+        if bench.options.fit:
             macs, outputs, cycles = (np.array(column, float) for column in zip(*fits[number_format], strict=True))
             per, *_ = np.linalg.lstsq(np.stack([macs, outputs], 1) / cycles[:, None], np.ones(len(cycles)), rcond=None)
             print(f"{number_format}: {per[0]:.3f} cycles a multiply-accumulate, {per[1]:.1f} a feature written")
     heads = ("network", "format", "macs", "instructions", "cycles", "per_instruction", "estimate", "ratio", "high")
-    finish("controller_cycles", verdicts, arguments.seed, [dict(zip(heads, row, strict=True)) for row in rows])
+    return [dict(zip(heads, row, strict=True)) for row in rows]
 
 
 if __name__ == "__main__":

@@ -10,13 +10,14 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from common import finish, parser, table, verdict
+from board import on_board, sources_of
+from common import Bench, benchmark, table
 from controller_cycles import networks
 from edp.evaluation.controller import FORMATS
 from edp.evaluation.footprint import footprint
 from edp.export.c.target import CTarget
 from edp.training.bundle import Bundle
-from embedded_step import on_board, sources_of, whole
+from embedded_step import whole
 
 PROGRAMS = ("arm-none-eabi-gcc", "qemu-system-arm")
 
@@ -65,25 +66,24 @@ def measured(bundle: Bundle) -> tuple[int, int]:
         return state, stack
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "", PROGRAMS).parse_args()
+@benchmark(programs=PROGRAMS)
+def main(bench: Bench) -> object:
     rows = []
-    for name, bundle in networks(arguments.quick, arguments.seed).items():
+    for name, bundle in networks(bench.quick, bench.seed).items():
         counts = footprint(bundle.predictor)
         for number_format in FORMATS:
-            running = whole(bundle, arguments.seed) if number_format == "w8a16" else bundle
+            running = whole(bundle, bench.seed) if number_format == "w8a16" else bundle
             state, stack = measured(running)
             said = counts.estimate(number_format).ram_bytes
             rows.append([name, number_format, state, stack, said, said / (state + stack)])
     heads = ["network", "numbers", "state", "stack", "memory estimate", "over used"]
     table(heads, rows)
-    verdicts = []
     for number_format in FORMATS:
         least = min(row[5] for row in rows if row[1] == number_format)
         question = f"{number_format}: least ratio of estimated and used memory"
-        verdicts.append(verdict(question, least, 1.0, ">= 1.0", "1", arguments.quick))
+        bench.check(question, least, 1.0, ">= 1.0", "1")
     kept = [dict(zip([head.replace(" ", "_") for head in heads], row, strict=True)) for row in rows]
-    finish("controller_memory", verdicts, arguments.seed, kept)
+    return kept
 
 
 if __name__ == "__main__":

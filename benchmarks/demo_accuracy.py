@@ -6,11 +6,10 @@ k = 10 (100 ms) and once for k = 1 (10 ms).
 
 from __future__ import annotations
 
-import tempfile
 import time
 from pathlib import Path
 
-from common import Verdict, finish, parser, table, verdict
+from common import DATA, Bench, benchmark, table
 from edp.cli.demo import MINUTES, RECORDINGS
 from edp.config.experiment import load_experiment
 from edp.storage import read_json
@@ -32,31 +31,26 @@ def run(folder: Path, data: Path, horizon: int, seed: int, quick: bool) -> dict[
     }
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    quick, seed = arguments.quick, arguments.seed
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        data = arguments.data or folder / "data"
-        began = time.perf_counter()
-        minutes, recordings = (8.0, 8) if quick else (MINUTES, RECORDINGS)
-        simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=recordings, seed=seed))
-        print(f"simulated in {time.perf_counter() - began:.1f} s")
-        verdicts: list[Verdict] = []
-        details = {}
-        for horizon, goals in ((10, {"ridge_arx": 0.6, "persistence": 0.4}), (1, {"ridge_arx": 0.9})):
-            found = run(folder, data, horizon, seed, quick)
-            details[f"k={horizon}"] = found
-            print(f"\nk = {horizon}, held-out recordings, mean over three cylinders, mm/s")
-            keys = ("mae", "rmse", "p95", "p99", "composite", "r2", "seconds")
-            rows = sorted(found.items(), key=lambda item: item[1]["mae"])
-            table(["model", *keys], [[name, *(scores[key] for key in keys)] for name, scores in rows])
-            verdicts += [
-                verdict(f"MAE at k={horizon} against {rival}", found["network"]["mae"], found[rival]["mae"],
-                        f"<= {goal}", "mm/s", quick)
-                for rival, goal in goals.items()
-            ]  # fmt: skip
-        finish("demo_accuracy", verdicts, seed, details)
+@benchmark(DATA)
+def main(bench: Bench) -> object:
+    quick, seed = bench.quick, bench.seed
+    folder, data = bench.folder, bench.data
+    began = time.perf_counter()
+    minutes, recordings = (8.0, 8) if quick else (MINUTES, RECORDINGS)
+    simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=recordings, seed=seed))
+    print(f"simulated in {time.perf_counter() - began:.1f} s")
+    details = {}
+    for horizon, goals in ((10, {"ridge_arx": 0.6, "persistence": 0.4}), (1, {"ridge_arx": 0.9})):
+        found = run(folder, data, horizon, seed, quick)
+        details[f"k={horizon}"] = found
+        print(f"\nk = {horizon}, held-out recordings, mean over three cylinders, mm/s")
+        keys = ("mae", "rmse", "p95", "p99", "composite", "r2", "seconds")
+        rows = sorted(found.items(), key=lambda item: item[1]["mae"])
+        table(["model", *keys], [[name, *(scores[key] for key in keys)] for name, scores in rows])
+        for rival, goal in goals.items():
+            ours, theirs = (found[name]["mae"] for name in ("network", rival))
+            bench.check(f"MAE at k={horizon} against {rival}", ours, theirs, f"<= {goal}", "mm/s")
+    return details
 
 
 if __name__ == "__main__":

@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 
 import onnx_rivals
-from common import finish, parser, table, verdict
+from board import M4, instructions, on_board, run, sources_of
+from common import Bench, benchmark, table
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
@@ -31,13 +32,11 @@ from edp.networks import ModelSpec, Stream, build_model
 from edp.networks.backbones import HybridSpec
 from edp.networks.integer import IntegerPredictor
 from edp.signals import TABLE_A1, Kind
+from edp.storage import make_folder
 from edp.training.bundle import Bundle
 
 PROGRAMS = ("gcc", "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
 
-BOARD = Path(__file__).parents[1] / "tests/export/board"
-M4 = ("-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "--specs=rdimon.specs", "-nostartfiles")
-QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-icount", "shift=0")
 SIZES = ((32, 32), (32, 64), (64, 64), (64, 128))
 RUNS = {"step": 20, "window": 2}
 
@@ -45,11 +44,6 @@ RUNS = {"step": 20, "window": 2}
 HEADS = ["channels/units", "constants", "MACs", "M4 instructions", "per MAC", "code bytes", "emx step", "emx window",
          "C us", "ORT window us", "ORT step us", "PyTorch us"]  # fmt: skip
 WHOLE_HEADS = ["channels/units", "constant bytes", "W8A16 instructions", "per MAC", "plain loops", "code bytes", "C us"]
-
-
-def sources_of(folder: Path) -> tuple[str, ...]:
-    """C files of an exported model and its runtime."""
-    return ("predictor.c", *sorted(path.name for path in folder.glob("edp_*.c")))
 
 
 def whole(bundle: Bundle, seed: int) -> Bundle:
@@ -69,26 +63,9 @@ def make(channels: int, units: int, seed: int) -> Bundle:
     return Bundle(predictor, inputs, (Kind.VELOCITY,) * 3, task.targets)
 
 
-def run(command: list[str], folder: Path) -> str:
-    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
-
-
-def on_board(folder: Path, sources: tuple[str, ...], *flags: str) -> list[str]:
-    """What a program prints on the M4, in words."""
-    rest = [*flags, *sources, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
-    given = ["-std=gnu11", "-O2", "-ffp-contract=off", *M4, "-I.", "-DCLOCK_HZ=25000000u", "-T", str(BOARD / "mps2.ld")]
-    run(["arm-none-eabi-gcc", *given, *rest], folder)
-    return run([*QEMU, "-semihosting-config", "enable=on,target=native", "-kernel", "image.elf"], folder).split()
-
-
-def instructions(folder: Path, *flags: str) -> int:
-    """Executed instructions of a tick, the mean over 200."""
-    return int(on_board(folder, (*sources_of(folder), str(BOARD / "count.c")), *flags)[0])
-
-
 def rival_instructions(folder: Path, kind: str) -> int:
     """Executed instructions of a prediction by the rival's C, which must be ours within its tolerance."""
-    counted, permille = on_board(folder, onnx_rivals.counting(folder, kind, RUNS[kind]))
+    counted, permille = on_board(folder, onnx_rivals.counting(folder, kind, RUNS[kind]), "-I..")
     if int(permille) > 1000:
         raise RuntimeError(f"emx-onnx-cgen's {kind} is {int(permille) / 1000} times the tolerance away from PyTorch")
     return int(counted)
@@ -135,27 +112,28 @@ def torch_us(bundle: Bundle, ticks: int) -> float:
     return 1e6 * best / ticks
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "", PROGRAMS).parse_args()
-    sizes = SIZES[:1] if arguments.quick else SIZES
-    rows, whole_rows, verdicts = [], [], []
+@benchmark(programs=PROGRAMS)
+def main(bench: Bench) -> object:
+    sizes = SIZES[:1] if bench.quick else SIZES
+    rows, whole_rows = [], []
     versions: dict[str, object] = {}
     for channels, units in sizes:
-        bundle = make(channels, units, arguments.seed)
+        bundle = make(channels, units, bench.seed)
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
             CTarget().write(bundle, "predictor", folder)
-            versions = onnx_rivals.write(bundle, folder)
+            graphs = make_folder(folder / "onnx")
+            versions = onnx_rivals.write(bundle, graphs)
             counted, code = instructions(folder), code_bytes(folder)
-            step, window = (rival_instructions(folder, kind) for kind in ("step", "window"))
-            host, torch = host_us(folder, bundle, 5_000 if arguments.quick else 20_000), torch_us(bundle, 300)
-            onnx_window, onnx_step = onnx_rivals.runtime_us(bundle, folder, 300 if arguments.quick else 2_000)
+            step, window = (rival_instructions(graphs, kind) for kind in ("step", "window"))
+            host, torch = host_us(folder, bundle, 5_000 if bench.quick else 20_000), torch_us(bundle, 300)
+            onnx_window, onnx_step = onnx_rivals.runtime_us(bundle, graphs, 300 if bench.quick else 2_000)
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
-            CTarget().write(whole(bundle, arguments.seed), "predictor", folder)
+            CTarget().write(whole(bundle, bench.seed), "predictor", folder)
             constants = int(re.findall(r"Constants (\d+) bytes", (folder / "predictor.h").read_text())[0])
             eight, plain = instructions(folder), instructions(folder, "-DEDP_PORTABLE")
-            whole_us = host_us(folder, bundle, 5_000 if arguments.quick else 20_000)
+            whole_us = host_us(folder, bundle, 5_000 if bench.quick else 20_000)
             whole_code = code_bytes(folder)
         graph, size = bundle.predictor.graph(), f"{channels}/{units}"
         whole_rows.append((size, constants, eight, eight / graph.macs, plain, whole_code, whole_us))
@@ -168,12 +146,11 @@ def main() -> None:
             ("time of a tick, C against ONNX Runtime on the window", host, onnx_window, "<= 0.05", "us"),
             ("time of a tick, C against PyTorch", host, torch, "<= 0.05", "us"),
         ):
-            verdicts.append(verdict(f"{size}: {name}", ours, rival, goal, unit, arguments.quick))
+            bench.check(f"{size}: {name}", ours, rival, goal, unit)
     table(HEADS, rows)
     table(WHOLE_HEADS, whole_rows)
-    kept = [{"rivals": versions}, *(dict(zip(HEADS, row)) for row in rows)]
-    kept += [dict(zip(WHOLE_HEADS, row)) for row in whole_rows]
-    finish("embedded_step", verdicts, arguments.seed, kept)
+    of_whole = (dict(zip(WHOLE_HEADS, row)) for row in whole_rows)
+    return [{"rivals": versions}, *(dict(zip(HEADS, row)) for row in rows), *of_whole]
 
 
 if __name__ == "__main__":

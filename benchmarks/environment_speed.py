@@ -12,13 +12,12 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common import finish, parser, table, verdict
+from common import Bench, benchmark, table
 from edp.sim import Scenario, Simulation, load_machine
 from edp.sim.environment import EnvironmentSpec, ExcavatorEnv, VectorExcavatorEnv
 from edp.sim.machine import layout as at
@@ -135,9 +134,9 @@ def step_errors(seconds: float, seed: int) -> dict[str, list[float]]:
     return errors
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    quick, seed = arguments.quick, arguments.seed
+@benchmark()
+def main(bench: Bench) -> object:
+    quick, seed = bench.quick, bench.seed
     turns = 5 if quick else 61
     levers = levers_of(seed, TICKS)
     forms: dict[str, Turn] = {}
@@ -164,30 +163,24 @@ def main() -> None:
     errors = step_errors(10.0 if quick else 60.0, seed)
     print()
     table(["against steps of 0.25 ms", "velocities, mm/s rms", "tip, mm at most"], [[k, *v] for k, v in errors.items()])
-    verdicts = judged({name: statistics.median(v) for name, v in figures.items()}, errors, quick)
-    finish("environment_speed", verdicts, seed, {"ticks per processor second": figures, "errors of steps": errors})
+    check(bench, {name: statistics.median(v) for name, v in figures.items()}, errors)
+    return {"ticks per processor second": figures, "errors of steps": errors}
 
 
-def judged(middle: dict[str, float], errors: dict[str, list[float]], quick: bool) -> list[Any]:
+def check(bench: Bench, middle: dict[str, float], errors: dict[str, list[float]]) -> None:
     """Verdicts: the goals at either step, the rival, and the error of the longer step against the sensors' noise."""
-    judge = partial(verdict, unit="ticks / processor s", quick=quick)
-    verdicts = []
     for step_s in STEPS_S:
         name = f"M22, {1e3 * step_s:g} ms"
-        many, one, rival, alone = (
-            middle[f"{form}, {name}"] for form in ("side by side", "one by one", "naive loop", "plant alone by samples")
-        )
-        verdicts += [
-            judge(f"64 side by side against the goal, {name}", many, GOAL_BATCH, ">= 1"),
-            judge(f"one by one against the goal, {name}", one, GOAL_SINGLE, ">= 1"),
-            judge(f"one by one against the naive loop, {name}", one, rival, ">= 5"),
-            judge(f"one by one against the plant alone, {name}", one, alone, ">= 0.7"),
-        ]
+        forms = ("side by side", "one by one", "naive loop", "plant alone by samples")
+        many, one, rival, alone = (middle[f"{form}, {name}"] for form in forms)
+        unit = "ticks / processor s"
+        bench.check(f"64 side by side against the goal, {name}", many, GOAL_BATCH, ">= 1", unit)
+        bench.check(f"one by one against the goal, {name}", one, GOAL_SINGLE, ">= 1", unit)
+        bench.check(f"one by one against the naive loop, {name}", one, rival, ">= 5", unit)
+        bench.check(f"one by one against the plant alone, {name}", one, alone, ">= 0.7", unit)
     worst = max(v[0] for k, v in errors.items() if k.endswith(f"{1e3 * OWN_STEP_S:g} ms"))
     noise = 1e3 * load_machine("M22").sensors.velocity
-    name = "error of the environment's step against M22's noise"
-    verdicts.append(verdict(name, worst, noise, "<= 0.5", "mm/s", quick))
-    return verdicts
+    bench.check("error of the environment's step against M22's noise", worst, noise, "<= 0.5", "mm/s")
 
 
 if __name__ == "__main__":

@@ -17,10 +17,11 @@ from functools import partial
 from pathlib import Path
 
 import onnx_rivals
-from common import finish, parser, table, verdict
+from common import Bench, benchmark, table
 from edp.export.fmu import FmuTarget
 from edp.export.golden import random_inputs
 from edp.export.onnx import OnnxTarget
+from edp.storage import make_folder
 from edp.training.bundle import Bundle
 from edp.workflows.parity import compare, golden_case
 from edp.workflows.parity.forms.fmu import Slave
@@ -67,41 +68,40 @@ def steps(slave: Slave, ticks: int) -> None:
         call(instance, begin + tick * size, size, 1)
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    ticks, windows = (500, 100) if arguments.quick else (3_000, 500)
-    rows, verdicts, kept = [], [], []
-    for channels, units in SIZES[:1] if arguments.quick else SIZES:
-        bundle, size = make(channels, units, arguments.seed), f"{channels}/{units}"
+@benchmark()
+def main(bench: Bench) -> object:
+    ticks, windows = (500, 100) if bench.quick else (3_000, 500)
+    rows: list[tuple[object, ...]] = []
+    for channels, units in SIZES[:1] if bench.quick else SIZES:
+        bundle, size = make(channels, units, bench.seed), f"{channels}/{units}"
         tick_us = 1e6 / bundle.task.rate_hz
-        with tempfile.TemporaryDirectory() as temporary:
-            OnnxTarget().write(bundle, "predictor", Path(temporary))
-            window_us, step_us = onnx_rivals.runtime_us(bundle, Path(temporary), windows)
-        ours = fmus_us(bundle, ticks, arguments.seed)
-        plain = fmus_us(bundle, ticks, arguments.seed, derivatives=False)
-        eight = fmus_us(whole(bundle, arguments.seed), ticks, arguments.seed)
+        folder = make_folder(bench.folder / size.replace("/", "_"))
+        OnnxTarget().write(bundle, "predictor", folder)
+        window_us, step_us = onnx_rivals.runtime_us(bundle, folder, windows)
+        ours = fmus_us(bundle, ticks, bench.seed)
+        plain = fmus_us(bundle, ticks, bench.seed, derivatives=False)
+        eight = fmus_us(whole(bundle, bench.seed), ticks, bench.seed)
         found = {f"FMU float32, {name}": us for name, us in ours.items()}
         found |= {f"FMU float32 without derivatives, {name}": us for name, us in plain.items()}
         found |= {f"FMU w8a16, {name}": us for name, us in eight.items()}
         found |= {"ONNX Runtime, step": step_us, "ONNX Runtime, window": window_us}
         rows += [(name, size, us, tick_us / us) for name, us in found.items()]
         text = f"{size}: a step of the FMU against ONNX Runtime on the window, neither with its importer"
-        verdicts.append(verdict(text, ours["step alone"], window_us, "<= 0.1", "us", arguments.quick))
+        bench.check(text, ours["step alone"], window_us, "<= 0.1", "us")
         for name in ("FMI 2.0", "FMI 3.0"):
             text = f"{size}: a tick of the FMU, {name} through FMPy, against ONNX Runtime on the window"
-            verdicts.append(verdict(text, ours[name], window_us, "<= 0.1", "us", arguments.quick))
+            bench.check(text, ours[name], window_us, "<= 0.1", "us")
             text = f"{size}: processor time of a step of the FMU against its sample time, {name} through FMPy"
-            verdicts.append(verdict(text, ours[name], tick_us, "<= 0.005", "us", arguments.quick))
+            bench.check(text, ours[name], tick_us, "<= 0.005", "us")
     table(HEADS, rows)
     print()
-    case = golden_case(make(*SIZES[0], arguments.seed), 200 if arguments.quick else 400)
-    forms = ("c", "fmu", "onnx_step", "onnx_window") if arguments.quick else ()
+    case = golden_case(make(*SIZES[0], bench.seed), 200 if bench.quick else 400)
+    forms = ("c", "fmu", "onnx_step", "onnx_window") if bench.quick else ()
     said = [
         (r.title, r.verdict, _number(r.largest), _number(r.microseconds), r.note or r.why) for r in compare(case, forms)
     ]
     table(PARITY_HEADS, said)
-    kept = [dict(zip(HEADS, row)) for row in rows] + [dict(zip(PARITY_HEADS, row)) for row in said]
-    finish("export_speed", verdicts, arguments.seed, kept)
+    return [dict(zip(HEADS, row)) for row in rows] + [dict(zip(PARITY_HEADS, row)) for row in said]
 
 
 def _number(value: float | None) -> float | str:

@@ -25,7 +25,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from common import finish, in_folder, kept, parser, table, verdict
+from common import DATA_AND_PARTS, Bench, Skipped, benchmark, option, table
 
 MOST_COMMANDS = 5
 WAYS_OUT = {"inspect": (0, 3), "evaluate": (0, 6)}
@@ -236,48 +236,40 @@ def shown_of(result: dict[str, Any]) -> dict[str, Any]:
     return facts | {"person_model_s": person_seconds(result)}
 
 
-def main() -> None:
-    """See the module's text."""
-    made = parser(__doc__ or "")
-    made.add_argument("shared", type=Path, nargs="?", default=Path("../shared/data"), help="folder of the sets")
-    made.add_argument("--minutes", type=float, default=0.3, help="of each training")
-    made.add_argument("--set", action="append", dest="names", help="only this set; may be repeated; nothing is kept")
-    arguments = made.parse_args()
-    chosen = arguments.names or list(SETS)[: 1 if arguments.quick else None]
-    there = [name for name in chosen if (arguments.shared / name).is_dir()]
+@benchmark(
+    DATA_AND_PARTS,
+    option("sets", type=Path, nargs="?", default=Path("../shared/data"), help="folder of the sets"),
+    option("--minutes", type=float, default=0.3, help="of each training"),
+    option("--set", action="append", dest="names", help="only this set; may be repeated; nothing is kept"),
+)
+def main(bench: Bench) -> object:
+    chosen = bench.options.names or list(SETS)[: 1 if bench.quick else None]
+    there = [name for name in chosen if (bench.options.sets / name).is_dir()]
     if not there:
-        print(f"none of the sets is in {arguments.shared}; give the folder that holds them")
-        return
+        raise Skipped(f"none of the sets is in {bench.options.sets}; give the folder that holds them")
     results: dict[str, Any] = {}
-
-    def run(folder: Path) -> None:
-        for name in there:
-            logs = (arguments.shared / name).resolve()
-            way = partial(first_hour, logs, SETS[name], folder / name, arguments.minutes)
-            results[name] = kept(folder / f"{name}.json", way)
-            facts = shown_of(results[name])
-            print(f"{name}: {json.dumps(facts)}", flush=True)
-
-    in_folder(arguments.data, run)
+    for name in there:
+        logs = (bench.options.sets / name).resolve()
+        results[name] = bench.part(
+            name, partial(first_hour, logs, SETS[name], bench.folder / name, bench.options.minutes)
+        )
+        print(f"{name}: {json.dumps(shown_of(results[name]))}", flush=True)
     shown = ("channels", "right", "said", "wrong", "unit_left_open", "commands", "report_bytes", "processor_s")
     rows = [[name, *(one[key] for key in shown), *person_seconds(one).values()] for name, one in results.items()]
     table(["set", *shown, "deciding_s", "reading_all_s"], rows)
     print("deciding_s, reading_all_s: a person's time by a model of keys, words and questions, not measured on persons")
-    quick = arguments.quick
     least = min(one["right"] / one["channels"] for one in results.values())
     silent = sum(one["wrong"] for one in results.values())
     most = max(one["commands"] for one in results.values())
     longest = max(person_seconds(one)["deciding"] for one in results.values())
     finished = sum(bool(one["report_bytes"]) and not one["stuck"] for one in results.values())
-    verdicts = [
-        verdict("channels mapped right, worst set (against 90 %)", least, 0.9, ">= 1", "share", quick),
-        verdict("columns silently wrong and one (against one)", silent + 1, 1, "<= 1", "columns", quick),
-        verdict("commands to the report, worst set (against 5)", most, MOST_COMMANDS, "<= 1", "commands", quick),
-        verdict("person's time by a model, worst set (against 3 min)", longest, MOST_PERSON_S, "<= 1", "s", quick),
-        verdict("sets with a report (against all)", finished, len(results), ">= 1", "sets", quick),
-    ]
-    details = {name: shown_of(one) for name, one in results.items()}
-    finish("first_hour", verdicts, arguments.seed, details, keep=not arguments.names)
+    bench.check("channels mapped right, worst set (against 90 %)", least, 0.9, ">= 1", "share")
+    bench.check("columns silently wrong and one (against one)", silent + 1, 1, "<= 1", "columns")
+    bench.check("commands to the report, worst set (against 5)", most, MOST_COMMANDS, "<= 1", "commands")
+    bench.check("person's time by a model, worst set (against 3 min)", longest, MOST_PERSON_S, "<= 1", "s")
+    bench.check("sets with a report (against all)", finished, len(results), ">= 1", "sets")
+    bench.keep = not bench.options.names
+    return {name: shown_of(one) for name, one in results.items()}
 
 
 if __name__ == "__main__":

@@ -18,29 +18,15 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common import Verdict, finish, parser, table, verdict
+from common import Bench, Verdict, benchmark, table
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "edp"
 MAX_PARAMETERS, LONG_FILE = 7, 600
-BANNED = frozenset(
-    (
-        "held",
-        "found",
-        "made",
-        "place",
-        "known",
-        "given",
-        "said",
-        "told",
-        "taken",
-        "wanted",
-        "kept",
-        "got",
-        "thing",
-        "stuff",
-    )
-)
+BANNED = frozenset({
+    "held", "found", "made", "place", "known", "given", "said", "told", "taken", "wanted", "kept", "got", "thing",
+    "stuff",
+})  # fmt: skip
 """Names that say how a value was come by and not what it is."""
 
 
@@ -233,9 +219,10 @@ def _processor_seconds(target: str) -> float:
     return seconds
 
 
-def main() -> None:
-    given = parser(__doc__.splitlines()[0]).parse_args()
+@benchmark()
+def main(bench: Bench) -> object:
     house = measure()
+    lines = sum(path.read_text(encoding="utf-8").count("\n") for path in Path(__file__).parent.glob("*.py"))
     figures = (
         ("siblings below the package", len(house.siblings), 23),
         ("arrows between rooms", house.arrows, 141),
@@ -244,24 +231,24 @@ def main() -> None:
         (f"files of more than {LONG_FILE} lines", len(house.long_files), 0),
         ("public class names that stand twice", len(house.duplicates), 0),
         ("variables of a banned name", len(house.banned), 0),
+        ("lines of benchmarks", lines, 11_500),
     )
     rows: list[tuple[object, ...]] = [(name, value, f"<= {bound}") for name, value, bound in figures]
     rows += [("floors", house.floors, ""), ("modules", house.modules, "")]
     rows += [("comments per 100 lines", house.comments, ">= 3"), ("docstrings per 100 lines", house.docstrings, "")]
-    verdicts = [
-        Verdict(n, v, b, v / b if b else float(v), "<= 1" if b else "<= 0", v <= b, "count", given.quick)
-        for n, v, b in figures
-    ]
-    verdicts.append(verdict("comments per 100 lines", house.comments, 3.0, ">= 1", "comments", given.quick))
-    if not given.quick:
+    for n, v, b in figures:
+        ratio, goal = (v / b, "<= 1") if b else (float(v), "<= 0")
+        bench.verdicts.append(Verdict(n, v, b, ratio, goal, v <= b, "count", bench.quick))
+    bench.check("comments per 100 lines", house.comments, 3.0, ">= 1", "comments")
+    if not bench.quick:
         for target, bound in (("check", 150.0), ("test", 300.0)):
             seconds = _processor_seconds(target)
             rows.append((f"make {target}, processor seconds", seconds, f"<= {bound:g}"))
-            verdicts.append(verdict(f"make {target}", seconds, bound, "<= 1", "s", given.quick))
+            bench.check(f"make {target}", seconds, bound, "<= 1", "s")
     table(("figure", "now", "bound"), rows)
     for line in (*house.circles, *house.wide_functions, *house.long_files, *house.duplicates, *house.banned[:40]):
         print("  ", line)
-    finish(Path(__file__).stem, verdicts, given.seed, {"floors": house.floors, "modules": house.modules})
+    return {"floors": house.floors, "modules": house.modules}
 
 
 if __name__ == "__main__":

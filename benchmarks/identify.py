@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from common import PrintedProgress, finish, in_folder, kept, parser, table, verdict
+from common import DATA, WORK, Bench, PrintedProgress, benchmark, kept, option, table
 from edp.config.twin import load_twin_experiment
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
@@ -43,21 +43,18 @@ QUICK = (
 )
 
 
-def main() -> None:
-    arguments_of = parser(__doc__ or "")
-    arguments_of.add_argument("--machines", type=int, default=5, help="how many of the family")
-    arguments_of.add_argument("--ticks", type=int, default=40_000, help="of a round of the fit")
-    arguments_of.add_argument("--starts", type=int, default=3, help="of the first stage of the fit")
-    arguments_of.add_argument("--minutes", type=float, default=40.0, help="of logs of a machine")
-    arguments_of.add_argument("--short", action="store_true", help="a fit of few rounds, judged by runs of 10 s")
-    arguments_of.add_argument("--only", type=int, nargs="*", default=None, help="machines of the family, from 0 on")
-    arguments_of.add_argument("--work", type=Path, default=None, help="folder that keeps what is finished")
-    given = arguments_of.parse_args()
-    in_folder(given.work, lambda work: run(given, work))
-
-
-def run(given: Any, work: Path) -> None:
-    """All machines that were asked for; some of the family take no whole result's place."""
+@benchmark(
+    DATA,
+    WORK,
+    option("--machines", type=int, default=5, help="how many of the family"),
+    option("--ticks", type=int, default=40_000, help="of a round of the fit"),
+    option("--starts", type=int, default=3, help="of the first stage of the fit"),
+    option("--minutes", type=float, default=40.0, help="of logs of a machine"),
+    option("--short", action="store_true", help="a fit of few rounds, judged by runs of 10 s"),
+    option("--only", type=int, nargs="*", help="machines of the family, from 0 on"),
+)
+def main(bench: Bench) -> object:
+    given, work = bench.options, bench.folder
     every = range(1 if given.quick else given.machines)
     chosen, form = every if given.only is None else given.only, "_quick" if given.quick else ""
     asked: dict[str, Any] = {"ticks": given.ticks, "starts": given.starts}
@@ -70,13 +67,10 @@ def run(given: Any, work: Path) -> None:
         if any(details[name].get(key) != value for key, value in asked.items()):
             raise SystemExit(f"{file} was measured with other settings: give these, or another --work folder")
         show(name, details[name])
-    finish(
-        "identify_short" if given.short else "identify",
-        verdicts(details, given.quick),
-        given.seed,
-        details,
-        keep=given.only is None,
-    )
+    check(bench, details)
+    # Some of the family take no whole result's place.
+    bench.name, bench.keep = "identify_short" if given.short else "identify", given.only is None
+    return details
 
 
 def one_machine(given: Any, name: str) -> dict[str, Any]:
@@ -121,18 +115,9 @@ def compared(truth: Machine, guess: Machine, result: Identified) -> dict[str, An
     for row in result.rows:
         if true.get(row.label, 0.0) > 0.0:
             right = true[row.label]
+            known = {"label": row.label, "group": row.group, "told": row.is_told, "excited": row.excited}
             errors = {"error": row.value / right - 1.0, "guess_error": row.base / right - 1.0}
-            inside = row.low <= right <= row.high
-            numbers.append(
-                {
-                    "label": row.label,
-                    "group": row.group,
-                    "told": row.is_told,
-                    "excited": row.excited,
-                    "inside": inside,
-                    **errors,
-                }
-            )
+            numbers.append(known | {"inside": row.low <= right <= row.high} | errors)
     joints = [
         {"joint": joint, "inertia": inertia, "gravity": gravity, "guess_inertia": first, "guess_gravity": second}
         for joint, (inertia, gravity), (first, second) in zip(
@@ -168,27 +153,25 @@ def groups_of(details: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     return groups
 
 
-def verdicts(details: dict[str, Any], quick: bool) -> list[Any]:
+def check(bench: Bench, details: dict[str, Any]) -> None:
     """Of each group that the goal names, the share of told numbers within 10 % of the truth; errors of the joints."""
-    result = []
     for group, rows in groups_of(details).items():
         told = [row for row in rows if row["told"]]
         if group in GOALS and told:
             share = float(np.mean([abs(row["error"]) <= NEAR for row in told]))
-            result.append(verdict(f"{group}: told numbers within 10 %", share, 1.0, ">= 1", "share", quick))
+            bench.check(f"{group}: told numbers within 10 %", share, 1.0, ">= 1", "share")
     every = [row for entry in details.values() for row in entry["numbers"]]
     told = [abs(row["error"]) <= NEAR for row in every if row["told"]]
     moved = [row["inside"] for row in every if row["excited"]]
     if told:
-        result.append(verdict("all told numbers within 10 %", float(np.mean(told)), 0.9, ">= 1", "share", quick))
-    result.append(verdict("intervals that hold the truth", float(np.mean(moved)), 0.9, ">= 1", "share", quick))
+        bench.check("all told numbers within 10 %", float(np.mean(told)), 0.9, ">= 1", "share")
+    bench.check("intervals that hold the truth", float(np.mean(moved)), 0.9, ">= 1", "share")
     for what in ("inertia", "gravity"):
         worst = max(joint[what] for entry in details.values() for joint in entry["joints"])
-        result.append(verdict(f"{what} of a joint over poses: largest error", worst, NEAR, "<= 1", "share", quick))
+        bench.check(f"{what} of a joint over poses: largest error", worst, NEAR, "<= 1", "share")
     for name, entry in details.items():
         ours, rivals = (entry["models"][key]["velocity_mae"]["mean"] for key in ("identified machine", "machine M22"))
-        result.append(verdict(f"{name}: velocity MAE against the guess", ours, rivals, "<= 1", "mm/s", quick))
-    return result
+        bench.check(f"{name}: velocity MAE against the guess", ours, rivals, "<= 1", "mm/s")
 
 
 def show(name: str, entry: dict[str, Any]) -> None:
@@ -205,24 +188,14 @@ def show(name: str, entry: dict[str, Any]) -> None:
         rows.append([group, f"{len(told)} of {len(numbers)}", near, *cells, covered])
     heads = ["group", "told", "within 10 %", "median error", "largest", "guess: median", "moved, in the interval"]
     table(heads, rows)
-    table(
-        ["joint", "inertia", "gravity", "guess: inertia", "guess: gravity"],
-        [
-            [j[key] for key in ("joint", "inertia", "gravity", "guess_inertia", "guess_gravity")]
-            for j in entry["joints"]
-        ],
-    )
+    keys = ("joint", "inertia", "gravity", "guess_inertia", "guess_gravity")
+    table([key.replace("_", ": ") for key in keys], [[joint[key] for key in keys] for joint in entry["joints"]])
     heads = ["model", "velocity MAE, mm/s", "stroke error by time, mm", "pressure NRMSE", "diverged"]
-    rows = [
-        [
-            model,
-            scores["velocity_mae"]["mean"],
-            " / ".join(f"{row['mean']:.3g}" for row in scores["stroke_error"]),
-            scores["pressure_nrmse"]["mean"],
-            scores["diverged"],
-        ]
-        for model, scores in entry["models"].items()
-    ]
+    rows = []
+    for model, scores in entry["models"].items():
+        strokes = " / ".join(f"{row['mean']:.3g}" for row in scores["stroke_error"])
+        mae, pressure = (scores[key]["mean"] for key in ("velocity_mae", "pressure_nrmse"))
+        rows.append([model, mae, strokes, pressure, scores["diverged"]])
     table(heads, rows)
 
 

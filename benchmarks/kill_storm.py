@@ -12,13 +12,12 @@ import random
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from common import finish, parser, table, verdict
+from common import Bench, benchmark, table
 from edp.jobs.base import Job, complete
 from edp.jobs.processes import LocalPool
 from edp.storage.ledger import Ledger, TrainingIdentity, known, read_records
@@ -142,32 +141,18 @@ def run(work: Path, trainings: int, seconds: float, rounds: int, seed: int) -> d
     }
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    trainings, seconds, rounds = (40, 0.1, 3) if arguments.quick else (300, 0.2, 12)
-    with tempfile.TemporaryDirectory() as work:
-        found = run(Path(work), trainings, seconds, rounds, arguments.seed)
+@benchmark()
+def main(bench: Bench) -> object:
+    trainings, seconds, rounds = (40, 0.1, 3) if bench.quick else (300, 0.2, 12)
+    found = run(bench.folder, trainings, seconds, rounds, bench.seed)
     print()
     table(["", "count"], list(found.items()))
-    questions = [
-        ("trainings with a record, of all", found["records"], trainings, ">= 1", "trainings"),
-        (
-            "starts of what had a record, plus one, against one",
-            1 + found["starts of what had a record"],
-            1,
-            "<= 1",
-            "starts",
-        ),
-        (
-            "starts of a finished study, plus one, against one",
-            1 + found["starts of the finished study"],
-            1,
-            "<= 1",
-            "starts",
-        ),
-        ("same hash as in peace", float(found["same hash"]), 1, ">= 1", "yes"),
-    ]
-    finish("kill_storm", [verdict(*question, arguments.quick) for question in questions], arguments.seed, found)
+    again, finished = (1 + found[f"starts of {what}"] for what in ("what had a record", "the finished study"))
+    bench.check("trainings with a record, of all", found["records"], trainings, ">= 1", "trainings")
+    bench.check("starts of what had a record, plus one, against one", again, 1, "<= 1", "starts")
+    bench.check("starts of a finished study, plus one, against one", finished, 1, "<= 1", "starts")
+    bench.check("same hash as in peace", float(found["same hash"]), 1, ">= 1", "yes")
+    return found
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "plugins"
 from browser import chromium, opened
 from websockets.asyncio.client import ClientConnection, connect
 
-from common import finish, parser, table, verdict
+from common import Bench, Skipped, benchmark, option, table
 from edp.live.protocol import HEAD, ROWS
 from edp.live.server import LiveServer
 from edp.logs.source import DataSource, read_with_truth
@@ -318,40 +318,35 @@ def day(ticks: int, note: Callable[[str], None]) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """See the module's text."""
-    made = parser(__doc__ or "")
-    made.add_argument("--seconds", type=float, default=60.0, help="of the eight viewers")
-    made.add_argument(
+@benchmark(
+    option("--seconds", type=float, default=60.0, help="of the eight viewers"),
+    option(
         "--models", nargs=3, metavar=("LOG", "RUN", "MONITOR"), help="only a log with a network and a monitor beside it"
-    )
-    arguments = made.parse_args()
+    ),
+)
+def main(bench: Bench) -> object:
     if chromium() is None:
-        made.exit(message="live_view.py looks at the page in Chromium, which is not here: make system-packages\n")
-    quick = arguments.quick
-    seconds = 10.0 if quick else arguments.seconds
-    if arguments.models:
-        look = watched(seconds, tuple(arguments.models))
+        raise Skipped("live_view.py looks at the page in Chromium, which is not here: make system-packages")
+    quick = bench.quick
+    seconds = 10.0 if quick else bench.options.seconds
+    if bench.options.models:
+        look = watched(seconds, tuple(bench.options.models))
         table(["eight viewers, with models", "figure"], [[name, float(value)] for name, value in look.items()])
-        judged = [
-            verdict("lag with models, 95 % (against 100 ms)", look["lag_p95_ms"], 100.0, "<= 1", "ms", quick),
-            verdict("ticks with models (against those due)", look["came"], look["due"], ">= 0.99", "ticks", quick),
-        ]
-        finish("live_view_models", judged, arguments.seed, {"viewers": look})
-        return
+        bench.check("lag with models, 95 % (against 100 ms)", look["lag_p95_ms"], 100.0, "<= 1", "ms")
+        bench.check("ticks with models (against those due)", look["came"], look["due"], ">= 0.99", "ticks")
+        bench.name = "live_view_models"
+        return {"viewers": look}
     look = watched(seconds)
     table(["eight viewers", "figure"], [[name, float(value)] for name, value in look.items()])
     long = day(DAY // 24 if quick else DAY, print)
     table(["a day", "figure"], [[name, float(value)] for name, value in long.items()])
-    verdicts = [
-        verdict("lag of the page, 95 % (against 100 ms)", look["lag_p95_ms"], 100.0, "<= 1", "ms", quick),
-        verdict("pictures (against 10 a second)", look["pictures_per_s"], 10.0, ">= 1", "1/s", quick),
-        verdict("ticks that came (against those due)", look["came"], look["due"], ">= 0.999", "ticks", quick),
-        verdict("server's processor time (against 5 % of a core)", look["server_share"], 0.05, "<= 1", "cores", quick),
-        verdict("memory of the day's last third (against the first)", long["last_third_mb"], long["first_third_mb"],
-                "<= 1.02", "MB", quick),
-    ]  # fmt: skip
-    finish("live_view", verdicts, arguments.seed, {"viewers": look, "day": long})
+    bench.check("lag of the page, 95 % (against 100 ms)", look["lag_p95_ms"], 100.0, "<= 1", "ms")
+    bench.check("pictures (against 10 a second)", look["pictures_per_s"], 10.0, ">= 1", "1/s")
+    bench.check("ticks that came (against those due)", look["came"], look["due"], ">= 0.999", "ticks")
+    bench.check("server's processor time (against 5 % of a core)", look["server_share"], 0.05, "<= 1", "cores")
+    first, last = long["first_third_mb"], long["last_third_mb"]
+    bench.check("memory of the day's last third (against the first)", last, first, "<= 1.02", "MB")
+    return {"viewers": look, "day": long}
 
 
 if __name__ == "__main__":

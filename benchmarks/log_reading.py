@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +30,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from common import finish, parser, table, verdict
+from common import PLACE, Bench, benchmark, table
 from edp.logs import WriteOptions, read_recording, write_recording
 from edp.logs.formats.matlab.library import matio
 from edp.recording import Recording
@@ -185,44 +184,40 @@ def bag_reader(container: str) -> Read:
     return read
 
 
-FORMATS: dict[str, tuple[str, Write, Read, SignalMap]] = {
-    "CSV": (".csv", write_csv, read_csv, MAP),
-    "Parquet": (".parquet", write_parquet, read_parquet, MAP),
-    "MAT v7": (".mat", write_mat5, read_mat5, MAP),
-    "MAT v7.3": ("_73.mat", write_mat73, read_mat73, MAP),
-    "Simulink Dataset v7": ("_ds.mat", writer_of_dataset("v5"), read_dataset, MAP),
-    "Simulink Dataset v7.3": ("_ds73.mat", writer_of_dataset("v7.3"), read_dataset, MAP),
-    "MDF 4": (".mf4", write_mdf, read_mdf, MAP),
-    "MCAP": ("_mcap", bag_writer("mcap"), bag_reader("mcap"), MAP),
-    "ROS 2 bag": ("_db3", bag_writer("db3"), bag_reader("db3"), MAP),
-    "ROS 1 bag": (".bag", bag_writer("bag"), bag_reader("bag"), MAP),
+FORMATS: dict[str, tuple[str, Write, Read]] = {
+    "CSV": (".csv", write_csv, read_csv),
+    "Parquet": (".parquet", write_parquet, read_parquet),
+    "MAT v7": (".mat", write_mat5, read_mat5),
+    "MAT v7.3": ("_73.mat", write_mat73, read_mat73),
+    "Simulink Dataset v7": ("_ds.mat", writer_of_dataset("v5"), read_dataset),
+    "Simulink Dataset v7.3": ("_ds73.mat", writer_of_dataset("v7.3"), read_dataset),
+    "MDF 4": (".mf4", write_mdf, read_mdf),
+    "MCAP": ("_mcap", bag_writer("mcap"), bag_reader("mcap")),
+    "ROS 2 bag": ("_db3", bag_writer("db3"), bag_reader("db3")),
+    "ROS 1 bag": (".bag", bag_writer("bag"), bag_reader("bag")),
 }
 
 
-def least(work: Callable[[], object], repeats: int) -> float:
-    """The shortest time of some repeats, s: what the work takes where nothing else runs."""
-    found = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        found.append(time.perf_counter() - start)
-    return min(found)
+def seconds(work: Callable[[], object]) -> float:
+    """Return the wall time of a call."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
 
 
 def compare(name: str, folder: Path, hours: float, repeats: int, seed: int) -> tuple[float, float, float]:
     """Seconds of EDP and of the library, and the size of the log in MB; both must find the same numbers."""
-    suffix, write, bare, signal_map = FORMATS[name]
+    suffix, write, bare = FORMATS[name]
     values = values_of(hours, CHANNELS, seed)
     path = write(folder / f"log{suffix}", values)
-    read = read_recording(path, signal_map)
+    read = read_recording(path, MAP)
     theirs = np.stack(bare(path), axis=1).astype(np.float32)
     if read.values.tobytes() != theirs.tobytes() or len(theirs) != len(values):
         raise SystemExit(f"{name}: EDP and the library do not read the same numbers")
-    ours = theirs_s = float("inf")
-    for _ in range(repeats):
-        ours = min(ours, least(lambda: read_recording(path, signal_map), 1))
-        theirs_s = min(theirs_s, least(lambda: bare(path), 1))
-    return ours, theirs_s, path.stat().st_size / 1e6
+    turns = [(seconds(lambda: read_recording(path, MAP)), seconds(lambda: bare(path))) for _ in range(repeats)]
+    # The shortest time is what the work takes where nothing else runs.
+    ours, library = (min(each) for each in zip(*turns, strict=True))
+    return ours, library, path.stat().st_size / 1e6
 
 
 PEAK = """
@@ -277,29 +272,28 @@ def peak_of(path: Path) -> tuple[float, float, int]:
     return float(peak), time.perf_counter() - start, int(samples)
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    hours, repeats, gigabytes = (0.05, 2, 0.1) if arguments.quick else (1.0, 3, 4.0)
-    verdicts, rows, large = [], [], []
-    with tempfile.TemporaryDirectory(dir=arguments.data) as temporary:
-        for name in FORMATS:
-            ours, theirs, size = compare(name, Path(temporary), hours, repeats, arguments.seed)
-            rows.append([name, size, ours, theirs, ours / theirs])
-            verdicts.append(verdict(f"{name}: {hours:g} h x 25 channels", ours, theirs, GOAL, "s", arguments.quick))
-        table(["format", "MB", "EDP s", "library s", "ratio"], rows)
-        print()
-        for suffix in (".mf4", ".parquet", ".csv"):
-            path = Path(temporary) / f"large{suffix}"
-            written = write_large(path, gigabytes, arguments.seed)
-            peak, seconds, samples = peak_of(path)
-            if samples != written:
-                raise SystemExit(f"{path.name}: {samples} samples read, {written} written")
-            large.append([f"{suffix[1:]}, {path.stat().st_size / 1e9:.2f} GB", peak, seconds])
-            name = f"peak memory, 25 of 128 channels of {path.stat().st_size / 1e9:.2g} GB {suffix[1:]}"
-            verdicts.append(verdict(name, peak, LARGE_LIMIT_MB, "<= 1", "MB", arguments.quick))
-            path.unlink()
-        table(["large log, in parts", "peak MB", "s"], large)
-    finish("log_reading", verdicts, arguments.seed, {"formats": rows, "large": large})
+@benchmark(PLACE)
+def main(bench: Bench) -> object:
+    hours, repeats, gigabytes = (0.05, 2, 0.1) if bench.quick else (1.0, 3, 4.0)
+    rows, large = [], []
+    for name in FORMATS:
+        ours, theirs, size = compare(name, bench.folder, hours, repeats, bench.seed)
+        rows.append([name, size, ours, theirs, ours / theirs])
+        bench.check(f"{name}: {hours:g} h x 25 channels", ours, theirs, GOAL, "s")
+    table(["format", "MB", "EDP s", "library s", "ratio"], rows)
+    print()
+    for suffix in (".mf4", ".parquet", ".csv"):
+        path = bench.folder / f"large{suffix}"
+        written = write_large(path, gigabytes, bench.seed)
+        peak, seconds, samples = peak_of(path)
+        if samples != written:
+            raise SystemExit(f"{path.name}: {samples} samples read, {written} written")
+        large.append([f"{suffix[1:]}, {path.stat().st_size / 1e9:.2f} GB", peak, seconds])
+        name = f"peak memory, 25 of 128 channels of {path.stat().st_size / 1e9:.2g} GB {suffix[1:]}"
+        bench.check(name, peak, LARGE_LIMIT_MB, "<= 1", "MB")
+        path.unlink()
+    table(["large log, in parts", "peak MB", "s"], large)
+    return {"formats": rows, "large": large}
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import subprocess
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from common import finish, parser, table, verdict
+from common import Bench, benchmark, option, table
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
@@ -200,26 +199,24 @@ def make(seed: int) -> Bundle:
     return Bundle(predictor, tuple(TABLE_A1[name] for name in task.inputs), (Kind.VELOCITY,) * 3, task.targets)
 
 
-def main() -> None:
-    options = parser(__doc__ or "", PROGRAMS)
-    options.add_argument("--format", choices=list(FORMATS), default="float32")
-    arguments = options.parse_args()
-    pieces, lanes = (64, 8) if arguments.quick else (DAY, 64)
+@benchmark(option("--format", choices=list(FORMATS), default="float32"), programs=PROGRAMS)
+def main(bench: Bench) -> object:
+    pieces, lanes = (64, 8) if bench.quick else (DAY, 64)
     torch.set_num_threads(1)
-    bundle, name = make(arguments.seed), arguments.format
-    signal = Signal(bundle.predictor, arguments.seed, pieces)
-    with tempfile.TemporaryDirectory() as folder:
-        program = program_of(FORMATS[name](bundle, signal), Path(folder))
-        drift = measure(bundle.predictor, program, signal, lanes)
+    bundle, name = make(bench.seed), bench.options.format
+    signal = Signal(bundle.predictor, bench.seed, pieces)
+    program = program_of(FORMATS[name](bundle, signal), bench.folder)
+    drift = measure(bundle.predictor, program, signal, lanes)
     question = f"{name}: error of the last 5 % against the first 5 %"
-    verdicts = [verdict(question, drift.last, drift.first, "<= 1.1", "sigma", arguments.quick)]
+    bench.check(question, drift.last, drift.first, "<= 1.1", "sigma")
     if name == "float32":
         allowed = SHARE * (1 + drift.largest)
         question = f"{name}: largest error against {SHARE:g} of sigma and of the largest value"
-        verdicts.append(verdict(question, drift.worst, allowed, "<= 1", "sigma", arguments.quick))
+        bench.check(question, drift.worst, allowed, "<= 1", "sigma")
     row = (name, pieces * PIECE, drift.first, drift.last, drift.worst, drift.largest, drift.seam)
     table(["format", "ticks", "first 5 %", "last 5 %", "largest error", "largest value", "seam of lanes"], [row])
-    finish("long_stream" if name == "float32" else f"long_stream_{name}", verdicts, arguments.seed, vars(drift))
+    bench.name = "long_stream" if name == "float32" else f"long_stream_{name}"
+    return vars(drift)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,11 @@ from __future__ import annotations
 import resource
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from common import finish, parser, verdict
+from common import Bench, benchmark
 from edp.logs import write_recording
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
@@ -39,23 +38,18 @@ def write_logs(folder: Path, hours: float, count: int, seed: int) -> None:
         )
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    hours, updates = (1.0, 20) if arguments.quick else (10.0, 300)
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        write_logs(folder / "logs", hours, 20, arguments.seed)
-        sets = ["training.epochs=2", f"training.updates={updates}"]
-        command = [sys.executable, "-m", "edp", "train", str(folder / "logs"), "--out", str(folder / "run")]
-        command += ["--preset", "quick", "--json", *(word for text in sets for word in ("--set", text))]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+@benchmark()
+def main(bench: Bench) -> object:
+    hours, updates = (1.0, 20) if bench.quick else (10.0, 300)
+    folder = bench.folder
+    write_logs(folder / "logs", hours, 20, bench.seed)
+    sets = ["training.epochs=2", f"training.updates={updates}"]
+    command = [sys.executable, "-m", "edp", "train", str(folder / "logs"), "--out", str(folder / "run")]
+    command += ["--preset", "quick", "--json", *(word for text in sets for word in ("--set", text))]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     print(f"training on {hours:g} h of {CHANNELS} channels at {RATE_HZ:g} Hz: peak resident memory {peak:,.0f} MB")
-    finish(
-        "memory",
-        [verdict(f"peak memory of training on {hours:g} h", peak, LIMIT_MB, "<= 1", "MB", arguments.quick)],
-        arguments.seed,
-    )
+    bench.check(f"peak memory of training on {hours:g} h", peak, LIMIT_MB, "<= 1", "MB")
 
 
 if __name__ == "__main__":

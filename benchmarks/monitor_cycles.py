@@ -11,15 +11,15 @@ the monitor adds, on average and in the longest tick.
 
 from __future__ import annotations
 
-import subprocess
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from common import finish, parser, table, verdict
-from controller_cycles import QEMU, of_preset, traced_image
+from board import M4, QEMU_M4, build_image, instructions, on_board
+from common import Bench, benchmark, option, table
+from controller_cycles import of_preset, traced_image
 from edp.evaluation.monitor_footprint import chain_cycles, chain_work
 from edp.export.c.target import CTarget
 from edp.export.monitor import (
@@ -33,9 +33,8 @@ from edp.export.monitor import (
     monitor_files,
 )
 from edp.signals import Channel, Kind
-from embedded_step import BOARD, M4, instructions, run
 
-PROGRAMS = ("arm-none-eabi-gcc", "qemu-system-arm")
+PROGRAMS = ("arm-none-eabi-gcc", "arm-none-eabi-objdump", "qemu-system-arm")
 
 BLOCK, SETTLE = 100, 1
 FITTED = (
@@ -86,16 +85,13 @@ int main(void) {
 """
 
 
-def main() -> None:
-    given = parser(__doc__ or "", PROGRAMS)
-    given.add_argument("--fit", action="store_true", help="print cycles fitted to what was counted")
-    arguments = given.parse_args()
-    quick, seed = arguments.quick, arguments.seed
-    with tempfile.TemporaryDirectory() as temporary:
-        root = Path(temporary)
-        sizes = HELD_OUT[:1] if quick else (FITTED if arguments.fit else HELD_OUT)
-        rows = [measured(size, root / str(i), seed) for i, size in enumerate(sizes)]
-        beside = beside_predictor(root / "beside", seed)
+@benchmark(option("--fit", action="store_true", help="print cycles fitted to what was counted"), programs=PROGRAMS)
+def main(bench: Bench) -> object:
+    quick, seed = bench.quick, bench.seed
+    root = bench.folder
+    sizes = HELD_OUT[:1] if quick else (FITTED if bench.options.fit else HELD_OUT)
+    rows = [measured(size, root / str(i), seed) for i, size in enumerate(sizes)]
+    beside = beside_predictor(root / "beside", seed)
     each = float(np.mean([row["cycles_each"] for row in rows]))
     for row in rows:
         row["ratio"] = row["estimate"] / (row["mean"] * each)
@@ -104,20 +100,17 @@ def main() -> None:
     heads += ["estimate / counted", "longest"]
     names = ("mean", "most", "ratio", "longest_ratio")
     table(heads, [[*row["size"], *(row[name] for name in names)] for row in rows])
-    if arguments.fit:
+    if bench.options.fit:
         print(fitted(rows, each))
     print(f"{each:.3f} cycles an instruction; predictor {beside['alone']:,} instructions a tick, in a monitor of its "
           f"look-ahead errors {beside['mean']:,.0f}, longest {beside['most']:,}")  # fmt: skip
     worst = max(abs(row["ratio"] - 1.0) for row in rows)
-    verdicts = [
-        verdict("estimated cycles of a chain against counted ones, largest error", worst, 0.15, "<= 1", "share", quick),
-        verdict("the same, longest tick", max(abs(row["longest_ratio"] - 1.0) for row in rows), 0.3, "<= 1", "share",
-                quick),
-        verdict("a monitor of look-ahead errors over 1.25 times the predictor alone, mean", beside["mean"],
-                1.25 * beside["alone"], "<= 1", "instructions", quick),
-        verdict("its longest tick", beside["most"], 1.25 * beside["alone"], "<= 1", "instructions", quick),
-    ]  # fmt: skip
-    finish("monitor_cycles", verdicts, seed, {"chains": rows, "cycles_an_instruction": each, "beside": beside})
+    bench.check("estimated cycles of a chain against counted ones, largest error", worst, 0.15, "<= 1", "share")
+    bench.check("the same, longest tick", max(abs(row["longest_ratio"] - 1.0) for row in rows), 0.3, "<= 1", "share")
+    name = "a monitor of look-ahead errors over 1.25 times the predictor alone, mean"
+    bench.check(name, beside["mean"], 1.25 * beside["alone"], "<= 1", "instructions")
+    bench.check("its longest tick", beside["most"], 1.25 * beside["alone"], "<= 1", "instructions")
+    return {"chains": rows, "cycles_an_instruction": each, "beside": beside}
 
 
 def measured(size: tuple[int, ...], folder: Path, seed: int) -> dict[str, Any]:
@@ -136,29 +129,19 @@ def measured(size: tuple[int, ...], folder: Path, seed: int) -> dict[str, Any]:
 def counted(parts: MonitorParts, folder: Path, *flags: str) -> np.ndarray:
     """Instructions of each tick of a block that is judged."""
     ticks = (SETTLE + 3) * BLOCK
-    build(parts, folder, "-DCOUNTED", f"-DTICKS={ticks}u", *flags)
-    told = run([*QEMU, "-icount", "shift=0", "-kernel", "image.elf"], folder).split()
-    return np.array(told, float)[-BLOCK:]
-
-
-def build(parts: MonitorParts, folder: Path, *flags: str) -> None:
     folder.mkdir(exist_ok=True)
     files = monitor_files(parts, "watch")
     for name, text in files.texts().items():
         (folder / name).write_text(text)
     (folder / "ticks.c").write_text(PROGRAM)
-    given = ["-std=gnu11", "-O2", "-ffp-contract=off", "-fno-tree-loop-vectorize", *M4, "-I.", "-DCLOCK_HZ=25000000u"]
-    rest = ["ticks.c", *files.compiled, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
-    run(["arm-none-eabi-gcc", *given, *flags, "-T", str(BOARD / "mps2.ld"), *rest], folder)
+    sources = ("ticks.c", *files.compiled)
+    told = on_board(folder, sources, "-fno-tree-loop-vectorize", "-DCOUNTED", f"-DTICKS={ticks}u", *flags)
+    return np.array(told, float)[-BLOCK:]
 
 
 def traced_ticks(folder: Path, ticks: int) -> tuple[int, int]:
-    given = ["-std=gnu11", "-O2", "-ffp-contract=off", *M4, "-I.", "-DCLOCK_HZ=25000000u", f"-DTICKS={ticks}u"]
-    sources = sorted(path.name for path in folder.glob("*.c"))
-    rest = [*sources, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
-    command = ["arm-none-eabi-gcc", *given, "-T", str(BOARD / "mps2.ld"), *rest]
-    subprocess.run(command, cwd=folder, check=True, capture_output=True)
-    return traced_image(folder, QEMU)
+    build_image(folder, M4, sorted(path.name for path in folder.glob("*.c")), f"-DTICKS={ticks}u")
+    return traced_image(folder, QEMU_M4)
 
 
 def beside_predictor(folder: Path, seed: int) -> dict[str, Any]:

@@ -7,17 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from common import finite, kept, table
+from common import kept
 from edp.monitor.residuals.base import SideBySide
-from monitor_metrics import LARGE, false_alarm_rate, judged, median_delay, share_found, summary
-from monitor_progress import BEGAN, say
+from monitor_metrics import false_alarm_rate, judged, summary
 from monitor_rivals import CHARTS, PYOD, Floats, Rival, has_pyod, limit_of, raised, rivals_of
-from monitor_sessions import COUNTS, plans_of, read_session, session_facts, session_names, write_sessions
-from monitor_test_set import write_training
-from monitor_watching import Plan, fitted, parts_of
-
-BEST_PYOD = ("CBLOF", "GMM")
-"""Of ten on the validation part."""
+from monitor_sessions import read_session, session_facts
+from monitor_watching import BEGAN, Plan, parts_of, say
 
 
 def rival_rows(plan: Plan, rivals: Mapping[str, Rival], folder: str, names: Sequence[str]) -> dict[str, list[Floats]]:
@@ -52,7 +47,7 @@ def rival_result(job: _RivalJob) -> dict[str, dict[str, Any]]:
     # Forty sessions are 5 h: what is linear or of neighbours has seen all there is to see by then.
     material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
     rate = 1.0
-    rivals = {job.rival: rivals_of(BEST_PYOD if job.rival.startswith("PyOD") else ())[job.rival]}
+    rivals = {job.rival: rivals_of(tuple(PYOD) if job.rival.startswith("PyOD") else ())[job.rival]}
     rivals[job.rival].fit(material, ticks=100)
     held = rival_rows(plan, rivals, "training", limiting)[job.rival]
     calm, wrong = (rival_rows(plan, rivals, "test", names)[job.rival] for names in (job.healthy, job.faulty))
@@ -76,41 +71,15 @@ def rival_results(
     """Every rival on the same sessions; of an earlier run of the same sessions where there was one."""
 
     def measured() -> dict[str, Any]:
-        rivals = rivals_of(BEST_PYOD if has_pyod() else ())
+        rivals = rivals_of(tuple(PYOD) if has_pyod() else ())
         jobs = [_RivalJob(plan, rival, tuple(names["healthy"]), tuple(names["faulty"])) for rival in rivals]
         results: dict[str, dict[str, Any]] = {}
         for result in side_by_side(rival_result, jobs):
             results |= result
             say("rival", result)
-        return finite(results)  # type: ignore[no-any-return]
+        return results
 
     if time.monotonic() - BEGAN > plan.until:
         print("rivals: left out, the time is over")
         return {}
     return kept(plan.monitor / "rivals.json", measured)
-
-
-def choose(plan: Plan, side_by_side: SideBySide) -> None:
-    """PyOD's detectors on the validation part: the two best are `BEST_PYOD`."""
-    write_training(plan, side_by_side)
-    write_sessions(plans_of("validation", COUNTS["validation"]), plan.data / "validation", side_by_side)
-    fitted(plan, side_by_side)
-    learning, limiting = parts_of(plan)
-    material = [read_session(plan.data / "training", name).recording.values for name in learning[:40]]
-    names, rows = session_names(plan.data / "validation", "faulty"), []
-    facts = [session_facts(plan.data / "validation", name) for name in names]
-    for name in PYOD:
-        rival = {name: rivals_of((name,))[f"PyOD {name}"]}
-        rival[name].fit(material, ticks=100)
-        held, wrong = (
-            rival_rows(plan, rival, part, some)[name] for part, some in (("training", limiting), ("validation", names))
-        )
-        for chart, spec in CHARTS.items():
-            limit = limit_of(spec, held, 1.0, plan.hours).limit
-            cases = [
-                judged(session.fault, moving, raised(spec, limit, part, 1.0))
-                for (session, moving), part in zip(facts, wrong, strict=True)
-            ]
-            rows.append([name, chart, share_found(cases), share_found(cases, LARGE), median_delay(cases)])
-        print(rows[-2:], flush=True)
-    table(["PyOD", "chart", "found", "two largest", "delay, s"], sorted(rows, key=lambda row: -row[2]))

@@ -39,12 +39,7 @@ from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.training.identification.machine_text import machine_text
 
 Floats = NDArray[np.float64]
-CHANNELS = (
-    *TABLE_A1,
-    *(f"CylStroke_{i}" for i in (1, 2, 3)),
-    *(f"PumpPressure_{i}" for i in (1, 2)),
-    "OilTemperature",
-)
+CHANNELS = (*TABLE_A1, *(f"CylStroke_{i}" for i in (1, 2, 3)), *(f"PumpPressure_{i}" for i in (1, 2)), "OilTemperature")
 """What a well-equipped machine measures."""
 NOISE = {"CylStroke": 1e-4, "PumpPressure": 1.5e4, "OilTemperature": 0.1}
 """rms in SI units of sensors that the simulator shows without noise: a magnetostrictive stroke sensor, the transmitters

@@ -1,8 +1,14 @@
-"""What a monitor makes of sessions: summaries that are written down once, alarms that follow as often as it changes."""
+"""The run of the monitor's benchmark: its plan, its sessions, and what a monitor makes of them.
+
+Summaries are written down once; alarms follow as often as what lies behind them changes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from io import BytesIO
@@ -12,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common import PrintedProgress
+from common import PrintedProgress, finite
 from edp.config.monitor import MonitorExperiment, load_monitor_experiment
 from edp.errors import DataError
 from edp.monitor.alarms import MonitorAlarm
@@ -27,7 +33,7 @@ from edp.recording import Recording
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.workflows.monitor import fit_to_recordings
 from edp.workflows.monitor.dictionary import build_dictionary, machine_of
-from monitor_sessions import read_session, session_names
+from monitor_sessions import COUNTS, NUISANCES, plans_of, read_session, session_names, session_plans, write_sessions
 
 Floats = NDArray[np.float64]
 NEVER_H = 1e9
@@ -310,3 +316,86 @@ def parts_of(plan: Plan) -> tuple[list[str], list[str]]:
     if not limits:
         limits = names[round(0.35 * len(names)) :]
     return [name for name in names if name not in set(limits)], list(limits)
+
+
+BEGAN = time.monotonic()
+
+
+def say(what: str, value: Any) -> None:
+    """A line with what was found, for runs that are cut off."""
+    print(json.dumps({"found": what, "after_s": round(time.monotonic() - BEGAN), "value": finite(value)}), flush=True)
+
+
+class Beside:
+    """Work in a thread beside the rest, whose result is asked for later; ends with the program."""
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self._work, self._result = work, None
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._result = self._work()
+        except Exception as error:
+            self._error = error
+
+    def done(self) -> bool:
+        """Whether it has come to its end."""
+        return not self._thread.is_alive()
+
+    def result(self) -> Any:
+        """What came of it; waits for it.
+
+        Raises:
+            Exception: that of the work.
+        """
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._result
+
+
+QUICK_COUNTS = {"training": (16, 0), "test": (6, 1)}
+"""Healthy sessions, and those of each nuisance set."""
+
+
+QUICK_SECONDS, QUICK_HOURS = 60.0, 0.1
+
+
+QUICK_FAULTS = 12
+
+
+def write_training(plan: Plan, side_by_side: SideBySide) -> None:
+    """Simulate the sessions that are fitted to, where they are missing."""
+    if plan.quick:
+        healthy, _ = QUICK_COUNTS["training"]
+        plans = plans_of("training", {"healthy": healthy, "faulty": 0, "nuisance": 0}, QUICK_SECONDS)
+    else:
+        plans = session_plans("training", "healthy", min(plan.sessions, COUNTS["training"]["healthy"]))
+    write_sessions(plans, plan.data / "training", side_by_side)
+
+
+def write_test(plan: Plan, side_by_side: SideBySide) -> None:
+    """Simulate the sessions that are judged, where they are missing."""
+    if not plan.quick:
+        write_sessions(plans_of("test", COUNTS["test"]), plan.data / "test", side_by_side)
+        return
+    # With the seeds of the validation part: those of the test are for the full form alone.
+    healthy, nuisance = QUICK_COUNTS["test"]
+    plans = plans_of("validation", {"healthy": healthy, "faulty": 0, "nuisance": nuisance}, QUICK_SECONDS)
+    faults = plans_of("validation", {"healthy": 0, "faulty": 1, "nuisance": 0}, QUICK_SECONDS)
+    step = len(faults) // QUICK_FAULTS
+    write_sessions([*plans, *faults[step - 1 :: step]], plan.data / "test", side_by_side)
+
+
+def test_names(plan: Plan) -> dict[str, list[str]]:
+    """Names of the test sessions by group; groups without any are left out."""
+    groups = ("healthy", "faulty", *NUISANCES)
+    if plan.quick:
+        names = {group: session_names(plan.data / "test", group) for group in groups}
+    else:
+        counts = {group: COUNTS["test"].get(group, COUNTS["test"]["nuisance"]) for group in groups}
+        names = {group: [one.name for one in session_plans("test", group, counts[group])] for group in groups}
+    return {group: some for group, some in names.items() if some}

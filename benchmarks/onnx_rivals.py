@@ -53,7 +53,7 @@ int main(void) {
 
 
 def write(bundle: Bundle, folder: Path) -> dict[str, object]:
-    """Write the graphs beside the C files and have them compiled to C; returns versions of the rivals."""
+    """Write the graphs and have them compiled to C; returns versions of the rivals."""
     OnnxTarget().write(bundle, "predictor", folder)
     for kind in ("step", "window"):
         names = ["--model-name", f"emx_{kind}", f"predictor_{kind}.onnx", f"emx_{kind}.c"]

@@ -8,14 +8,13 @@ what 200 ticks more take, by 200. The twin runs free.
 
 from __future__ import annotations
 
-import re
-import subprocess
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from common import finish, parser, table, verdict
+from board import callgrind, run, sources_of
+from common import Bench, benchmark, table
 from edp.data.features import FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
@@ -58,14 +57,14 @@ int main(int argc, char **argv) {
 """
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "", PROGRAMS).parse_args()
+@benchmark(programs=PROGRAMS)
+def main(bench: Bench) -> object:
     channels = m22_channels()
     rows, found = [], {}
-    for name, bundle in {"twin": twin(channels, arguments.seed), "predictor": rival(channels, arguments.seed)}.items():
+    for name, bundle in {"twin": twin(channels, bench.seed), "predictor": rival(channels, bench.seed)}.items():
         graph = bundle.predictor.graph()
         found[name] = {
-            "instructions": instructions(bundle, arguments.seed),
+            "instructions": instructions(bundle, bench.seed),
             "macs": graph.macs,
             "parameters": graph.parameters,
         }
@@ -73,8 +72,8 @@ def main() -> None:
     table(["", "instructions a tick", "MACs", "parameters", "instructions by MAC"], rows)
     ours, theirs = (float(found[name]["instructions"]) for name in ("twin", "predictor"))
     name = "a tick of the exported twin against the look-ahead predictor of the same size"
-    verdicts = [verdict(name, ours, theirs, "<= 1.3", "instructions", arguments.quick)]
-    finish("plant_step", verdicts, arguments.seed, found)
+    bench.check(name, ours, theirs, "<= 1.3", "instructions")
+    return found
 
 
 def m22_channels() -> TwinChannels:
@@ -118,24 +117,9 @@ def instructions(bundle: Bundle, seed: int) -> int:
         CTarget().write(bundle, "predictor", folder)
         (folder / "program.c").write_text(PROGRAM)
         (folder / "rows").write_bytes(inputs.tobytes())
-        sources = ["program.c", "predictor.c", *sorted(path.name for path in folder.glob("edp_*.c"))]
-        _run(["gcc", *FLAGS, f"-DTICKS={ticks}", *sources, "-lm", "-o", "program"], folder)
-        counts = [_counted(folder, count) for count in (WARM, ticks)]
+        run(["gcc", *FLAGS, f"-DTICKS={ticks}", "program.c", *sources_of(folder), "-lm", "-o", "program"], folder)
+        counts = [callgrind(folder, str(count)) for count in (WARM, ticks)]
     return (counts[1] - counts[0]) // COUNTED
-
-
-def _counted(folder: Path, ticks: int) -> int:
-    """Instructions of a whole run."""
-    told = _run(["valgrind", "--tool=callgrind", "--callgrind-out-file=counted", "./program", str(ticks)], folder)
-    match = re.search(r"Collected : (\d+)", told)
-    if match is None:
-        raise SystemExit(f"Callgrind counted nothing: {told[-500:]}")
-    return int(match[1])
-
-
-def _run(command: list[str], folder: Path) -> str:
-    done = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
-    return done.stdout + done.stderr
 
 
 if __name__ == "__main__":

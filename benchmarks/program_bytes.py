@@ -26,7 +26,7 @@ from types import ModuleType
 import numpy as np
 from scipy.optimize import linprog
 
-from common import finish, parser, table, verdict
+from common import ROOT, Bench, benchmark, option, table
 from controller_cycles import networks
 from edp.errors import ExportError
 from edp.export.c.integer_calls import tables_header
@@ -42,7 +42,6 @@ from embedded_step import whole
 
 PROGRAMS = ("arm-none-eabi-gcc", "arm-none-eabi-nm", "arm-none-eabi-readelf")
 
-ROOT = Path(__file__).parents[1]
 PLUGINS = ROOT / "tests" / "plugins"
 KERNELS = ROOT / "src/edp/export/c/kernels.toml"
 COMPILER = "arm-none-eabi-gcc"
@@ -151,18 +150,8 @@ def kernels() -> tuple[dict[str, int], dict[str, list[str]]]:
         sizes: dict[str, int] = {}
         needs = {}
         for function in [*found, "memcpy"]:
-            run(
-                folder,
-                COMPILER,
-                *FLAGS,
-                *LINK,
-                f"-Wl,-e,{function}",
-                f"-Wl,-u,{function}",
-                *objects,
-                "-lm",
-                "-o",
-                "image.elf",
-            )
+            chosen = (f"-Wl,-e,{function}", f"-Wl,-u,{function}")
+            run(folder, COMPILER, *FLAGS, *LINK, *chosen, *objects, "-lm", "-o", "image.elf")
             lines = run(folder, "arm-none-eabi-nm", "-S", "image.elf").splitlines()
             symbols = distinct([line.split() for line in lines if re.search(r" [tTrR] \S+$", line)])
             needs[function] = sorted(symbols)
@@ -194,14 +183,15 @@ def write_kernels() -> None:
     KERNELS.write_text("\n".join(lines) + "\n")
 
 
-def main() -> None:
-    made = parser(__doc__ or "", PROGRAMS)
-    made.add_argument("--fit", action="store_true", help="measure the runtime anew, and fit the model's own code")
-    arguments = made.parse_args()
-    if arguments.fit:
+@benchmark(
+    option("--fit", action="store_true", help="measure the runtime anew, and fit the model's own code"),
+    programs=PROGRAMS,
+)
+def main(bench: Bench) -> object:
+    if bench.options.fit:
         write_kernels()
     rows, given, code = [], [], []
-    for name, bundle in bundles(arguments.quick, arguments.seed):
+    for name, bundle in bundles(bench.quick, bench.seed):
         model = make_model("predictor", bundle)
         ticks, ends = computed(model.graph, model.plan)
         constants, program, own = measured(bundle)
@@ -210,7 +200,7 @@ def main() -> None:
         code.append(own)
         rows.append([name, constants, said.constants, program, said.program, said.program / program])
     table(["network", "constants", "stated", "program", "estimate", "over linked"], rows)
-    if arguments.fit:
+    if bench.options.fit:
         # The least largest error: no network is to be missed by much.
         share = 1.0 / np.array([row[3] for row in rows], float)
         columns, wanted = np.array(given, float) * share[:, None], np.array(code, float) * share
@@ -223,13 +213,10 @@ def main() -> None:
         print(", ".join(f"{value:.3f}" for value in each))
     different = sum(row[1] != row[2] for row in rows)
     worst = max(max(row[5], 1 / row[5]) for row in rows)
-    quick = arguments.quick
-    verdicts = [
-        verdict("networks whose constants are not those stated", different, 1.0, "<= 0.0", "networks", quick),
-        verdict("largest ratio of estimated and linked program, either way", worst, 1.0, "<= 1.02", "1", quick),
-    ]
+    bench.check("networks whose constants are not those stated", different, 1.0, "<= 0.0", "networks")
+    bench.check("largest ratio of estimated and linked program, either way", worst, 1.0, "<= 1.02", "1")
     heads = ("network", "constants", "stated", "program", "estimate", "ratio")
-    finish("program_bytes", verdicts, arguments.seed, [dict(zip(heads, row, strict=True)) for row in rows])
+    return [dict(zip(heads, row, strict=True)) for row in rows]
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ import json
 import resource
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -34,7 +33,7 @@ from sklearn.ensemble import RandomForestRegressor
 from sklearn.feature_selection import mutual_info_regression
 from threadpoolctl import threadpool_limits
 
-from common import finish, parser, table, verdict
+from common import DATA, Bench, benchmark, option, table
 from decoys import lay_decoys
 from edp.data.screening import ScreeningSpec, screen
 from edp.data.screening.forest import rows_of
@@ -234,31 +233,28 @@ def informed(x: np.ndarray, y: np.ndarray) -> float:
     return float(mutual_info_regression(x[:, None], y, n_neighbors=ScreeningSpec().neighbours, random_state=0)[0])
 
 
-def arguments() -> argparse.Namespace:
-    made = parser(__doc__ or "")
-    made.add_argument("--whole", action="store_true", help="the rival makes every call (an hour or more)")
-    made.add_argument("--ours", type=Path, nargs=2, default=None, help=argparse.SUPPRESS)
-    return made.parse_args()
-
-
-def main() -> None:
-    chosen = arguments()
+@benchmark(
+    DATA,
+    option("--whole", action="store_true", help="the rival makes every call (an hour or more)"),
+    option("--ours", type=Path, nargs=2, help=argparse.SUPPRESS),
+)
+def main(bench: Bench) -> object:
+    chosen = bench.options
     if chosen.ours:
         ours(*chosen.ours)
-        return
+        return None
     minutes, each, share = (4.0, 5, 0.002) if chosen.quick else (60.0, 20, 0.02)
-    with tempfile.TemporaryDirectory() as temporary:
-        base = chosen.data or Path(temporary)
-        logs, out = base / f"screening_{minutes:g}min_{each}", Path(temporary) / "found.json"
-        make_logs(logs, minutes, each, chosen.seed)
-        subprocess.run([sys.executable, __file__, "--ours", str(logs), str(out)], check=True)
-        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-        told = json.loads(out.read_text())
-        data = build_table(read_data_set(logs), ScreeningSpec())
-        rival = Rival(data, told["found"], 1.0 if chosen.whole else share)
-        with threadpool_limits(1):
-            for stage in (rival.matrices, rival.lags, rival.stability, rival.forest):
-                stage()
+    base = chosen.data or bench.folder
+    logs, out = base / f"screening_{minutes:g}min_{each}", bench.folder / "found.json"
+    make_logs(logs, minutes, each, chosen.seed)
+    subprocess.run([sys.executable, __file__, "--ours", str(logs), str(out)], check=True)
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    told = json.loads(out.read_text())
+    data = build_table(read_data_set(logs), ScreeningSpec())
+    rival = Rival(data, told["found"], 1.0 if chosen.whole else share)
+    with threadpool_limits(1):
+        for stage in (rival.matrices, rival.lags, rival.stability, rival.forest):
+            stage()
     print(f"\n{len(data.names)} channels, {data.samples} rows, {len(data.pieces)} pieces")
     table(["stage, ours", "wall s"], [[k, v] for k, v in told["found"]["seconds"].items()])
     print()
@@ -266,16 +262,10 @@ def main() -> None:
     wall, busy = told["wall_s"], told["processor_s"]
     print(f"\nours {wall:.0f} s by the clock, {busy:.0f} s of the processors; the rival {rival.seconds:.0f} s of one")
     size = f"{len(data.names)} channels x {data.samples} rows"
-    finish(
-        "screening",
-        [
-            verdict(f"whole screening of {size}", wall, SECONDS, "<= 1", "s", chosen.quick),
-            verdict("peak memory", peak, MEGABYTES, "<= 1", "MB", chosen.quick),
-            verdict("processor time against a plain loop", busy, rival.seconds, SHARE, "s", chosen.quick),
-        ],
-        chosen.seed,
-        {"stages_s": told["found"]["seconds"], "rival": rival.rows, "processor_s": busy},
-    )
+    bench.check(f"whole screening of {size}", wall, SECONDS, "<= 1", "s")
+    bench.check("peak memory", peak, MEGABYTES, "<= 1", "MB")
+    bench.check("processor time against a plain loop", busy, rival.seconds, SHARE, "s")
+    return {"stages_s": told["found"]["seconds"], "rival": rival.rows, "processor_s": busy}
 
 
 if __name__ == "__main__":

@@ -12,17 +12,14 @@ A set that holds leaks has errors that no machine will ever see, because there t
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from common import Verdict, finish, parser, table, verdict
+from common import DATA_AND_PARTS, Bench, Verdict, benchmark, option, table, verdict
 from decoys import FAMILIES, Decoy, lay_decoys
 from edp.config.experiment import FeatureSettings, load_experiment
 from edp.data.screening import FlagKind, ScreeningResult, ScreeningSpec, screen
@@ -168,25 +165,24 @@ def show_importance(run: Path, truth: Sequence[Cause], quick: bool) -> dict[str,
     }
 
 
-def main() -> None:
-    """Command line."""
-    options = parser(__doc__.splitlines()[0])
-    options.add_argument("--workers", type=int, default=2)
-    options.add_argument("--draws", type=int, default=None, help="how often decoys are laid anew (default 3, quick 1)")
-    options.add_argument("--random", type=int, default=None, help="random sets (default 3, quick 1)")
-    options.add_argument("--sets", default="", help="names of the sets to train on, FG1 among them: a,b (default all)")
-    given = options.parse_args()
-    quick, seed = given.quick, given.seed
+@benchmark(
+    DATA_AND_PARTS,
+    option("--workers", type=int, default=2),
+    option("--draws", type=int, help="how often decoys are laid anew (default 3, quick 1)"),
+    option("--random", type=int, help="random sets (default 3, quick 1)"),
+    option("--sets", default="", help="names of the sets to train on, FG1 among them: a,b (default all)"),
+)
+def main(bench: Bench) -> object:
+    quick, seed = bench.quick, bench.seed
     minutes, count = (7.0, 14) if quick else (60.0, 30)
     plan = SimulationOrder(minutes=minutes, recordings=count, seed=seed).scenarios()
-    recordings = [only_table_a1(recording) for recording in simulate_many(plan, given.workers)]
+    recordings = [only_table_a1(recording) for recording in simulate_many(plan, bench.options.workers)]
     truth = causes(plan, recordings, moments=2 if quick else 10, seed=seed)
     print("What the simulator says: change of velocity after a push, mm/s rms, at most in 0.5 s")
     table(["channel", "boom", "arm", "bucket", "matters", "given by"],
           [[c.name, *c.effect_mm_s, "yes" if c.matters else "no", ", ".join(c.given_by)] for c in truth])  # fmt: skip
-    verdicts: list[Verdict] = []
     details: dict[str, Any] = {"truth": [asdict(c) for c in truth], "draws": []}
-    for draw in range(given.draws or (1 if quick else 3)):
+    for draw in range(bench.options.draws or (1 if quick else 3)):
         laid, decoys = lay_decoys(recordings, 20, seed=seed + draw)
         began = time.perf_counter()
         screening = screen(laid, ScreeningSpec(targets=TARGETS, seed=seed))
@@ -195,34 +191,20 @@ def main() -> None:
         found = judged(screening, decoys, truth)
         show_screening(found, decoys, truth)
         details["draws"].append(found | {"decoys": [asdict(decoy) for decoy in decoys]})
-        verdicts += [Verdict(**{**asdict(v), "name": f"{v.name}, draw {draw + 1}"})
-                     for v in goals(found, decoys, truth, quick)]  # fmt: skip
+        bench.verdicts += [replace(v, name=f"{v.name}, draw {draw + 1}") for v in goals(found, decoys, truth, quick)]
         if draw == 0:
             first, first_screening = laid, screening
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = given.data or Path(temporary)
-        source = on_disk(first, folder / "logs")
-        trials = tried(source, first_screening, truth, folder / "trials", given)
-        show_trials(trials)
-        importances = show_importance(folder / "trials" / f"FG1_seed{seed}", truth, quick)
+    folder = bench.folder
+    source = on_disk(first, folder / "logs")
+    trials = tried(source, first_screening, truth, folder / "trials", bench.options)
+    show_trials(trials)
+    importances = show_importance(folder / "trials" / f"FG1_seed{seed}", truth, quick)
     errors = {trial.name: trial.error["10"] for trial in trials.trials}
     drawn = min(value for name, value in errors.items() if name.startswith("random"))
-    verdicts += [
-        verdict("MAE of the proposal against FG1", errors["proposed"], errors["FG1"], "<= 1.05", trials.unit, quick),
-        verdict("MAE of the proposal against the best random set", errors["proposed"], drawn, "<= 0.9", trials.unit,
-                quick),
-    ]  # fmt: skip
+    bench.check("MAE of the proposal against FG1", errors["proposed"], errors["FG1"], "<= 1.05", trials.unit)
+    bench.check("MAE of the proposal against the best random set", errors["proposed"], drawn, "<= 0.9", trials.unit)
     details |= {"trials": trials.to_json(), "importances": importances}
-    finish(Path(__file__).stem, verdicts, seed, _plain(details))
-
-
-def _plain(value: Any) -> Any:
-    """JSON values; numbers of NumPy as Python's."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value.item() if isinstance(value, np.generic) else value
+    return details
 
 
 if __name__ == "__main__":

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from common import finish, parser, table, verdict
+from common import Bench, benchmark, option, table
 from edp.data.screening import ScreeningResult, ScreeningSpec, screen
 from edp.recording import Recording
 from edp.signals import TABLE_A1
@@ -275,13 +274,10 @@ def only_table_a1(recording: Recording) -> Recording:
                      recording.rate_hz, recording.source, recording.meta)  # fmt: skip
 
 
-def main() -> None:
-    """Command line."""
-    options = parser(__doc__.splitlines()[0])
-    options.add_argument("--workers", type=int, default=2)
-    given = options.parse_args()
-    recordings = data_set(6.0 if given.quick else 60.0, given.seed, given.workers)
-    found = screen(recordings, ScreeningSpec(targets=TARGETS, seed=given.seed))
+@benchmark(option("--workers", type=int, default=2))
+def main(bench: Bench) -> object:
+    recordings = data_set(6.0 if bench.quick else 60.0, bench.seed, bench.options.workers)
+    found = screen(recordings, ScreeningSpec(targets=TARGETS, seed=bench.seed))
     figures, rows = Figures(found), lag_rows(found)
     show_lags(rows)
     show_pattern(figures, "spearman", "Spearman (fig. 4.1)")
@@ -292,9 +288,8 @@ def main() -> None:
     table(["statement", "thesis", "ours", "verdict"],
           [[s.name, s.thesis, s.ours, words.get(s.met, f"{s.met:.0%} of them")] for s in statements])  # fmt: skip
     met = float(sum(statement.met for statement in statements))
-    verdicts = [verdict("statements of section 4.1 met", met, len(statements), ">= 0.7", "statements", given.quick)]
-    details = {"lags": rows, "statements": [asdict(s) for s in statements], "window": found.proposal.window_reason}
-    finish(Path(__file__).stem, verdicts, given.seed, details)
+    bench.check("statements of section 4.1 met", met, len(statements), ">= 0.7", "statements")
+    return {"lags": rows, "statements": [asdict(s) for s in statements], "window": found.proposal.window_reason}
 
 
 if __name__ == "__main__":

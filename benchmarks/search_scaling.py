@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-from common import finish, parser, table, verdict
+from common import DATA, Bench, benchmark, table
 from edp.config.experiment import load_experiment
 from edp.jobs.base import Job, complete
 from edp.jobs.processes import LocalPool
@@ -93,22 +93,21 @@ def rate(workers: int, warm: Sequence[Job], jobs: Sequence[Job]) -> dict[str, fl
     }
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    quick, seed = arguments.quick, arguments.seed
+@benchmark(DATA)
+def main(bench: Bench) -> object:
+    quick, seed = bench.quick, bench.seed
     count, trainings, updates, minutes = (2000, 4, 10, 2.0) if quick else (10_000, 16, 60, 6.0)
-    with tempfile.TemporaryDirectory() as temporary:
-        ledger = Path(temporary) / "ledger"
-        fill(ledger, count)
-        wall, processor = opening(ledger, count, 3 if quick else 7)
-        shutil.rmtree(ledger)
-        data = arguments.data or Path(temporary) / "data"
-        simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=6, seed=seed))
-        warm = orders(data, 2, 1, 10_000)
-        rows = []
-        for turn in range(1 if quick else 3):  # in turn, so that other load of the machine meets both alike
-            jobs = orders(data, trainings, updates, 100 * turn)
-            rows += [rate(workers, warm, jobs) for workers in (1, 2)]
+    ledger = bench.folder / "ledger"
+    fill(ledger, count)
+    wall, processor = opening(ledger, count, 3 if quick else 7)
+    shutil.rmtree(ledger)
+    data = bench.data
+    simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=6, seed=seed))
+    warm = orders(data, 2, 1, 10_000)
+    rows = []
+    for turn in range(1 if quick else 3):  # in turn, so that other load of the machine meets both alike
+        jobs = orders(data, trainings, updates, 100 * turn)
+        rows += [rate(workers, warm, jobs) for workers in (1, 2)]
     table([f"opening {count:,} records", "least", "median"], [
         ["wall s", min(wall), median(wall)],
         ["processor s", min(processor), median(processor)],
@@ -118,13 +117,10 @@ def main() -> None:
     one, two = (median(row["trainings an hour"] for row in rows if row["workers"] == n) for n in (1, 2))
     share = max(row["coordinator's share of a core"] for row in rows)
     bound = OPEN_S * count / 10_000
-    verdicts = [
-        verdict(f"opening {count:,} records, of {bound:g} s", min(wall), bound, "<= 1", "s", quick),
-        verdict("coordinator's share of a core, of 2 %", share, SHARE, "<= 1", "core", quick),
-        verdict("trainings an hour, two workers against one", two, one, f">= {SPEEDUP}", "1/h", quick),
-    ]
-    details = {"opening_s": wall, "opening_processor_s": processor, "pools": rows}
-    finish("search_scaling", verdicts, seed, details)
+    bench.check(f"opening {count:,} records, of {bound:g} s", min(wall), bound, "<= 1", "s")
+    bench.check("coordinator's share of a core, of 2 %", share, SHARE, "<= 1", "core")
+    bench.check("trainings an hour, two workers against one", two, one, f">= {SPEEDUP}", "1/h")
+    return {"opening_s": wall, "opening_processor_s": processor, "pools": rows}
 
 
 if __name__ == "__main__":

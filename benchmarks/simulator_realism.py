@@ -10,7 +10,6 @@ held to them as well. The error of persistence must lie above the thesis's model
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import signal
 from sklearn.feature_selection import mutual_info_regression
 
-from common import finish, parser, table, verdict
+from common import Bench, benchmark, option, table
 from edp.recording import Recording
 from edp.sim import Scenario, load_machine, simulate_many
 from edp.sim.data_set import SimulationOrder
@@ -278,25 +277,20 @@ def show(title: str, facts: Sequence[Fact]) -> None:
     table(["fact", *CYLINDERS, "thesis", "verdict"], rows)
 
 
-def main() -> None:
-    """Command line."""
-    options = parser(__doc__.splitlines()[0])
-    options.add_argument("--workers", type=int, default=2)
-    given = options.parse_args()
-    kept, verdicts = {}, []
+@benchmark(option("--workers", type=int, default=2))
+def main(bench: Bench) -> object:
+    kept = {}
     for machine, title in (("M22", "M22, default mix, free air"), ("C14", "C14, free air and soil")):
-        plan = scenarios(machine, 4.0 if given.quick else 40.0, given.seed)
-        signals = Signals(list(simulate_many(plan, given.workers)))
-        facts = facts_of(signals, machine, given.seed)
+        plan = scenarios(machine, 4.0 if bench.quick else 40.0, bench.seed)
+        signals = Signals(list(simulate_many(plan, bench.options.workers)))
+        facts = facts_of(signals, machine, bench.seed)
         minutes = sum(r.duration_s for r in signals.recordings) / 60
         show(f"{title}, {minutes:.0f} min", facts)
         stated = [f for f in facts if f.thesis]
         met = float(sum(f.met for f in stated))
-        verdicts.append(
-            verdict(f"facts of the thesis met, {machine}", met, len(stated), ">= 0.8", "facts", given.quick)
-        )
+        bench.check(f"facts of the thesis met, {machine}", met, len(stated), ">= 0.8", "facts")
         kept[machine] = [vars(f) for f in facts]
-    finish("simulator_realism", verdicts, given.seed, json.loads(json.dumps(kept)))
+    return kept
 
 
 if __name__ == "__main__":

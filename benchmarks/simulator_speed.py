@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from common import finish, parser, table, verdict
+from common import Bench, benchmark, table
 from edp.sim import Scenario, load_machine, plan_data_set, simulate, simulate_many
 
 PARITY = Path(__file__).parents[1] / "tests" / "parity"
@@ -105,9 +105,9 @@ def ten_hours(seed: int) -> tuple[float, float]:
     return time.perf_counter() - began, busy
 
 
-def main() -> None:
-    arguments = parser(__doc__ or "").parse_args()
-    quick, seed = arguments.quick, arguments.seed
+@benchmark()
+def main(bench: Bench) -> object:
+    quick, seed = bench.quick, bench.seed
     seconds, turns, starts = (50.0, 3, 2) if quick else (200.0, 11, 3)
     works = {
         "ours, free air": ours(seconds, seed, "", "combined"),
@@ -130,20 +130,18 @@ def main() -> None:
     air, soil, bare, stiff = middle.values()
     start = min(start_seconds() for _ in range(starts))
     unit = "simulated s / CPU s"
-    verdicts = [
-        verdict("full loop in free air against the goal", air, GOAL, ">= 1", unit, quick),
-        verdict("full loop in soil against the goal", soil, GOAL, ">= 1", unit, quick),
-        verdict("full loop in free air against SciPy's Radau", air, stiff, ">= 100", unit, quick),
-        verdict("full loop in free air against MuJoCo's bare step", air, bare, ">= 1", unit, quick),
-        verdict("full loop in soil against MuJoCo's bare step", soil, bare, ">= 1", unit, quick),
-        verdict("second start, one second simulated", start, START_S, "<= 1", "s", quick),
-    ]
+    bench.check("full loop in free air against the goal", air, GOAL, ">= 1", unit)
+    bench.check("full loop in soil against the goal", soil, GOAL, ">= 1", unit)
+    bench.check("full loop in free air against SciPy's Radau", air, stiff, ">= 100", unit)
+    bench.check("full loop in free air against MuJoCo's bare step", air, bare, ">= 1", unit)
+    bench.check("full loop in soil against MuJoCo's bare step", soil, bare, ">= 1", unit)
+    bench.check("second start, one second simulated", start, START_S, "<= 1", "s")
     if not quick:
         wall, busy = ten_hours(seed)
         found["10 h of M22 on two cores, wall and processor s"] = [wall, busy]
         print(f"10 h of M22 took two processes {busy:.0f} s of processor time, {wall:.0f} s by the clock")
-        verdicts.append(verdict("10 h of M22 on two cores", wall, TEN_HOURS_S, "<= 1", "s", quick))
-    finish("simulator_speed", verdicts, seed, found)
+        bench.check("10 h of M22 on two cores", wall, TEN_HOURS_S, "<= 1", "s")
+    return found
 
 
 if __name__ == "__main__":

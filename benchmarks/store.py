@@ -15,11 +15,9 @@ Memory is what a process holds beside files that the system may drop and read ag
 
 from __future__ import annotations
 
-import json
 import resource
 import subprocess
 import sys
-import tempfile
 import time
 from itertools import islice
 from pathlib import Path
@@ -28,14 +26,15 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load_file
 
-from common import finish, parser, table, verdict
-from edp.cli.evaluate import BEATEN
+from common import PLACE, Bench, benchmark, option, table
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.gathered import stored_columns
 from edp.data.series import Series
+from edp.evaluation.guard import BEATEN
 from edp.logs.store import read_store
 from edp.logs.store.index import INDEX
 from edp.signals import TABLE_A1
+from edp.storage import read_json, write_json
 from memory import CHANNELS, RATE_HZ, write_logs
 
 GOAL_S_AN_HOUR = 3.0
@@ -86,13 +85,13 @@ def repeated(store: Path, out: Path, times: int) -> Path:
     """A store that lists the recordings of another one so many times, each time under other names."""
     out.mkdir()
     (out / "rows").symlink_to((store / "rows").resolve())
-    index = json.loads((store / INDEX).read_text(encoding="utf-8"))
+    index = read_json(store / INDEX)
     index["recordings"] = [
         {**entry, "name": f"{entry['name']}_{turn}", "log": f"/{turn}/{entry['log']}", "log_key": f"{turn}"}
         for turn in range(times)
         for entry in index["recordings"]
     ]
-    (out / INDEX).write_text(json.dumps(index), encoding="utf-8")
+    write_json(out / INDEX, index)
     return out
 
 
@@ -117,10 +116,11 @@ def of_hours(store: Path, folder: Path, times: int, hours: float, commands: list
     return rows
 
 
-def of_a_part(folder: Path, base: float, hours: float, at_most: float, quick: bool, seed: int) -> None:
+def of_a_part(bench: Bench, base: float, hours: float, at_most: float) -> object:
     """What commands take that look at some hours of a store, and their verdicts, in results of their own."""
+    folder, quick = bench.folder, bench.quick
     store, data = folder / "store", folder / f"store_{hours:g}"
-    write_logs(folder / "logs", base, 20, seed)
+    write_logs(folder / "logs", base, 20, bench.seed)
     run(["store", "build", str(folder / "logs"), "--out", str(store), "--workers", "1"])
     repeated(store, data, max(1, round(hours / base)))
     run(training(store, folder / "trained", 2 if quick else UPDATES[0], 1))
@@ -136,11 +136,10 @@ def of_a_part(folder: Path, base: float, hours: float, at_most: float, quick: bo
         rows.append((name, hours, at_most, *run(order)))
         print(*rows[-1], flush=True)
     table([f"{CHANNELS} channels, {RATE_HZ:g} Hz", "hours", "looked at, h", "processor s", "anonymous MB"], rows)
-    verdicts = [
-        verdict(f"memory of {row[0]} on {at_most:g} of {hours:g} h", row[4], GOAL_MB, "<= 1", "MB", quick)
-        for row in rows
-    ]
-    finish("store_part", verdicts, seed, {"rows": rows, "base_hours": base})
+    for row in rows:
+        bench.check(f"memory of {row[0]} on {at_most:g} of {hours:g} h", row[4], GOAL_MB, "<= 1", "MB")
+    bench.name = "store_part"
+    return {"rows": rows, "base_hours": base}
 
 
 def draw_ms(store: Path, in_memory: bool) -> tuple[float, float]:
@@ -163,69 +162,63 @@ def draw_ms(store: Path, in_memory: bool) -> tuple[float, float]:
     return planned - began, 1e3 * (time.process_time() - planned) / 300
 
 
-def main() -> None:
-    added = parser(__doc__ or "")
-    added.add_argument("--hours", type=float, nargs="*", default=[10.0, 100.0, 1000.0], help="of the stores")
-    added.add_argument("--commands", nargs="*", default=list(COMMANDS), help="which commands to measure at each size")
-    added.add_argument("--at-most", type=float, default=None, help="only commands that look at so many hours")
-    added.add_argument("--base", type=float, default=2.0, help="with --at-most: hours that are listed again and again")
-    arguments = added.parse_args()
-    if arguments.at_most is not None:
-        base, hours = (0.1, 0.4) if arguments.quick else (arguments.base, arguments.hours[-1])
-        with tempfile.TemporaryDirectory(dir=arguments.data) as temporary:
-            of_a_part(Path(temporary), base, hours, arguments.at_most, arguments.quick, arguments.seed)
-        return
-    base, updates = (0.2, 20) if arguments.quick else (BASE_HOURS, 300)
+@benchmark(
+    PLACE,
+    option("--hours", type=float, nargs="*", default=[10.0, 100.0, 1000.0], help="of the stores"),
+    option("--commands", nargs="*", default=list(COMMANDS), help="which commands to measure at each size"),
+    option("--at-most", type=float, help="only commands that look at so many hours"),
+    option("--base", type=float, default=2.0, help="with --at-most: hours that are listed again and again"),
+)
+def main(bench: Bench) -> object:
+    if bench.options.at_most is not None:
+        base, hours = (0.1, 0.4) if bench.quick else (bench.options.base, bench.options.hours[-1])
+        return of_a_part(bench, base, hours, bench.options.at_most)
+    base, updates = (0.2, 20) if bench.quick else (BASE_HOURS, 300)
     # Screening alone would take half of the minute.
-    sizes, commands = ([0.4], ["evaluate", "inspect"]) if arguments.quick else (arguments.hours, arguments.commands)
-    with tempfile.TemporaryDirectory(dir=arguments.data) as temporary:
-        folder = Path(temporary)
-        write_logs(folder / "logs", base, 20, arguments.seed)
-        build_s, build_mb = run(
-            ["store", "build", str(folder / "logs"), "--out", str(folder / "store"), "--workers", "1"]
-        )
-        logs_s, logs_mb = run(training(folder / "logs", folder / "from_logs", updates))
-        store_s, store_mb = run(training(folder / "store", folder / "from_store", updates))
-        weights = [load_file(next((folder / name).rglob("*.safetensors"))) for name in ("from_logs", "from_store")]
-        # An update where all samples are in memory, as a training on logs has them.
-        few, many = (2, 20) if arguments.quick else UPDATES
-        spent = [run(training(folder / "logs", folder / f"memory_{n}", n, 1))[0] for n in (few, many)]
-        rows = [
-            ("build the store", base, build_s, build_mb, float("nan")),
-            ("train on the logs", base, logs_s, logs_mb, (spent[1] - spent[0]) / (many - few)),
-            ("train on the store", base, store_s, store_mb, float("nan")),
-        ]
-        drawn = [("in memory", base, *draw_ms(folder / "store", in_memory=True))]
-        for hours in sizes:
-            listed = repeated(folder / "store", folder / f"listed_{hours:g}", max(1, round(hours / base)))
-            drawn.append(("in a store", hours, *draw_ms(listed, in_memory=False)))
-        for hours in sizes:
-            times = max(1, round(hours / base))
-            rows += of_hours(folder / "store", folder, times, hours, commands, arguments.quick)
+    sizes, commands = ([0.4], ["evaluate", "inspect"]) if bench.quick else (bench.options.hours, bench.options.commands)
+    folder = bench.folder
+    write_logs(folder / "logs", base, 20, bench.seed)
+    build_s, build_mb = run(["store", "build", str(folder / "logs"), "--out", str(folder / "store"), "--workers", "1"])
+    logs_s, logs_mb = run(training(folder / "logs", folder / "from_logs", updates))
+    store_s, store_mb = run(training(folder / "store", folder / "from_store", updates))
+    weights = [load_file(next((folder / name).rglob("*.safetensors"))) for name in ("from_logs", "from_store")]
+    # An update where all samples are in memory, as a training on logs has them.
+    few, many = (2, 20) if bench.quick else UPDATES
+    spent = [run(training(folder / "logs", folder / f"memory_{n}", n, 1))[0] for n in (few, many)]
+    rows = [
+        ("build the store", base, build_s, build_mb, float("nan")),
+        ("train on the logs", base, logs_s, logs_mb, (spent[1] - spent[0]) / (many - few)),
+        ("train on the store", base, store_s, store_mb, float("nan")),
+    ]
+    drawn = [("in memory", base, *draw_ms(folder / "store", in_memory=True))]
+    for hours in sizes:
+        listed = repeated(folder / "store", folder / f"listed_{hours:g}", max(1, round(hours / base)))
+        drawn.append(("in a store", hours, *draw_ms(listed, in_memory=False)))
+    for hours in sizes:
+        times = max(1, round(hours / base))
+        rows += of_hours(folder / "store", folder, times, hours, commands, bench.quick)
     same = all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0] | weights[1])
     table([f"{CHANNELS} channels, {RATE_HZ:g} Hz", "hours", "processor s", "anonymous MB", "s an update"], rows)
     table(["batches of 8 x 128 ticks", "hours", "plan of an epoch, s", "a batch, ms"], drawn)
     print(f"weights of both trainings: {'the same bits' if same else 'NOT the same'}")
-    conclude(rows, base, sizes[-1], same, arguments.quick, arguments.seed)
+    return conclude(bench, rows, base, sizes[-1], same)
 
 
-def conclude(rows: list[Row], base: float, most: float, same: bool, quick: bool, seed: int) -> None:
-    """Hold the figures against the goals."""
+def conclude(bench: Bench, rows: list[Row], base: float, most: float, same: bool) -> object:
+    """Hold the figures against the goals; returns the details of the result."""
     figures = {(row[0], row[1]): row for row in rows}
     build, in_memory, stored = (
         figures[name, base] for name in ("build the store", "train on the logs", "train on the store")
     )
     update = figures["train", most][4]
-    verdicts = [
-        verdict("processor time of building, an hour of logs", build[2] / base, GOAL_S_AN_HOUR, "<= 1", "s", quick),
-        verdict("memory of training, store over logs", stored[3], in_memory[3], "<= 0.5", "MB", quick),
-        verdict("trainings with the same weights", float(same), 1.0, ">= 1", "", quick),
-        verdict(f"an update on {most:g} h, over one in memory", update, in_memory[4], "<= 1.05", "s", quick),
-    ]
+    bench.check("processor time of building, an hour of logs", build[2] / base, GOAL_S_AN_HOUR, "<= 1", "s")
+    bench.check("memory of training, store over logs", stored[3], in_memory[3], "<= 0.5", "MB")
+    bench.check("trainings with the same weights", float(same), 1.0, ">= 1", "")
+    bench.check(f"an update on {most:g} h, over one in memory", update, in_memory[4], "<= 1.05", "s")
     for (name, hours), row in figures.items():
         if hours == most and name not in ("build the store", "train on the logs", "train on the store"):
-            verdicts.append(verdict(f"memory of {name} on {most:g} h", row[3], GOAL_MB, "<= 1", "MB", quick))
-    finish("store", verdicts, seed, {"rows": rows})
+            bench.check(f"memory of {name} on {most:g} h", row[3], GOAL_MB, "<= 1", "MB")
+    return {"rows": rows}
 
 
 if __name__ == "__main__":

@@ -14,20 +14,19 @@ from __future__ import annotations
 import json
 import statistics
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from common import Verdict, finish, parser, table, verdict
+from common import EXAMPLES, SHARED, Bench, Verdict, benchmark, table, verdict
 from edp.config.experiment import load_experiment
 from edp.logs import write_recording
 from edp.storage import make_folder
 from edp.workflows.train_evaluate import DataSource, train
 from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec, finetune
-from real_recordings import EXAMPLES, OWN_NETWORK, shared_folder
 
+OWN_NETWORK = "small"
 OURS, NONE = "full", "direct"
 RIVALS = (NONE, "scratch", "ridge_arx", "rehearsal")
 RATES = (3e-3, 1e-2, 3e-2)  # the validation part chooses
@@ -103,26 +102,21 @@ def verdicts_of(rows: Sequence[dict[str, Any]], quick: bool) -> Iterator[Verdict
             yield verdict(f"{title}: over {METHODS[rival].label.lower()}", ratio, 1.0, "<= 1", "RMSE ratio", quick)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
-    options = parser(__doc__ or "")
-    options.add_argument("--shared", type=Path, default=None, help="folder of the recordings")
-    given = options.parse_args(arguments)
-    if shared_folder(given.shared) is None:
-        return
+@benchmark(SHARED)
+def main(bench: Bench) -> object:
     rows: list[dict[str, Any]] = []
-    kept: dict[str, Any] = {}
-    for regimes in QUICK_SETS if given.quick else SETS:
+    sets: dict[str, Any] = {}
+    for regimes in QUICK_SETS if bench.quick else SETS:
         print(f"{regimes.data} ...", file=sys.stderr, flush=True)
-        with tempfile.TemporaryDirectory() as folder:
-            found = transferred(regimes, Path(folder), given.quick, given.seed)
-        kept[regimes.title] = {"minutes": found["data"]["minutes"], "rate": found["settings"]["rate"]}
+        found = transferred(regimes, bench.folder / regimes.data, bench.quick, bench.seed)
+        sets[regimes.title] = {"minutes": found["data"]["minutes"], "rate": found["settings"]["rate"]}
         rows += rows_of(regimes, found)
     names = [OURS, *RIVALS]
     print("\nRMSE k steps ahead on the end of the second recording, units of the logs")
     heads = ["set", "target", "k", *(METHODS[name].label for name in names)]
     table(heads, [[row["set"], row["target"], row["horizon"], *(row["rmse"][n] for n in names)] for row in rows])
-    finish("transfer_real", list(verdicts_of(rows, given.quick)), given.seed, {"sets": kept, "rows": rows})
+    bench.verdicts += verdicts_of(rows, bench.quick)
+    return {"sets": sets, "rows": rows}
 
 
 if __name__ == "__main__":

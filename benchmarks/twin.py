@@ -2,11 +2,9 @@
 
 Machine M22 in free air, recordings that no training saw: a short measured prefix, then 60 s on commands alone. Goals
 are asked of the formulation, network or grey box, that has less error on the validation part. One grey box is told the
-linkage, beside bodies that are 10 to 50 % off those of the machine. A grey box with that linkage, but without power
-limit, cushions and play, and a network on top of it, tell what a structure is worth that is not the simulator's. With
---only some of these are fitted, and the questions of the others are left out. With --specialist it also asks whether
-one set of weights for all modes is as good as one that was only ever run free, and as one that only ever looked 0.1 s
-ahead. A machine in soil is asked by `twin_soil.py`.
+linkage, beside bodies that are 10 to 50 % off those of the machine. With --only some of these are fitted, and the
+questions of the others are left out. With --specialist it also asks whether one set of weights for all modes is as good
+as one that was only ever run free, and as one that only ever looked 0.1 s ahead.
 """
 
 from __future__ import annotations
@@ -15,8 +13,7 @@ import json
 import tempfile
 import time
 import tomllib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -26,7 +23,7 @@ import numpy as np
 import tomli_w
 import torch
 
-from common import Verdict, finish, parser, table, verdict
+from common import DATA, Bench, benchmark, option, table
 from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.evaluation.ahead import ahead_scores, look_ahead
 from edp.evaluation.free_run import calibrated, free_run_scores, free_runs
@@ -36,13 +33,11 @@ from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.greybox import GreyBox, GreyTwin
 from edp.networks.twin.recurrent import RecurrentTwin
 from edp.networks.twin.recurrent_cell import TwinNetwork
-from edp.networks.twin.residual import Residual
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.testing.twin_cell import plain_steps
 from edp.training.blas import one_blas_thread
 from edp.training.free_run import FreeRunProgress, FreeRunSampler, FreeRunSpec, fit_free_runs
 from edp.training.grey_fit import fit_grey_box
-from edp.training.residual_fit import fit_residual
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.train_twin import prepare_twin
 
@@ -54,13 +49,11 @@ LINKED = "greybox, linkage told"
 FITTED = ("recurrent", "greybox", LINKED)
 """Formulations that are trained on free runs and asked the goals; the others are floors."""
 RECURRENT = ("twin.kind=recurrent",)
-LEFT_OUT = ("power_limit", "cushions", "play")
-BARE, TOPPED = "greybox without parts", "residual on it"
-RESIDUAL = "residual"
 WRONG = {
     "mass": (1.25, 0.8, 1.3), "com_x": (0.9, 1.1, 0.85), "com_y": (0.8, 1.2, 1.2), "inertia": (0.7, 1.4, 1.5),
 }  # fmt: skip
 """Factors on the bodies of the machine file that names the linkage: a tape measure does not find them."""
+DEFAULT_FIT = GreyFitSpec()
 QUICK_FIT = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(1, 1), final_rounds=1, ticks=1000, starts=1)
 MANY = 1000
 """Free runs in which those that diverge are counted."""
@@ -68,67 +61,49 @@ VALIDATION_S = 10.0
 """Length of the free runs by which one of them is chosen: that of the validation in a training."""
 
 
-def main() -> None:
-    arguments = read_arguments()
-    quick, only, seed = arguments.quick, arguments.only, arguments.seed
+@benchmark(
+    DATA,
+    option("--specialist", action="store_true", help="train a second one, which takes as long"),
+    option("--only", nargs="+", choices=FITTED, default=FITTED),
+    option("--minutes", type=float, default=180.0, help="of recordings of 3 min each"),
+    option("--ticks", type=int, default=DEFAULT_FIT.ticks, help="of a round of a grey box's fit"),
+    option("--many", action="store_true", help=f"only the share of diverged ones of {MANY} runs"),
+    option("--kept", type=Path, help="folder of what was fitted: read where there, else written"),
+    option("--starts", type=int, default=DEFAULT_FIT.starts, help="of a grey box's fit"),
+    option("--final-rounds", type=int, default=DEFAULT_FIT.final_rounds, help="of a grey box's fit"),
+    option("--final-memory", type=float, default=DEFAULT_FIT.final_memory,
+           help="share of what such a round knows that counts in the next one"),
+)  # fmt: skip
+def main(bench: Bench) -> object:
+    arguments, quick, only = bench.options, bench.quick, bench.options.only
+    if arguments.specialist and "recurrent" not in only:
+        raise SystemExit("--specialist is asked of the recurrent twin: --only must name it")
     experiment = load_twin_experiment(None, RECURRENT)
-    parts = recordings(arguments, experiment)
-    whole = set(only) == {*FITTED, RESIDUAL}
+    minutes, count = (10.0, 8) if quick else (arguments.minutes, round(arguments.minutes / 3))
+    simulate_data_set(bench.data, SimulationOrder(minutes=minutes, recordings=count, seed=bench.seed + 1))
+    channels, data = prepare_twin(DataSource.of(bench.data), experiment)
+    parts = channels, fit_scales(channels, data.train), data
+    whole = set(only) == set(FITTED)
     closed = (*experiment.judge.floors, "n4sid") if whole else ("static",) if not arguments.many else ()
-    models = floors(closed, parts, seed) | fitted_models(arguments, experiment, parts)
+    models = floors(closed, parts, bench.seed) | fitted_models(arguments, experiment, parts)
     if arguments.many:
-        many = {
-            name: diverged_of_many(twin, parts[2].test, 60 if quick else MANY) for name, (twin, _) in models.items()
-        }
-        return finish("twin_many", many_verdicts(many, quick), seed, many)
+        least = 60 if quick else MANY
+        many = {name: diverged_of_many(twin, data.test, least) for name, (twin, _) in models.items()}
+        for name, row in many.items():
+            bench.check(f"diverged of {row['runs']} runs, {name}", row["diverged"], 1e-3, "<= 1", "share")
+        bench.name = "twin_many"
+        return many
     scores = scored(models, closed, parts, experiment, 3 if quick else 16)
     show(scores)
-    named = [name for name in FITTED if name in only]
-    verdicts = goals(scores, named, experiment.judge.coverage, quick) if named else []
+    check_goals(bench, scores, [name for name in FITTED if name in only], experiment.judge.coverage)
     if "recurrent" in only:
-        ways = (TwinNetwork.forward, plain_steps)
-        compiled, plain = (update_ms(experiment, parts, how) for how in ways)
+        compiled, plain = (update_ms(experiment, parts, how) for how in (TwinNetwork.forward, plain_steps))
         name = "forward and backward, 100 ticks of 64 lanes: compiled loop against autograd"
-        verdicts.append(verdict(name, compiled, plain, "<= 0.5", "ms", quick))
-    if RESIDUAL in only:
-        bare, floor = (scores[name]["stroke_error"][-1]["mean"] for name in (TOPPED, "static"))
-        name = "stroke error at 60 s without three parts of the structure, network on top, against the static map"
-        verdicts.append(verdict(name, bare, floor, "<= 0.12", "mm", quick))
+        bench.check(name, compiled, plain, "<= 0.5", "ms")
     if arguments.specialist:
-        verdicts += specialist_verdicts(scores, quick)
-    names = {"twin_specialist": arguments.specialist, "twin": whole, "twin_residual": only == [RESIDUAL]}
-    finish(next((name for name, so in names.items() if so), "twin_part"), verdicts, seed, scores)
-
-
-def read_arguments() -> Any:
-    """The command line."""
-    of = parser(__doc__ or "")
-    of.add_argument("--specialist", action="store_true", help="train a second one, which takes as long")
-    of.add_argument("--only", nargs="+", choices=(*FITTED, RESIDUAL), default=(*FITTED, RESIDUAL))
-    of.add_argument("--minutes", type=float, default=180.0, help="of recordings of 3 min each")
-    of.add_argument("--ticks", type=int, default=GreyFitSpec().ticks, help="of a round of a grey box's fit")
-    of.add_argument("--many", action="store_true", help=f"only the share of diverged ones of {MANY} runs")
-    of.add_argument("--kept", type=Path, help="folder of what was fitted: read where there, else written")
-    of.add_argument("--starts", type=int, default=GreyFitSpec().starts, help="of a grey box's fit")
-    of.add_argument("--final-rounds", type=int, default=GreyFitSpec().final_rounds, help="of a grey box's fit")
-    memory = "share of what such a round knows that counts in the next one"
-    of.add_argument("--final-memory", type=float, default=GreyFitSpec().final_memory, help=memory)
-    short = "the grey box below a network has fewer stretches in its curves and no final rounds"
-    of.add_argument("--short", action="store_true", help=short)
-    arguments = of.parse_args()
-    if arguments.specialist and "recurrent" not in arguments.only:
-        of.error("--specialist is asked of the recurrent twin: --only must name it")
-    return arguments
-
-
-def recordings(arguments: Any, experiment: TwinExperiment) -> Any:
-    """Channels, scales and prepared recordings of M22, simulated where there are none yet."""
-    minutes, count = (10.0, 8) if arguments.quick else (arguments.minutes, round(arguments.minutes / 3))
-    with tempfile.TemporaryDirectory() as temporary:
-        source = arguments.data or Path(temporary) / "data"
-        simulate_data_set(source, SimulationOrder(minutes=minutes, recordings=count, seed=arguments.seed + 1))
-        channels, data = prepare_twin(DataSource.of(source), experiment)
-    return channels, fit_scales(channels, data.train), data
+        check_specialist(bench, scores)
+    bench.name = "twin_specialist" if arguments.specialist else "twin" if whole else "twin_part"
+    return scores
 
 
 def floors(names: tuple[str, ...], parts: Any, seed: int) -> dict[str, tuple[Twin, float]]:
@@ -157,13 +132,6 @@ def fitted_models(arguments: Any, experiment: TwinExperiment, parts: Any) -> dic
         if name in only:
             print(f"fitting: {name}", flush=True)
             models[name] = fitted_once(arguments.kept, name, fitted, (parts, seed, fit))
-    if RESIDUAL in only:
-        form = Residual(fit=fit, without=LEFT_OUT)
-        if arguments.short:
-            form = replace(form, fit=replace(fit, final_rounds=0), stretches=5)
-        with guessed_linkage() as linkage:
-            form = replace(small(form) if quick else form, linkage=linkage)
-            models[BARE], models[TOPPED] = fitted_residual(parts, seed, form, arguments.kept)
     if arguments.specialist:
         free_only = replace(training, measured_share=0.0, mixed_share=0.0)
         models[FREE_ONLY] = network(FREE_ONLY, free_only)
@@ -194,15 +162,7 @@ def validation_mae(twin: Twin, data: Any, experiment: TwinExperiment) -> float:
     return float(free_run_scores(runs, experiment.judge)["velocity_mae"]["mean"])
 
 
-def many_verdicts(many: dict[str, Any], quick: bool) -> list[Verdict]:
-    """Shares of diverged runs."""
-    return [
-        verdict(f"diverged of {row['runs']} runs, {name}", row["diverged"], 1e-3, "<= 1", "share", quick)
-        for name, row in many.items()
-    ]
-
-
-def goals(scores: dict[str, dict[str, Any]], named: list[str], coverage: float, quick: bool) -> list[Verdict]:
+def check_goals(bench: Bench, scores: dict[str, dict[str, Any]], named: list[str], coverage: float) -> None:
     """The goals, asked of the formulation that has less error on the validation part."""
     best = min(named, key=lambda name: scores[name]["validation_mae"])
     print(f"less error on the validation part: {best}")
@@ -210,15 +170,13 @@ def goals(scores: dict[str, dict[str, Any]], named: list[str], coverage: float, 
     last, floor = (row["stroke_error"][-1]["mean"] for row in (ours, rival))
     shares = [row[part]["share"] for row in ours["intervals"]["at"] for part in PARTS]
     worst = max(abs(share - coverage) for share in shares)
-    return [
-        verdict("stroke error at 60 s against the static map", last, floor, "<= 0.04", "mm", quick),
-        verdict("stroke error at 60 s", last, 3.0, "<= 1", "mm", quick),
-        verdict("velocity MAE over 60 s", ours["velocity_mae"]["mean"], 1.5, "<= 1", "mm/s", quick),
-        verdict("pressure NRMSE over 60 s", ours["pressure_nrmse"]["mean"], 0.15, "<= 1", "1", quick),
-        verdict("diverged runs", ours["diverged"], 1e-3, "<= 1", "share", quick),
-        verdict("processor time of the training", ours["training_s"], 1200.0, "<= 1", "s", quick),
-        verdict("intervals at 0.1, 1, 10, 60 s: furthest from 90 %", worst, 0.05, "<= 1", "share", quick),
-    ]
+    bench.check("stroke error at 60 s against the static map", last, floor, "<= 0.04", "mm")
+    bench.check("stroke error at 60 s", last, 3.0, "<= 1", "mm")
+    bench.check("velocity MAE over 60 s", ours["velocity_mae"]["mean"], 1.5, "<= 1", "mm/s")
+    bench.check("pressure NRMSE over 60 s", ours["pressure_nrmse"]["mean"], 0.15, "<= 1", "1")
+    bench.check("diverged runs", ours["diverged"], 1e-3, "<= 1", "share")
+    bench.check("processor time of the training", ours["training_s"], 1200.0, "<= 1", "s")
+    bench.check("intervals at 0.1, 1, 10, 60 s: furthest from 90 %", worst, 0.05, "<= 1", "share")
 
 
 def diverged_of_many(twin: Twin, test: Any, least: int) -> dict[str, Any]:
@@ -228,15 +186,13 @@ def diverged_of_many(twin: Twin, test: Any, least: int) -> dict[str, Any]:
     return {"runs": len(gone), "diverged": float(gone.mean())}
 
 
-def specialist_verdicts(scores: dict[str, Any], quick: bool) -> list[Verdict]:
+def check_specialist(bench: Bench, scores: dict[str, Any]) -> None:
     """One set of weights for all modes against one that was made for each."""
     free, special = (scores[name]["velocity_mae"]["mean"] for name in ("recurrent", FREE_ONLY))
     ahead, other = (scores[name]["ahead"]["velocity_mae"]["mean"] for name in ("recurrent", AHEAD_ONLY))
+    bench.check("one set of weights in free mode against the free specialist", free, special, "<= 1.05", "mm/s")
     name = f"one set of weights, {AHEAD} ticks ahead of measured ports, against a specialist for that"
-    return [
-        verdict("one set of weights in free mode against the free specialist", free, special, "<= 1.05", "mm/s", quick),
-        verdict(name, ahead, other, "<= 1.05", "mm/s", quick),
-    ]
+    bench.check(name, ahead, other, "<= 1.05", "mm/s")
 
 
 def trained(experiment: TwinExperiment, training: FreeRunSpec, parts: Any) -> tuple[RecurrentTwin, float]:
@@ -270,63 +226,25 @@ def fitted_once(
 
 def fitted_linkage(parts: Any, seed: int, fit: GreyFitSpec) -> tuple[GreyTwin, float]:
     """The same, told pins and lengths of M22, with bodies that are not its own."""
-    with guessed_linkage() as linkage:
-        return fitted_grey_box(parts, seed, fit, linkage)
+    with tempfile.TemporaryDirectory() as folder:
+        return fitted_grey_box(parts, seed, fit, write_guess("m22", Path(folder) / "guess.toml"))
 
 
-@contextmanager
-def guessed_linkage() -> Iterator[str]:
-    """Path of a file with M22's linkage and bodies that are not its own; it is gone afterwards."""
-    text = (resources.files("edp.sim") / "machines" / "m22.toml").read_text(encoding="utf-8")
-    machine = tomllib.loads(text)
+def write_guess(machine: str, path: Path) -> str:
+    """Write the file of a machine with its linkage and bodies that are not its own; returns the path."""
+    table = tomllib.loads((resources.files("edp.sim") / "machines" / f"{machine}.toml").read_text(encoding="utf-8"))
     for key, factors in WRONG.items():
-        machine["bodies"][key] = [value * factor for value, factor in zip(machine["bodies"][key], factors, strict=True)]
-    with tempfile.TemporaryDirectory() as temporary:
-        guess = Path(temporary) / "guess.toml"
-        guess.write_text(tomli_w.dumps(machine), encoding="utf-8")
-        yield str(guess)
+        table["bodies"][key] = [value * factor for value, factor in zip(table["bodies"][key], factors, strict=True)]
+    path.write_text(tomli_w.dumps(table), encoding="utf-8")
+    return str(path)
 
 
 def fitted_grey_box(parts: Any, seed: int, settings: GreyFitSpec, linkage: str = "") -> tuple[GreyTwin, float]:
     """A grey box and the processor seconds of its fit; of the machine a linkage is told, and its channels."""
     channels, scales, data = parts
     twin = GreyBox(fit=settings, linkage=linkage).start(channels, scales, data.train, seed)
-    fit = fit_grey_box(
-        twin,
-        data.train,
-        data.validation,
-        seed,
-        lambda e: print(f"round {e.update}/{e.updates}, {e.length_s:g} s, validation {e.validation:.4f}", flush=True),
-    )
+    fit = fit_grey_box(twin, data.train, data.validation, seed, told)
     return fit.twin, fit.seconds
-
-
-def small(form: Residual) -> Residual:
-    """A network of a few updates, to see that it runs."""
-    return replace(form, units=16, updates=(8, 4, 2), validate_every=7)
-
-
-def fitted_residual(
-    parts: Any, seed: int, form: Residual, kept: Path | None
-) -> tuple[tuple[Twin, float], tuple[Twin, float]]:
-    """A grey box and a network on top of it, each with its processor seconds; kept as other grey boxes are."""
-    channels, scales, data = parts
-
-    def grey_box() -> tuple[GreyTwin, float]:
-        start = form.start(channels, scales, data.train, seed)
-        fit = fit_grey_box(start, data.train, data.validation, seed, told)
-        return fit.twin, fit.seconds
-
-    def network() -> tuple[GreyTwin, float]:
-        fit = fit_residual(grey, form, data.train, data.validation, FreeRunSpec(seed=seed), told)
-        print(f"network on top helps: {fit.helps}, validation {fit.error:.4f} against {fit.grey_error:.4f}", flush=True)
-        return fit.twin, fit.seconds
-
-    untrained, seconds = fitted_once(kept, BARE, grey_box, ())
-    grey: Any = untrained
-    alone = grey.without_network()  # Before the training, which changes the network in place.
-    twin, more = fitted_once(kept, TOPPED, network, ())
-    return (alone, seconds), (twin, seconds + more)
 
 
 def told(event: FreeRunProgress) -> None:
@@ -364,16 +282,8 @@ def show(scores: dict[str, dict[str, Any]]) -> None:
     for name, row in scores.items():
         strokes = [entry["mean"] for entry in row["stroke_error"]]
         tail = [row["stroke_error"][-1]["median"], row["pressure_nrmse"]["mean"], row["diverged"]]
-        rows.append(
-            [
-                name,
-                row["velocity_mae"]["mean"],
-                *strokes,
-                *tail,
-                row["ahead"]["velocity_mae"]["mean"],
-                row["training_s"],
-            ]
-        )
+        tail += [row["ahead"]["velocity_mae"]["mean"], row["training_s"]]
+        rows.append([name, row["velocity_mae"]["mean"], *strokes, *tail])
     print(f"\n{first['runs']} runs of {first['seconds']:g} s")
     table(heads, rows)
     for name in (name for name, row in scores.items() if "intervals" in row):

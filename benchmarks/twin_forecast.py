@@ -18,8 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from accuracy_league import closed, update_cost
-from common import finish, in_folder, kept, parser, table, verdict
+from common import WORK, Bench, benchmark, option, table
 from edp.config.experiment import Experiment, load_experiment
 from edp.config.twin import load_twin_experiment
 from edp.data.prepared import Prepared
@@ -67,29 +66,21 @@ CHANGES = (
 )
 
 
-def main() -> None:
-    made = parser(__doc__ or "")
-    made.add_argument("--minutes", type=float, default=90.0, help="of recordings of 3 min each")
-    made.add_argument("--budget", type=float, default=300.0, help="processor seconds of the network on forecasts")
-    made.add_argument("--work", type=Path, default=None, help="folder that keeps data and finished parts")
-    arguments = made.parse_args()
-    if arguments.quick:
-        arguments.minutes, arguments.budget = 1.0, 0.5
-    in_folder(arguments.work, lambda work: run(arguments, work))
-
-
-def run(arguments: Any, work: Path) -> None:
-    """The whole comparison in a folder."""
-    quick, seed = arguments.quick, arguments.seed
+@benchmark(
+    WORK,
+    option("--minutes", type=float, default=90.0, help="of recordings of 3 min each"),
+    option("--budget", type=float, default=300.0, help="processor seconds of the network on forecasts"),
+)
+def main(bench: Bench) -> object:
+    quick, seed, work = bench.quick, bench.seed, bench.folder
+    minutes, budget = (1.0, 0.5) if quick else (bench.options.minutes, bench.options.budget)
     logs, ahead = work / "logs", work / "ahead"
-    order = SimulationOrder(
-        minutes=arguments.minutes, recordings=6 if quick else round(arguments.minutes / 3), seed=seed + 1
-    )
+    order = SimulationOrder(minutes=minutes, recordings=6 if quick else round(minutes / 3), seed=seed + 1)
     simulate_data_set(logs, order)
     spec = LimitSpec(horizons=HORIZONS, **({"moments": 8, "branches": 4} if quick else {}))
-    limit = kept(work / "limit.json", lambda: find_data_set_limit(logs, order, spec))
+    limit = bench.part("limit", lambda: find_data_set_limit(logs, order, spec))
     limits = {k: float(row[-1]) for k, row in zip(limit["horizons"], limit["commands_unknown"]["mae"], strict=True)}
-    twin = kept(work / "twin.json", lambda: forecasts(logs, ahead, work / "grey", seed, quick))
+    twin = bench.part("twin", lambda: forecasts(logs, ahead, work / "grey", seed, quick))
     settings, settings_ahead = experiment(seed, quick), experiment(seed, quick, ahead=True)
     plain = prepare_data(DataSource.of(logs), settings)
     extended = prepare_data(DataSource.of(ahead), settings_ahead)
@@ -99,21 +90,39 @@ def run(arguments: Any, work: Path) -> None:
         raise SystemExit("the three divisions of the recordings differ; nothing can be compared")
     before = twin["fit_s"] + twin["forecast_s"]
     rows = {"grey box, looks ahead": {"mae": forecast_error(extended), "seconds": twin["fit_s"]}}
-    rows["network on its forecasts"] = kept(
-        work / "extended.json", lambda: trained(extended, settings_ahead, arguments.budget, before)
+    rows["network on its forecasts"] = bench.part("extended", lambda: trained(extended, settings_ahead, budget, before))
+    rows["network without them"] = bench.part(
+        "plain", lambda: trained(plain, settings, rows["network on its forecasts"]["seconds"], 0.0)
     )
-    rows["network without them"] = kept(
-        work / "plain.json", lambda: trained(plain, settings, rows["network on its forecasts"]["seconds"], 0.0)
-    )
-    small = kept(
-        work / "small.json", lambda: trained(extended, smaller(settings_ahead), arguments.budget / 2, before, True)
-    )
+    small = bench.part("small", lambda: trained(extended, smaller(settings_ahead), budget / 2, before, True))
     rows["smaller network on its forecasts"] = small
     rows["the same in W8A16"] = {"mae": small["integer"], "seconds": small["seconds"]}
     rows["ridge ARX on its forecasts"] = {"mae": rows["network on its forecasts"]["ridge_arx"], "seconds": before}
     rows["ridge ARX"] = {"mae": rows["network without them"]["ridge_arx"], "seconds": 0.0}
     rows["persistence"] = {"mae": rows["network without them"]["persistence"], "seconds": 0.0}
-    finish("twin_forecast", verdicts(rows, limits, quick), seed, {"limits": limits, "twin": twin, "models": rows})
+    check(bench, rows, limits)
+    return {"limits": limits, "twin": twin, "models": rows}
+
+
+def closed(mae: float, ridge: float, limit: float) -> float:
+    """Share of the gap between ridge ARX and the limit of predictability that a model closes."""
+    return (ridge - mae) / (ridge - limit)
+
+
+def update_cost(data: Prepared, settings: Experiment) -> float:
+    """Processor seconds of an update, from short trainings that are thrown away."""
+    short = replace(data, validation=data.validation[:1])
+
+    def seconds(updates: int) -> float:
+        began = time.process_time()
+        fit(short, settings.model, replace(settings.training, epochs=1, updates=updates))
+        return time.process_time() - began
+
+    seconds(1)  # the first call of all pays for start-up
+    fixed, updates = seconds(1), 8
+    while (spent := seconds(updates) - fixed) < 0.5:
+        updates *= 2
+    return spent / (updates - 1)
 
 
 def experiment(seed: int, quick: bool, ahead: bool = False) -> Experiment:
@@ -189,7 +198,7 @@ def judged(net: Predictor, data: Prepared, spec: JudgeSpec) -> dict[str, dict[st
     return {name: {str(k): row["overall"][str(k)]["mean"]["mae"] for k in HORIZONS} for name, row in models.items()}
 
 
-def verdicts(rows: dict[str, Any], limits: dict[int, float], quick: bool) -> list[Any]:
+def check(bench: Bench, rows: dict[str, Any], limits: dict[int, float]) -> None:
     """The table, and what is asked of it."""
     ridge = {k: rows["ridge ARX"]["mae"][str(k)] for k in HORIZONS}
     share = {name: {k: closed(row["mae"][str(k)], ridge[k], limits[k]) for k in HORIZONS} for name, row in rows.items()}
@@ -199,45 +208,22 @@ def verdicts(rows: dict[str, Any], limits: dict[int, float], quick: bool) -> lis
     ]
     lines.append(["limit of predictability", 0.0, *(x for k in HORIZONS for x in (limits[k], "100%"))])
     table(["mm/s", "processor s", *(x for k in HORIZONS for x in (f"k = {k}", "gap closed"))], lines)
-    ours = share["network on its forecasts"]
-    asked = [
-        verdict(
-            f"share of the gap closed at k = {k}",
-            max(ours[k], share["grey box, looks ahead"][k]),
-            1.0,
-            f">= {goal}",
-            "1",
-            quick,
-        )
-        for k, goal in GOALS.items()
-    ]
-    name = "share of the gap closed at k = 10 by the grey box alone"
-    asked.append(verdict(name, share["grey box, looks ahead"][10], 1.0, f">= {SOON}", "1", quick))
-    asked.append(
-        verdict("processor time of its fit", rows["grey box, looks ahead"]["seconds"], 300.0, "<= 1", "s", quick)
-    )
-    mae = {name: rows[name]["mae"]["10"] for name in ("network on its forecasts", "network without them")}
-    asked += small_verdicts(rows, share["the same in W8A16"], quick)
-    asked.append(
-        verdict("MAE at k = 10 with forecasts against without, equal time", *mae.values(), "<= 0.8", "mm/s", quick)
-    )
-    return asked
-
-
-def small_verdicts(rows: dict[str, Any], share: dict[int, float], quick: bool) -> list[Any]:
-    """What is asked of the network that a controller has room for."""
-    small, large = rows["smaller network on its forecasts"], rows["network on its forecasts"]
-    asked = [
-        verdict("parameters of the smaller network", small["parameters"], MOST_PARAMETERS, "<= 1", "1", quick),
-        verdict("bytes of its constants in W8A16", small["bytes"], MOST_BYTES, "<= 1", "bytes", quick),
-    ]
+    alone, network = "grey box, looks ahead", "network on its forecasts"
     for k, goal in GOALS.items():
-        asked.append(verdict(f"share of the gap closed at k = {k} by it", share[k], 1.0, f">= {goal}", "1", quick))
-        ours, theirs = small["integer"][str(k)], large["mae"][str(k)]
-        asked.append(
-            verdict(f"MAE at k = {k}, it against the network of float", ours, theirs, "<= 1.05", "mm/s", quick)
-        )
-    return asked
+        best = max(share[network][k], share[alone][k])
+        bench.check(f"share of the gap closed at k = {k}", best, 1.0, f">= {goal}", "1")
+    name = "share of the gap closed at k = 10 by the grey box alone"
+    bench.check(name, share[alone][10], 1.0, f">= {SOON}", "1")
+    bench.check("processor time of its fit", rows[alone]["seconds"], 300.0, "<= 1", "s")
+    small = rows["smaller network on its forecasts"]
+    bench.check("parameters of the smaller network", small["parameters"], MOST_PARAMETERS, "<= 1", "1")
+    bench.check("bytes of its constants in W8A16", small["bytes"], MOST_BYTES, "<= 1", "bytes")
+    for k, goal in GOALS.items():
+        whole, floats = small["integer"][str(k)], rows[network]["mae"][str(k)]
+        bench.check(f"share of the gap closed at k = {k} by it", share["the same in W8A16"][k], 1.0, f">= {goal}", "1")
+        bench.check(f"MAE at k = {k}, it against the network of float", whole, floats, "<= 1.05", "mm/s")
+    mae = (rows[name]["mae"]["10"] for name in (network, "network without them"))
+    bench.check("MAE at k = 10 with forecasts against without, equal time", *mae, "<= 0.8", "mm/s")
 
 
 if __name__ == "__main__":

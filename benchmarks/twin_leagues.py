@@ -6,12 +6,11 @@ stands in the place of the velocity, alone. The twin is what `edp twin` chooses 
 data; where the description of a set names its parts (two tanks, an axis with a drive), these elements are one more
 candidate. It is measured for a few ticks and then runs on the commands through the whole test recording.
 
-Published leagues have their leaders beside it. Sets from outside were chosen before anything was run on them; all have
-the static map, ARX, a subspace model and a NARX model beside it, fitted in the same run to the same estimation data.
+The leagues have their leaders beside it, and all sets the static map, ARX, a subspace model and a NARX model, fitted in
+the same run to the same estimation data.
 
-The recordings are no part of the repository: the folder of the leagues is given by --shared or EDP_SHARED_DATA, that
-of the sets from outside by --outside: drive, ballbeam, damper and dryer (.mat) as github.com/RomanFoell/DRGP-VSS has
-them in matlab/data_raw. --work keeps what is finished, so that a run may be stopped, and divided: each part is a run
+The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
+--work keeps what is finished, so that a run may be stopped, and divided: each part is a run
 of its own with --only and --seed, also on another machine, all with one --work folder (or with folders whose files are
 put together); a last run over all sets and seeds with that folder reads them, and gives the tables.
 """
@@ -21,14 +20,16 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from common import Verdict, finish, in_folder, kept, parser, table, verdict
+from common import EXAMPLES, SHARED, WORK, Bench, benchmark, kept, option, table
 from edp.config.twin import TwinExperiment, load_twin_experiment, with_budget
 from edp.data.series import Series
 from edp.data.stretch_folds import StretchFold
@@ -45,9 +46,6 @@ from edp.storage.provenance import environment
 from edp.storage.runs import KeyedRun, Run
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
-from published_leagues import verdicts_of
-from real_recordings import EXAMPLES, VARIABLE, shared_folder
-from twin_rivals import fit_narx
 
 ESTIMATION = 0.8
 """Share of the estimation data that trains where nothing is left out in turn; the rest chooses."""
@@ -78,25 +76,6 @@ class LeagueSet:
     elements: ElementsBox | None = None
 
 
-@dataclass(frozen=True)
-class OutsideSet:
-    """A set from outside: file, what it is, sample time, and how many rows are for estimation.
-
-    Attributes:
-        machine: how it becomes a machine with one actuator.
-        what: in words.
-        unit: of what is scored.
-        sample_time_s: as its authors say.
-        rows: for estimation and in all, as in the literature.
-    """
-
-    machine: LeagueSet
-    what: str
-    unit: str
-    sample_time_s: float
-    rows: tuple[int, int]
-
-
 TWO_TANKS = ElementsBox(
     tanks=(TankElement(name="upper", source="command"), TankElement(name="lower", source="upper", level="stroke"))
 )
@@ -108,26 +87,6 @@ SETS = {
 }
 GOALS = {"tanks.toml": 0.25, "emps.toml": 3.0, "sjoberg.toml": 0.55}
 """Largest free-run error that was asked for, in the unit of the league (medians of five seeds)."""
-OUTSIDE = {
-    "drive": OutsideSet(LeagueSet("u1", "", "z1", "velocity", 10), "coupled electric drives", "V", 0.02, (250, 500)),
-    "ballbeam": OutsideSet(LeagueSet("X", "y", "", "stroke", 10), "ball on a beam", "m", 0.1, (500, 1000)),
-    "damper": OutsideSet(LeagueSet("X", "", "y", "velocity", 10), "magnetorheological damper", "N", 5e-3, (2000, 3499)),
-    "dryer": OutsideSet(LeagueSet("X", "", "y", "velocity", 10), "hot air in a tube", "V", 0.08, (500, 1000)),
-}
-
-
-def outside_source(name: str, folder: Path, work: Path) -> DataSource:
-    """A set from outside as two recordings, estimation and test."""
-    which = OUTSIDE[name]
-    cut, rows = which.rows
-    file = (folder / f"{name}.mat").resolve()
-    parts = [f'[[recordings]]\npath = "{file}"\nname = "{n}"\nrows = [{a}, {b}]\n'
-             for n, a, b in (("estimation", 0, cut), ("test", cut, rows))]  # fmt: skip
-    columns = (which.machine.command, which.machine.stroke or which.machine.velocity)
-    channels = [f'{column} = {{ column = "{column}" }}' for column in columns]
-    text = "\n".join([*parts, f"[map]\nsample_time_s = {which.sample_time_s}\n[map.channels]", *channels])
-    (work / f"{name}.toml").write_text(text + "\n")
-    return DataSource.of(work / f"{name}.toml")
 
 
 def machine(recording: Recording, which: LeagueSet) -> Recording:
@@ -142,6 +101,100 @@ def machine(recording: Recording, which: LeagueSet) -> Recording:
         channels.append(Channel("stroke", Kind.POSITION))
     values = np.stack(columns, axis=1).astype(np.float32)
     return Recording(recording.name, tuple(channels), values, recording.rate_hz, recording.source)
+
+
+Doubles = NDArray[np.float64]
+FORMS = (("polynomial", 2), ("polynomial", 4), ("perceptron", 4), ("perceptron", 10))
+"""Form and lags that are tried."""
+CHOOSES = 0.2
+"""Share of the estimation data that chooses."""
+PENALTY = 1e-4
+HIDDEN = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Narx:
+    """NARX model: ``say`` maps scaled rows of lags to the scaled answer one tick later."""
+
+    label: str
+    lags: int
+    say: Callable[[Doubles], Doubles]
+    offset: Doubles
+    width: Doubles
+    low: float
+    high: float
+
+    def free_run(self, commands: Doubles, answers: Doubles) -> Doubles:
+        """Answers from tick `lags` on, by commands ``(tick, command)`` and the first answers ``(lags,)``."""
+        said = list(answers[: self.lags])
+        u = (commands - self.offset[:-1]) / self.width[:-1]
+        for t in range(self.lags, len(commands)):
+            y = (np.array(said[-self.lags :]) - self.offset[-1]) / self.width[-1]
+            row = np.concatenate([u[t - self.lags : t].ravel(), y])
+            value = float(self.say(row[None])[0]) * self.width[-1] + self.offset[-1]
+            said.append(min(max(value, self.low), self.high))
+        return np.array(said[self.lags :])
+
+
+def fit_narx(commands: Doubles, answers: Doubles, prefix: int, seed: int) -> Narx:
+    """Fit what a textbook on system identification would try next to ARX and subspace models.
+
+    Polynomials of second degree and perceptrons with one hidden layer read the last commands and answers, are fitted
+    one tick ahead, and are fed with their own answers, kept within the range that was seen, widened by a quarter to
+    each side. Lags and form are those with the least error of a free run through the last fifth; the choice is fitted
+    to all data.
+    """
+    cut = round((1.0 - CHOOSES) * len(answers))
+    errors = {}
+    for form, lags in FORMS:
+        if lags > prefix:
+            continue
+        model = _fitted(form, lags, commands[:cut], answers[:cut], seed)
+        with np.errstate(all="ignore"):
+            said = model.free_run(commands[cut:], answers[cut:])
+        errors[form, lags] = float(np.square(said - answers[cut + lags :]).mean())
+    form, lags = min(errors, key=lambda one: errors[one])
+    return _fitted(form, lags, commands, answers, seed)
+
+
+def _fitted(form: str, lags: int, commands: Doubles, answers: Doubles, seed: int) -> Narx:
+    whole = np.concatenate([commands, answers[:, None]], axis=1)
+    offset, width = whole.mean(axis=0), np.maximum(whole.std(axis=0), 1e-9)
+    scaled = (whole - offset) / width
+    ticks = range(lags, len(answers))
+    rows = np.stack([np.concatenate([scaled[t - lags : t, :-1].ravel(), scaled[t - lags : t, -1]]) for t in ticks])
+    say = (_polynomial if form == "polynomial" else _perceptron)(rows, scaled[lags:, -1], seed)
+    reach = 0.25 * float(np.ptp(answers))
+    return Narx(f"{form}, {lags} lags", lags, say, offset, width, answers.min() - reach, answers.max() + reach)
+
+
+def _polynomial(rows: Doubles, goal: Doubles, seed: int) -> Callable[[Doubles], Doubles]:
+    first, second = np.triu_indices(rows.shape[1])
+
+    def spread(x: Doubles) -> Doubles:
+        return np.concatenate([np.ones((len(x), 1)), x, x[:, first] * x[:, second]], axis=1)
+
+    matrix = spread(rows)
+    weights = np.linalg.solve(matrix.T @ matrix + PENALTY * len(rows) * np.eye(matrix.shape[1]), matrix.T @ goal)
+    return lambda x: spread(x) @ weights
+
+
+def _perceptron(rows: Doubles, goal: Doubles, seed: int) -> Callable[[Doubles], Doubles]:
+    from sklearn.neural_network import MLPRegressor
+
+    network = MLPRegressor(
+        hidden_layer_sizes=(HIDDEN,), activation="tanh", solver="lbfgs", alpha=1e-3, max_iter=600, random_state=seed
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        network.fit(rows, goal)
+    (w1, w2), (b1, b2) = network.coefs_, network.intercepts_
+
+    def say(x: Doubles) -> Doubles:
+        said: Any = np.tanh(x @ w1 + b1) @ w2 + b2
+        return np.asarray(said)[:, 0]
+
+    return say
 
 
 def column_of(channels: TwinChannels, target: str) -> int:
@@ -275,32 +328,14 @@ def show(title: str, found: dict[str, Any], published: dict[str, float]) -> None
         print(f"seed {seed}: {found['ours'][seed]:.4g}; {row['chosen']}; intervals of 90 % hold {held}")
 
 
-def against_goal(title: str, data: str, found: dict[str, Any], unit: str, quick: bool) -> Verdict:
-    """Compare the median error with the goal that was set for this data set."""
-    return verdict(f"{title}: twin against its goal", found["median"], GOALS[data], "<= 1", unit, quick)
-
-
-def against_rivals(title: str, found: dict[str, Any], unit: str, quick: bool) -> Verdict:
-    """The twin beside the best of its rivals."""
+def check(bench: Bench, entry: dict[str, Any], found: dict[str, Any]) -> None:
+    """The median of the twin against each published rival that the entry names, its goal, and the best rival here."""
+    title, ours, unit = entry["title"], found["median"], entry["unit"]
+    for name in entry["rivals"]:
+        bench.check(f"{title}, twin: against the published {name}", ours, entry["published"][name], "<= 1", unit)
+    bench.check(f"{title}: twin against its goal", ours, GOALS[entry["data"]], "<= 1", unit)
     best = min(found["rivals"], key=lambda rival: float(found["rivals"][rival]))
-    return verdict(f"{title}: twin against {best}", found["median"], found["rivals"][best], "<= 1", unit, quick)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
-    options = parser(__doc__ or "")
-    options.add_argument("--shared", type=Path, default=None, help=f"folder of the recordings (else ${VARIABLE})")
-    options.add_argument("--outside", type=Path, default=None, help="folder of the sets from outside; else left out")
-    options.add_argument("--seeds", type=int, default=5)
-    options.add_argument(
-        "--minutes", nargs="*", default=[], help="as of edp twin, for all or as tanks=1; else no bound"
-    )
-    options.add_argument("--only", nargs="*", default=None, help="sets by name, such as tanks or drive")
-    options.add_argument("--work", type=Path, default=None, help="folder that keeps what is finished")
-    given = options.parse_args(arguments)
-    if shared_folder(given.shared) is None:
-        return
-    in_folder(given.work, lambda work: run(given, work))
+    bench.check(f"{title}: twin against {best}", ours, found["rivals"][best], "<= 1", unit)
 
 
 def minutes_of(given: Sequence[str], name: str) -> float:
@@ -309,10 +344,16 @@ def minutes_of(given: Sequence[str], name: str) -> float:
     return float(own.get(name, own.get("", 0.0)))
 
 
-def run(given: Any, work: Path) -> None:
-    """All sets that were asked for."""
+@benchmark(
+    SHARED,
+    WORK,
+    option("--seeds", type=int, default=5),
+    option("--minutes", nargs="*", default=[], help="as of edp twin, for all or as tanks=1; else no bound"),
+    option("--only", nargs="*", help="sets by name, such as tanks"),
+)
+def main(bench: Bench) -> object:
+    given, work = bench.options, bench.folder
     seeds = range(given.seed, given.seed + (1 if given.quick else given.seeds))
-    verdicts: list[Verdict] = []
     details: dict[str, Any] = {}
     for entry in read_toml(EXAMPLES / "leagues.toml")["leagues"]:
         name = Path(entry["data"]).stem
@@ -324,21 +365,11 @@ def run(given: Any, work: Path) -> None:
         factor = 1000.0 if entry["unit"] == "mm" else 1.0
         found = summary(judged, seeds, factor, given.quick, work, name)
         show(entry["title"], found, entry["published"])
-        verdicts += [*verdicts_of(entry, found, given.quick, ", twin"),
-                     against_goal(entry["title"], entry["data"], found, entry["unit"], given.quick),
-                     against_rivals(entry["title"], found, entry["unit"], given.quick)]  # fmt: skip
+        check(bench, entry, found)
         details[entry["title"]] = found
-    for name, which in OUTSIDE.items() if given.outside else ():
-        if given.only is not None and name not in given.only:
-            continue
-        judged = Judged.of(outside_source(name, given.outside, work), which.machine, minutes_of(given.minutes, name))
-        title = f"{which.what} ({name})"
-        found = summary(judged, seeds, 1.0, given.quick, work, name)
-        show(title, found, {})
-        verdicts.append(against_rivals(title, found, which.unit, given.quick))
-        details[title] = found
     # A part of the sets takes no whole result's place.
-    finish("twin_leagues" if given.only is None else "twin_leagues_part", verdicts, given.seed, details)
+    bench.keep = given.only is None
+    return details
 
 
 if __name__ == "__main__":

@@ -18,15 +18,14 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from common import Verdict, finish, parser, table, verdict
-from edp.cli.train import source_of
+from common import EXAMPLES, VARIABLE, Bench, Verdict, benchmark, option, shared_folder, table, verdict
+from edp.cli.options import source_of
 from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.splits import ByRecording, ByTime
@@ -41,7 +40,6 @@ from edp.storage.runs import KeyedRun, Run
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.fit_twin import TwinFit
 from edp.workflows.twin.prepare_twin import prepared_twin
-from real_recordings import EXAMPLES, VARIABLE, shared_folder
 
 RIVALS = ("static", "arx", "n4sid")
 SPLIT = ByTime(validation_share=0.2, test_share=0.25)
@@ -158,19 +156,21 @@ def show(found: dict[str, dict[str, Any]], quick: bool) -> list[Verdict]:
     return verdicts
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
-    options = parser(__doc__ or "")
-    options.add_argument("--shared", type=Path, default=None, help=f"folder of the recordings (else ${VARIABLE})")
-    options.add_argument("--logs", type=Path, default=None, help="a folder of own logs in place of the public sets")
-    options.add_argument("--map", type=Path, default=None, help="signal map of --logs")
-    options.add_argument("--repair", action="append", default=[], help="as of edp twin")
-    given = options.parse_args(arguments)
-    if given.logs is None and shared_folder(given.shared) is None:
-        return
-    found = public_sets(given.seed, given.quick) if given.logs is None else own_logs(given)
-    # What somebody's own logs give is theirs, and takes no other result's place.
-    finish("twin_recordings", show(found, given.quick), given.seed, found, keep=given.logs is None)
+@benchmark(
+    option("--shared", dest="recordings", type=Path, help=f"folder of the recordings (else ${VARIABLE})"),
+    option("--logs", type=Path, help="a folder of own logs in place of the public sets"),
+    option("--map", type=Path, help="signal map of --logs"),
+    option("--repair", action="append", default=[], help="as of edp twin"),
+)
+def main(bench: Bench) -> object:
+    if bench.options.logs is None:
+        shared_folder(bench.options.recordings)
+        found = public_sets(bench.seed, bench.quick)
+    else:
+        # What somebody's own logs give is theirs, and takes no other result's place.
+        found, bench.keep = own_logs(bench.options), False
+    bench.verdicts += show(found, bench.quick)
+    return found
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
 from edp.settings.bounds import shown
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 Number = TypeVar("Number", float, NDArray[np.floating])
 
@@ -364,7 +364,7 @@ class ChannelMap:
             if number is not None and not (math.isfinite(number) and abs(number) <= LARGEST):
                 where = f"signal map, channel '{self.name}'"
                 raise ConfigError(
-                    f"{where}: {key} = {setting_text(number)}; give a finite number of at most {figure(LARGEST)}"
+                    f"{where}: {key} = {setting_text(number)}; give a finite number of at most {typed(LARGEST)}"
                 )
 
 
@@ -408,8 +408,8 @@ class SignalMap:
             value = getattr(self, key)
             if value is not None and not (math.isfinite(value) and _SLOWEST <= value <= _FASTEST):
                 raise ConfigError(
-                    f"signal map: {key} = {setting_text(value)}; give a number from {figure(_SLOWEST)} to "
-                    f"{figure(_FASTEST)}, or leave it out"
+                    f"signal map: {key} = {setting_text(value)}; give a number from {typed(_SLOWEST)} to "
+                    f"{typed(_FASTEST)}, or leave it out"
                 )
         if self.delimiter is not None and (len(self.delimiter) != 1 or self.delimiter in '"\r\n\0'):
             raise ConfigError(

@@ -65,6 +65,18 @@ def figure(value: float | None, digits: int = MAX_DIGITS) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
+def typed(value: float | None, digits: int = 6) -> str:
+    """Return a number as a user can type it back into a setting or an option: ASCII, without thousands separators.
+
+    Messages of errors use it: what they advise is copied. Tables, pages and first lines use `figure`.
+    """
+    if value is None:
+        return MISSING
+    if math.isfinite(value) and float(value).is_integer() and abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value:.{digits}g}"
+
+
 def unit_text(unit: str) -> str:
     """Return a unit as pages show it: empty for numbers without a unit, which is "1" in files."""
     return "" if unit == "1" else unit

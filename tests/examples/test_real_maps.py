@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.io import savemat
 
 from edp.config.experiment import load_experiment, read_toml
 from edp.errors import ConfigError
 from edp.logs.source import load_data_set
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.workflows.train_evaluate import DataSource
+from edp.storage import read_json
+from edp.workflows.auto import load_auto, train_auto
+from edp.workflows.train_evaluate import DataSource, evaluate, train
 
 ROOT = Path(__file__).parents[2]
 REAL = ROOT / "examples" / "real"
@@ -35,20 +36,10 @@ def scripts():
     folder = str(ROOT / "benchmarks")
     sys.path.insert(0, folder)
     try:
-        names = ("real_recordings", "published_leagues", "twin_leagues", "twin_recordings")
+        names = ("auto_preset", "transfer_real", "twin_leagues", "twin_recordings")
         yield {name: script(name) for name in names}
     finally:
         sys.path.remove(folder)
-
-
-@pytest.fixture(scope="module")
-def bench(scripts):
-    return scripts["real_recordings"]
-
-
-@pytest.fixture(scope="module")
-def leagues(scripts):
-    return scripts["published_leagues"]
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=[entry["settings"] for entry in ENTRIES])
@@ -88,7 +79,7 @@ def test_an_unset_variable_is_named(monkeypatch):
         DataSource.of(REAL / "faster.toml").read()
 
 
-@pytest.mark.parametrize("name", ["real_recordings", "published_leagues", "twin_leagues", "twin_recordings"])
+@pytest.mark.parametrize("name", ["auto_preset", "transfer_real", "twin_leagues", "twin_recordings"])
 def test_without_recordings_it_says_so_and_succeeds(name, scripts, tmp_path, capsys):
     scripts[name].main(["--shared", str(tmp_path / "nowhere")])
     lines = capsys.readouterr().out.strip().splitlines()
@@ -133,18 +124,6 @@ def test_a_narx_rival_follows_a_quadratic_system_through_a_run_that_it_was_not_f
     assert np.sqrt(np.mean((said - answer[600 + rival.lags :]) ** 2)) < 0.02 * np.std(answer)
 
 
-def test_a_set_from_outside_is_divided_as_the_literature_does(scripts, tmp_path):
-    twins = scripts["twin_leagues"]
-    command, answer = np.arange(500.0)[:, None], 2.0 * np.arange(500.0)[:, None]
-    savemat(tmp_path / "drive.mat", {"u1": command, "z1": answer, "z2": answer})
-    source = twins.outside_source("drive", tmp_path, tmp_path)
-    judged = twins.Judged.of(source, twins.OUTSIDE["drive"].machine, 0.0)
-    assert judged.channels.rate_hz == 50.0
-    assert [c.name for c in judged.channels.answers] == ["velocity"]
-    assert (judged.estimation.samples, judged.test.samples) == (250, 250)
-    assert judged.test.inputs[0, 0] == 250.0
-
-
 def test_the_default_twin_is_held_against_the_best_of_its_rivals(scripts):
     twins = scripts["twin_recordings"]
     assert set(twins.SETS) <= {path.stem for path in REAL.glob("*.toml")}
@@ -160,60 +139,7 @@ def test_the_default_twin_is_held_against_the_best_of_its_rivals(scripts):
     assert mean.ratio == pytest.approx(np.sqrt(0.8 * 1.2))
 
 
-def model(error: float) -> dict:
-    return {"overall": {"1": {"y": {"rmse": error}}, "0": {"y": {"rmse": error}}}}
-
-
-SCORES = {
-    "task": {"skip": 4, "rate_hz": 2.0},
-    "models": {"network": model(0.5), "ridge_arx": model(0.8), "persistence": model(2.0)},
-}
-
-
-def test_rows_and_verdicts(bench):
-    entry = {"title": "made up", "rows": [["y", 1, 2.1, 0.4]]}
-    rows = list(bench.floor_rows(entry, SCORES))
-    assert (rows[0].ours, rows[0].ridge, rows[0].persistence, rows[0].floor_linear) == (0.5, 0.8, 2.0, 0.4)
-    (found,) = bench.verdicts_of(rows, quick=True)
-    assert not found.met
-    assert found.ratio == pytest.approx(1.25)
-    bench.show_floors(rows, quick=True)
-
-
-def test_a_league_puts_the_median_of_ours_in_its_place(leagues, monkeypatch, capsys):
-    errors = {"training.seed=0": 0.9, "training.seed=1": 0.5, "training.seed=2": 0.4}
-
-    def scores_of(data, settings, out, changes):
-        return {**SCORES, "models": {**SCORES["models"], "network": model(errors[changes[0]])}}, 1.0
-
-    monkeypatch.setattr(leagues, "scores_of", scores_of)
-    entry = {
-        "title": "made up",
-        "data": "d",
-        "settings": "s",
-        "target": "y",
-        "factor": 1e3,
-        "unit": "mm",
-        "published": {"A": 0.1, "B": 900.0},
-        "rivals": ["A", "B"],
-        "source": "s",
-        "note": "n",
-    }
-    found = leagues.measure(entry, range(3), quick=False)
-    assert found["median"] == 500.0
-    assert found[leagues.RIDGE] == 800.0
-    assert [(v.ours, v.rival, v.met) for v in leagues.verdicts_of(entry, found, False)] == [
-        (500.0, 0.1, False),
-        (500.0, 900.0, True),
-    ]
-    leagues.show(entry, found, quick=True)
-    printed = capsys.readouterr().out
-    assert printed.index("A  ") < printed.index("OURS") < printed.index("B  ")
-    assert "Ours by seed: 900, 500, 400" in printed
-    assert "first 4 ticks (2 s)" in printed
-
-
-def test_real_recordings_train_through_their_maps(bench, tmp_path, monkeypatch):
+def test_real_recordings_train_through_their_maps(tmp_path, monkeypatch):
     """The whole path on a set of the same shape, so that it runs where the recordings are not."""
     rng = np.random.default_rng(0)
     u = np.repeat(rng.normal(size=(160, 2)), 8, axis=0)[:1024]
@@ -225,9 +151,15 @@ def test_real_recordings_train_through_their_maps(bench, tmp_path, monkeypatch):
     text = "uEst,uVal,yEst,yVal\n" + "\n".join(",".join(f"{v:.6g}" for v in row) for row in table)
     (tmp_path / "cascaded_tanks/dataBenchmark.csv").write_text(text)
     monkeypatch.setenv("EDP_SHARED_DATA", str(tmp_path))
+    data = DataSource.of(REAL / "tanks.toml")
     changes = ["training.epochs=1", "training.updates=2"]
-    free, _ = bench.scores_of("tanks.toml", "tanks_freerun_settings.toml", tmp_path / "free", changes)
-    assert np.isfinite(bench.rmse(free, "network", "y", 0))
-    scores, _ = bench.scores_of("tanks.toml", "tanks_settings.toml", tmp_path / "run", ["auto.minutes=0.05"])
+    train(data, load_experiment(REAL / "tanks_freerun_settings.toml", "small", changes), tmp_path / "free")
+    assert np.isfinite(rmse(tmp_path / "free", "network", 0))
+    train_auto(data, load_auto(REAL / "tanks_settings.toml", ["auto.minutes=0.05"]), tmp_path / "run")
     for horizon in (1, 5, 10):
-        assert bench.rmse(scores, "network", "y", horizon) < bench.rmse(scores, "persistence", "y", horizon)
+        assert rmse(tmp_path / "run", "network", horizon) < rmse(tmp_path / "run", "persistence", horizon)
+
+
+def rmse(run: Path, model: str, horizon: int) -> float:
+    scores = read_json(evaluate(run, baselines=("persistence", "ridge_arx")) / "scores.json")
+    return scores["models"][model]["overall"][str(horizon)]["y"]["rmse"]

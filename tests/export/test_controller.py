@@ -393,7 +393,7 @@ def test_options_that_cannot_be_are_refused(options, text, exported_plan, tmp_pa
 
 
 def test_a_run_that_kept_no_controller_is_refused(tmp_path):
-    with pytest.raises(StorageError, match=r"controller/controller\.json.*run edp control again"):
+    with pytest.raises(StorageError, match=r"one of an earlier version: it has no controller\.json"):
         export_controller(tmp_path, tmp_path / "c", "machine")
 
 

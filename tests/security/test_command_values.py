@@ -11,7 +11,7 @@ from typer.models import OptionInfo, ParameterInfo
 
 from edp.cli import app
 from edp.cli.console import PATH_OPTIONS, run_app
-from edp.cli.settings import FORMER
+from edp.cli.options import FORMER
 
 EXTREMES = ("-1", "0", "1e9", "1000000000000", "9" * 6000, "nan", "1e400", "")
 APART = {"simulate", "demo"}

@@ -16,7 +16,7 @@ from edp.evaluation.controller import load_budget
 from edp.logs.source import load_data_set, load_signal_map
 from edp.report import read_facts
 from edp.report.compression.facts import read_compression
-from edp.report.run.predictability import read_limit
+from edp.report.run.facts import read_limit
 from edp.report.transfer.facts import read_transfer
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics.soil import load_material

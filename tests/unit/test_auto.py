@@ -336,7 +336,7 @@ def test_a_recurrent_network_is_trained_to_the_end_where_its_trial_comes_near_th
     tmp_path, monkeypatch, margin, trained
 ):
     monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
-    monkeypatch.setattr("edp.workflows.auto.portfolio.MARGIN", margin)
+    monkeypatch.setattr("edp.workflows.auto.train_candidates.MARGIN", margin)
     told = NotedProgress()
     source = write(tmp_path / "logs", ticks=1500)
     facts = train_auto(source, load_auto(None, SET), tmp_path / "run", told).facts

@@ -9,7 +9,7 @@ from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY
 from edp.workflows.auto import load_auto
-from edp.workflows.auto.channels import fit_to_channels
+from edp.workflows.auto.recordings import fit_to_channels
 
 
 def fitted(*absent, more=(), changes=()):

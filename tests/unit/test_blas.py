@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from edp.cli.threads import VARIABLE, use_one_blas_thread
+from edp.cli.process import VARIABLE, use_one_blas_thread
 from edp.config.experiment import load_experiment
 from edp.config.twin import TwinExperiment
 from edp.training.blas import one_blas_thread
@@ -61,7 +61,7 @@ def test_the_preset_auto_and_evaluations_run_within_one_thread(tmp_path, monkeyp
         raise Told(*threads())
 
     # By its module: the package gives the function under the same name.
-    monkeypatch.setattr(sys.modules[train_auto.__module__], "_ReadOnce", tell)
+    monkeypatch.setattr(sys.modules[train_auto.__module__], "ReadOnce", tell)
     monkeypatch.setattr(train_evaluate, "trained_run", tell)
     with threadpool_limits(limits=2, user_api="blas"):
         for call in (lambda: train_auto(Recordings(), None, tmp_path), lambda: evaluate(tmp_path)):

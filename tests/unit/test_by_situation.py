@@ -9,7 +9,7 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.evaluation.by_situation import NEAR_STOP, SITUATIONS, Situations
 from edp.evaluation.judge import score_predictions
-from edp.report.run.situations import situation_sheet
+from edp.report.run.sheets import situation_sheet
 from edp.signals import Channel, Kind
 
 RATE, STILL = 10.0, 0.0

@@ -12,7 +12,7 @@ from edp.data.splits import ByBlocks, ByName, ByRecording, ByTime
 from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.workflows.auto import load_auto
-from edp.workflows.auto.division import divide
+from edp.workflows.auto.recordings import divide
 from edp.workflows.proposal import propose
 
 RATE = 50.0

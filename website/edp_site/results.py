@@ -37,12 +37,48 @@ def read_goals(path: Path) -> list[Goal]:
     return [Goal(**row | {"verdicts": tuple(row.get("verdicts", ()))}) for row in rows]
 
 
-def results_page(folder: Path, goals: Sequence[Goal]) -> str:
+@dataclass(frozen=True)
+class Archived:
+    """Benchmark, or part of one, that was removed because its question is answered.
+
+    Attributes:
+        script: name of the script.
+        reason: why it is not measured again.
+        place: argument of ``git show`` that prints the script.
+        parts: removed options; an empty text if the whole script was removed.
+        results: names of the kept results of these options.
+    """
+
+    script: str
+    reason: str
+    place: str
+    parts: str = ""
+    results: tuple[str, ...] = ()
+
+    def covers(self, name: str, result: Mapping[str, Any]) -> bool:
+        """Return whether a kept result can only be measured again with the archived script."""
+        return name in self.results or (not self.parts and _script(result) == self.script)
+
+
+def read_archive(path: Path) -> list[Archived]:
+    """Return the rows of ``benchmarks/archive.toml``."""
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    return [
+        Archived(
+            **row
+            | {"results": tuple(row.get("results", ())), "place": f"{table['commit']}:benchmarks/{row['script']}.py"}
+        )
+        for row in table["archived"]
+    ]
+
+
+def results_page(folder: Path, goals: Sequence[Goal], archive: Sequence[Archived] = ()) -> str:
     """Return a page with one table per benchmark, its command and its date; no figure is typed by hand.
 
     Args:
         folder: folder of the JSON files that benchmarks write.
         goals: goals that were asked; a table of them comes first.
+        archive: removed benchmarks; their results name the commit that has the script.
 
     Raises:
         ValueError: a file lacks what every result has.
@@ -83,6 +119,9 @@ def results_page(folder: Path, goals: Sequence[Goal]) -> str:
             f"{result['date']}, seed {result['seed']}.",
             "",
         ]
+        for one in archive:
+            if one.covers(path.stem, result):
+                lines += [f"Archived: {one.reason}. Script: `git show {one.place}`.", ""]
         lines += _table(result["verdicts"])
     return "\n".join(lines) + "\n"
 
@@ -110,6 +149,10 @@ def _checked(path: Path) -> Mapping[str, Any]:
         if missing := [key for key in _FIELDS if key not in verdict]:
             raise ValueError(f"{path.name}: a verdict has no {missing}; run its benchmark again")
     return result  # type: ignore[no-any-return]
+
+
+def _script(result: Mapping[str, Any]) -> str:
+    return str(result["command"]).split()[0].removesuffix(".py")
 
 
 def _command(result: Mapping[str, Any]) -> str:

@@ -66,7 +66,9 @@ def _made(root: Path) -> dict[str, Callable[[], str]]:
         "reference/formats.md": formats.formats_page,
         "reference/c.md": formats.c_page,
         "leaderboard.md": lambda: results.results_page(
-            root / "benchmarks" / "results", results.read_goals(root / "benchmarks" / "goals.toml")
+            root / "benchmarks" / "results",
+            results.read_goals(root / "benchmarks" / "goals.toml"),
+            results.read_archive(root / "benchmarks" / "archive.toml"),
         ),
         "decisions/index.md": lambda: decisions_page(root / "docs" / "decisions"),
     }

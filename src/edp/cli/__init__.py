@@ -43,10 +43,8 @@ from edp.cli import (
     twin,
 )
 from edp.cli.console import err, run_app
-from edp.cli.ending import stop_on_request
-from edp.cli.slow import tell_of_missing_layers, tell_of_slow_logs
-from edp.cli.threads import use_one_blas_thread
-from edp.cli.unsealed import tell_of_unsealed_files
+from edp.cli.notices import tell_of_missing_layers, tell_of_slow_logs, tell_of_unsealed_files
+from edp.cli.process import stop_on_request, use_one_blas_thread
 from edp.workflows import load_plugins
 
 app = typer.Typer(

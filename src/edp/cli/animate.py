@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
-from edp.cli.options import MOST_SECONDS, check_effects, within
-from edp.cli.train import MapOption
+from edp.cli.options import MOST_SECONDS, MapOption, check_effects, within
 from edp.errors import ConfigError
 from edp.settings.bounds import above, span
 from edp.storage.paths import full_path

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption, source_if_given
 from edp.cli.progress import shown_progress
-from edp.cli.settings import SettingsOption
-from edp.cli.train import DataOption, MapOption, RepairOption, source_if_given
 
 if TYPE_CHECKING:
     from edp.workflows.compression import Judged

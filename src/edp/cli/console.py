@@ -21,9 +21,8 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, Tas
 from rich.table import Table
 from rich.text import Text
 
-from edp.cli.ending import memory_message, out_of_memory, stopped_code
-from edp.cli.options import check_belonging
-from edp.cli.settings import setting_of
+from edp.cli.options import check_belonging, setting_of
+from edp.cli.process import memory_message, out_of_memory, stopped_code
 from edp.errors import ConfigError, EdpError
 
 UNFOLDED_COLUMNS = 100_000

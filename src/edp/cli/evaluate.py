@@ -9,11 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
-from edp.cli.options import MOST_HOURS, MOST_MINUTES, check_effects, within
+from edp.cli.options import (
+    MOST_HOURS,
+    MOST_MINUTES,
+    ClusterOption,
+    DataOption,
+    MapOption,
+    OpenOption,
+    RepairOption,
+    WorkersOption,
+    check_effects,
+    source_if_given,
+    within,
+    workforce_of,
+)
 from edp.cli.progress import shown_progress
-from edp.cli.train import DataOption, MapOption, RepairOption, source_if_given
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
-from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.settings.bounds import above, span
 from edp.wording import figure, number, percent, setting_text
 
@@ -241,7 +252,7 @@ def score_table(scores: dict[str, Any]) -> None:
 
 def by_situation_table(scores: dict[str, Any]) -> None:
     """Print where the network's error is by what the axes did, at its furthest horizon, where the scores tell."""
-    from edp.report.run.situations import situation_sheet
+    from edp.report.run.sheets import situation_sheet
 
     horizon = max(scores["task"]["horizons"])
     sheet = situation_sheet(scores, horizon)

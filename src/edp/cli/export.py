@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, waiting
-from edp.cli.train import MapOption, RepairOption, source_if_given
+from edp.cli.options import MapOption, RepairOption, source_if_given
 from edp.errors import ConfigError
 from edp.storage.paths import full_path, is_file_at
 

@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.options import (
+    ClusterOption,
+    MapOption,
+    OpenOption,
+    RepairOption,
+    SettingsOption,
+    WorkersOption,
+    source_of,
+    workforce_of,
+)
 from edp.cli.progress import shown_progress
-from edp.cli.settings import SettingsOption
-from edp.cli.train import MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
-from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import ConfigError
 from edp.wording import figure
 

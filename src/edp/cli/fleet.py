@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.options import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.cli.progress import shown_progress
-from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.storage.paths import full_path
 
 app = typer.Typer(

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.progress import shown_progress
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.errors import count_of
 from edp.wording import figure
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.options import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.progress import shown_progress
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.twin import score_table
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.wording import figure

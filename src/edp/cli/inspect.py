@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
+from edp.cli.options import ClusterOption, LogsArgument, MapOption, OpenOption, WorkersOption, workforce_of
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, show_lines, show_report, verdict_text
-from edp.cli.train import LogsArgument, MapOption, shell_words
-from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import DataError, EdpError, count_of
 from edp.storage.paths import full_path, is_file_at
 from edp.wording import figure, number, percent
@@ -113,7 +113,8 @@ def inspect(
         out.print(verdict_text(quality))
         if quality.proposed or (errors and signal_map is None and _undescribed(quality)):
             out.print(
-                f"next: edp init {shell_words(data)}, which writes a signal map and settings; then edp train with both"
+                f"next: edp init {shlex.join(map(str, data))}, which writes a signal map and settings; then edp train "
+                "with both"
             )
         elif not errors:
             out.print(f"next: {_training(data, signal_map)}")
@@ -139,9 +140,10 @@ def _training(data: Sequence[Path], signal_map: Path | None) -> str:
     described = signal_map or (data[0] if data[0].suffix == ".toml" else None)
     settings = None if described is None else described.parent / SETTINGS
     mapped = "" if signal_map is None else f" --map {signal_map}"
+    command = f"edp train {shlex.join(map(str, data))}{mapped}"
     if settings is None or not is_file_at(settings):
-        return f"edp train {shell_words(data)}{mapped} --out runs/first"
-    return f"edp train {shell_words(data)}{mapped} --config {settings} --out {settings.parent / 'runs' / 'first'}"
+        return f"{command} --out runs/first"
+    return f"{command} --config {settings} --out {settings.parent / 'runs' / 'first'}"
 
 
 def _coverage(

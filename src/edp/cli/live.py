@@ -10,7 +10,7 @@ import typer
 
 from edp.cli.consent import ask_for_fmus
 from edp.cli.console import JsonFlag, emit, err, out
-from edp.cli.train import MapOption
+from edp.cli.options import MapOption
 from edp.errors import ConfigError
 from edp.settings.bounds import MOST_SEED
 from edp.storage.paths import full_path

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
-from edp.cli.options import check_effects
+from edp.cli.options import LogsArgument, MapOption, RepairOption, WorkersOption, check_effects, source_of
 from edp.cli.progress import shown_progress
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
-from edp.cli.workforce import WorkersOption
 from edp.errors import ConfigError, count_of
 from edp.storage.paths import full_path
 from edp.wording import figure

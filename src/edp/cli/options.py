@@ -1,15 +1,20 @@
-"""Validation of command-line options: bounds of numeric options and dependencies between options."""
+"""Options that commands share, their validation, and the settings that replaced former options."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.errors import ConfigError
 from edp.settings.bounds import Bound, shown
+
+if TYPE_CHECKING:
+    from edp.jobs import Workforce
+    from edp.logs.source import DataSource
 
 MOST_WORKERS = 256
 MOST_LOOPS = 10_000
@@ -17,6 +22,42 @@ MOST_TICKS = 1_000_000
 """Of a reference recording: three hours at 100 Hz."""
 MOST_SECONDS, MOST_MINUTES, MOST_HOURS = 1e6, 1e6, 1e6
 """Lengths of runs and logs, processor time, and lengths of data sets: more than anybody has."""
+LogsArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOGS...",
+        help="Logs and folders of logs; or one data-set file (.toml), or one store.",
+    ),
+]
+DataOption = Annotated[
+    list[Path],
+    typer.Option(
+        "--data",
+        help="Other recordings: logs and folders of logs, a data-set file, or a store; may be repeated. Default: those "
+        "of the run.",
+    ),
+]
+MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
+RepairOption = Annotated[
+    list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
+]
+SettingsOption = Annotated[
+    Path | None,
+    typer.Option("--config", help="Settings (TOML): the table of this command, and tables of its trainings."),
+]
+WorkersOption = Annotated[
+    int, typer.Option(min=0, max=MOST_WORKERS, help="Processes side by side; 0: one for each core.")
+]
+ClusterOption = Annotated[
+    str,
+    typer.Option(help="Address of a Ray cluster that does the work, or auto; all paths must lead to the same there."),
+]
+OpenOption = Annotated[
+    bool,
+    typer.Option(
+        "--open-cluster", help="Accept a cluster without a token, on which anyone who can reach it can run code."
+    ),
+]
 
 OWNERS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("*", "open_cluster"): ("cluster",),
@@ -73,6 +114,40 @@ DEPENDENT: Mapping[tuple[str, str], str] = {
 
 ``changes.TABLE`` are the values of ``--set`` for one table of the settings.
 """
+_SAME = {
+    "finetune": "head_epochs epochs head_rate backbone_rate depth_decay rounds rate batch smoothness weight_decay "
+    "patience rank source_weight soft reversal inner_rate inner_steps center",
+    "adapt": "rank noise prior limit margin",
+    "distil": "levels",
+    "compress": "units",
+    "pretrain": "inner_rate inner_steps shots",
+    "screen": "trusted",
+}
+FORMER = {(command, name): f"{command}.{name}=VALUE" for command, names in _SAME.items() for name in names.split()} | {
+    ("finetune", "no_center"): "finetune.center=false",
+    ("finetune", "any_sign"): "finetune.check_signs=false",
+    ("adapt", "rest"): "adapt.dead_zone=VALUE",
+    ("adapt", "forgetting"): "adapt.forgetting_s=VALUE",
+    ("adapt", "judged"): "adapt.judged_s=VALUE",
+    ("distil", "pruned"): "distil.pruned=true",
+    ("distil", "truth"): "distil.objective.truth=VALUE",
+    ("distil", "hint"): "distil.objective.hint=VALUE",
+    ("compress", "format"): "compress.formats=[VALUE]",
+    ("compress", "thesis"): "compress.thesis=true",
+    ("compress", "units"): "compress.units=[VALUE]",
+    ("pretrain", "head_only"): "pretrain.head_only=true",
+    ("screen", "trusted"): "screen.trusted=[VALUE]",
+    ("screen", "random"): "trials.random=VALUE",
+    ("run", "mode"): "search.mode=VALUE",
+    ("simulate", "masses"): "masses=[LOW, HIGH]",
+    ("simulate", "scatter"): "scatter=VALUE",
+    ("simulate", "layout"): "files.layout=VALUE",
+    ("simulate", "truth"): "files.truth=VALUE",
+    ("simulate", "moments"): "limit.moments=VALUE",
+    ("simulate", "branches"): "limit.branches=VALUE",
+    ("simulate", "horizons"): "limit.horizons=[VALUE]",
+}
+"""By command and option up to version 0.1, what stands behind ``--set`` for it now."""
 
 
 def within(bound: Bound) -> Callable[[typer.CallbackParam, Any], Any]:
@@ -93,6 +168,48 @@ def within(bound: Bound) -> Callable[[typer.CallbackParam, Any], Any]:
         return value
 
     return check
+
+
+def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
+    """Return a data source from command-line options."""
+    from edp.config.experiment import build
+    from edp.logs.repair import Repair
+    from edp.logs.source import DataSource
+
+    table: dict[str, str] = {}
+    for text in repair:
+        # Only the first sign parts key and value.
+        key, sign, value = text.partition("=")
+        if not sign:
+            raise ConfigError(f"--repair '{text}': write what=how, for example nan=hold")
+        table[key] = value
+    return DataSource.of(data, signal_map, build(Repair, table, "--repair") if table else None)
+
+
+def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource | None:
+    """Return a data source from command-line options; None if no path was given."""
+    return source_of(data, signal_map, repair) if data else None
+
+
+def workforce_of(workers: int, cluster: str, open_cluster: bool, usual: int = 1) -> Workforce:
+    """Return the workers that the options ask for.
+
+    Args:
+        workers: as given.
+        cluster: as given.
+        open_cluster: as given.
+        usual: number of workers where the option is left out; not refused beside a cluster.
+    """
+    from edp.jobs import Workforce
+
+    chosen = 1 if cluster and workers == usual else workers
+    return Workforce(workers=chosen, cluster=cluster, open_cluster=open_cluster)
+
+
+def setting_of(command: str, option: str) -> str | None:
+    """Return the ``--set`` form of an option that is a setting now; None for any other word."""
+    setting = FORMER.get((command, option.lstrip("-").replace("-", "_")))
+    return None if setting is None else f"--set '{setting}'"
 
 
 def check_belonging(context: typer.Context) -> None:

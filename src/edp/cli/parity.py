@@ -9,8 +9,7 @@ import typer
 
 from edp.cli.consent import ask
 from edp.cli.console import JsonFlag, emit, err, out, table
-from edp.cli.options import MOST_TICKS, check_effects
-from edp.cli.train import MapOption, RepairOption, source_if_given
+from edp.cli.options import MOST_TICKS, MapOption, RepairOption, check_effects, source_if_given
 from edp.wording import figure, number
 
 if TYPE_CHECKING:

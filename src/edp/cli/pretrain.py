@@ -8,11 +8,18 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
-from edp.cli.options import check_effects
+from edp.cli.options import (
+    ClusterOption,
+    LogsArgument,
+    MapOption,
+    OpenOption,
+    RepairOption,
+    SettingsOption,
+    check_effects,
+    source_of,
+    workforce_of,
+)
 from edp.cli.progress import shown_progress
-from edp.cli.settings import SettingsOption
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
-from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 
 
 def pretrain(
@@ -71,7 +78,7 @@ def pretrain(
 
 def _tables(result: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
-    from edp.report.run.foundation import contexts_sheet, parts_sheet
+    from edp.report.run.sheets import contexts_sheet, parts_sheet
 
     for sheet in (parts_sheet(result), contexts_sheet(result)):
         table(sheet.caption, sheet.heads(), sheet.texts())

@@ -30,9 +30,8 @@ def report(
     Example: `edp report runs/first`
     """
     from edp.report import build_report, build_twin_report, headline, holds_free_runs, read_facts
-    from edp.report.run.facts import main_horizon
+    from edp.report.run.facts import limit_line, main_horizon
     from edp.report.run.outputs import judged_line
-    from edp.report.run.predictability import limit_line
 
     is_twin = holds_free_runs(run)
     check_effects(context, {"limit": not is_twin, "budget": not is_twin})

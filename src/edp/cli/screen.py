@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,10 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, left_text, listing, out, progress, table
-from edp.cli.options import TRIAL_TABLES, check_effects
+from edp.cli.options import (
+    TRIAL_TABLES,
+    ClusterOption,
+    LogsArgument,
+    MapOption,
+    OpenOption,
+    RepairOption,
+    WorkersOption,
+    check_effects,
+    source_of,
+    workforce_of,
+)
 from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
-from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
-from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
 from edp.errors import count_of
 from edp.wording import figure, number, percent
 
@@ -252,7 +262,7 @@ def facts_of(selection: Selection) -> dict[str, Any]:
 def next_command(data: Sequence[Path], signal_map: Path | None, repair: Sequence[str], selection: Selection) -> str:
     """The training that the proposal is for."""
     chosen = signal_map or selection.map
-    parts = [f"edp train {shell_words(data)}"] + ([f"--map {chosen}"] if chosen is not None else [])
+    parts = [f"edp train {shlex.join(map(str, data))}"] + ([f"--map {chosen}"] if chosen is not None else [])
     parts += [f"--repair {entry}" for entry in repair]
     return " ".join([*parts, f"--config {selection.files['settings']}", "--out runs/first"])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,8 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
-from edp.cli.options import check_effects
-from edp.cli.train import LogsArgument, MapOption, RepairOption, shell_words, source_of
+from edp.cli.options import LogsArgument, MapOption, RepairOption, check_effects, source_of
 from edp.errors import count_of
 from edp.wording import number
 
@@ -249,7 +249,7 @@ def _show(result: SearchResult, page: Path) -> None:
         return
     if result.networks:
         out.print(f"next: {_deploying(result)}")
-    data, word = shell_words(result.source.paths), "or" if result.networks else "next"
+    data, word = shlex.join(map(str, result.source.paths)), "or" if result.networks else "next"
     out.print(f"{word}: edp train {data} --config {result.teacher} --out runs/teacher (frozen sessions stay frozen)")
 
 

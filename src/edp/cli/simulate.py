@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, out, progress, table
-from edp.cli.options import check_effects
-from edp.cli.workforce import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, workforce_of
 from edp.errors import count_of
 from edp.wording import figure, number
 

@@ -10,9 +10,8 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, err, listing, out, table
 from edp.cli.inspect import FAULTY
+from edp.cli.options import ClusterOption, MapOption, OpenOption, RepairOption, source_of, workforce_of
 from edp.cli.progress import shown_progress
-from edp.cli.train import MapOption, RepairOption, source_of
-from edp.cli.workforce import ClusterOption, OpenOption, workforce_of
 from edp.errors import count_of
 from edp.wording import number
 

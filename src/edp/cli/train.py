@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.cli.console import JsonFlag, duration, emit, err, out, table
-from edp.cli.options import MOST_WORKERS, check_effects
+from edp.cli.options import MOST_WORKERS, LogsArgument, MapOption, RepairOption, check_effects, source_of
 from edp.cli.progress import shown_progress
-from edp.errors import ConfigError
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
@@ -24,25 +22,6 @@ AUTO = "auto"
 """`edp.config.experiment.AUTO`, known here without loading that module."""
 MOST_EXPECTED = 12
 """Outputs of which the terminal says what to expect; the report has all."""
-LogsArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="LOGS...",
-        help="Logs and folders of logs; or one data-set file (.toml), or one store.",
-    ),
-]
-DataOption = Annotated[
-    list[Path],
-    typer.Option(
-        "--data",
-        help="Other recordings: logs and folders of logs, a data-set file, or a store; may be repeated. Default: those "
-        "of the run.",
-    ),
-]
-MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
-RepairOption = Annotated[
-    list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort|cut.")
-]
 
 
 def train(
@@ -179,29 +158,3 @@ def run(
     with shown_progress("train", quiet) as progress:
         bundle = run_training(source or DataSource.of(data), experiment, folder, training_steps(progress))
     return bundle, progress.display.measured("validation_mae")
-
-
-def shell_words(paths: Iterable[Path]) -> str:
-    """Return paths as arguments of a command that can be typed."""
-    return shlex.join(str(path) for path in paths)
-
-
-def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource | None:
-    """Return a data source from command-line options; None if no path was given."""
-    return source_of(data, signal_map, repair) if data else None
-
-
-def source_of(data: Path | Sequence[Path], signal_map: Path | None, repair: list[str]) -> DataSource:
-    """A data source from command-line options."""
-    from edp.config.experiment import build
-    from edp.logs.repair import Repair
-    from edp.logs.source import DataSource
-
-    table: dict[str, str] = {}
-    for text in repair:
-        # Only the first sign parts key and value.
-        key, sign, value = text.partition("=")
-        if not sign:
-            raise ConfigError(f"--repair '{text}': write what=how, for example nan=hold")
-        table[key] = value
-    return DataSource.of(data, signal_map, build(Repair, table, "--repair") if table else None)

@@ -8,9 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
-from edp.cli.options import MOST_MINUTES, MOST_SECONDS, MOST_WORKERS, check_effects, within
+from edp.cli.options import (
+    MOST_MINUTES,
+    MOST_SECONDS,
+    MOST_WORKERS,
+    LogsArgument,
+    MapOption,
+    RepairOption,
+    check_effects,
+    source_of,
+    within,
+)
 from edp.cli.progress import shown_progress
-from edp.cli.train import LogsArgument, MapOption, RepairOption, source_of
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
 from edp.errors import count_of
 from edp.settings.bounds import MIN_MINUTES, above, span
@@ -97,7 +106,7 @@ def twin(
 def show_trained(trained: TrainedTwin) -> None:
     """Print what a trained twin has learned of ground and network, and how far its free runs are off."""
     from edp.evaluation.beyond import beyond_sentence
-    from edp.report.twin.ground import ground_line
+    from edp.report.twin.facts import ground_line
 
     provenance = trained.bundle.provenance
     if trained.bundle.ground is not None:

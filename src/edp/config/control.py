@@ -15,7 +15,7 @@ from edp.control.tasks.grade import Grade
 from edp.errors import ConfigError
 from edp.settings.bounds import MOST_SEED, above, check_bounds, integer, span
 from edp.settings.tree import SettingsTree, Table
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 CONTROL_SETTINGS = SettingsTree(
     {"task": TASKS, "controller": CONTROLLERS}, {"task": "grade", "controller": "pi"}, what="settings"
@@ -59,8 +59,8 @@ class ControlExperiment:
         if self.deadline_ms > 1e3 / self.rate_hz:
             raise ConfigError(
                 f"control: deadline_ms = {setting_text(self.deadline_ms)}, but a tick has "
-                f"{figure(1e3 / self.rate_hz)} ms at rate_hz = "
-                f"{figure(self.rate_hz)}; give a deadline within it, or 0 for none"
+                f"{typed(1e3 / self.rate_hz)} ms at rate_hz = "
+                f"{typed(self.rate_hz)}; give a deadline within it, or 0 for none"
             )
 
 

@@ -21,7 +21,7 @@ from edp.control.plant import interface_of as interface_of
 from edp.control.reference import TipReference
 from edp.errors import ConfigError, EdpError
 from edp.registry import Registry
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 MOST_EVENTS = 1_000
@@ -155,7 +155,7 @@ class Controller(ABC):
         """
         if reference.rate_hz != self.plant.rate_hz:
             raise ConfigError(
-                f"the reference has {figure(reference.rate_hz)} Hz, {self.plant.source} {figure(self.plant.rate_hz)} "
+                f"the reference has {typed(reference.rate_hz)} Hz, {self.plant.source} {typed(self.plant.rate_hz)} "
                 "Hz; give both "
                 "the same rate"
             )

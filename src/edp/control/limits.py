@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError
 from edp.settings.bounds import above, below, check_bounds, span
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -56,7 +56,7 @@ class LoopLimits:
         for axis, low, high in zip(("boom", "arm", "bucket"), self.lever_low, self.lever_high, strict=True):
             if low == high:
                 raise ConfigError(
-                    f"limits: lever_low and lever_high of the {axis} are both {figure(low)}, so that it cannot move; "
+                    f"limits: lever_low and lever_high of the {axis} are both {typed(low)}, so that it cannot move; "
                     "low < high must hold"
                 )
 

@@ -19,7 +19,7 @@ from edp.control.tasks.base import ControlTask
 from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.signals import GROUND_CHANNELS, VOCABULARY, Channel, Kind
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 TRUE = "_true"
@@ -126,7 +126,7 @@ class _Watched:
         levers = self.controller.step(observation, tick, verdict)
         spent = time.perf_counter() - began
         if before is not None and spent > self._deadline_s:
-            levers = self.controller.late(before, tick, f"no answer within {figure(1e3 * self._deadline_s)} ms")
+            levers = self.controller.late(before, tick, f"no answer within {typed(1e3 * self._deadline_s)} ms")
         return levers, spent
 
 

@@ -15,7 +15,7 @@ from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
 from edp.training.twin_bundle import STROKES, TwinBundle, load_twin
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 FMU = ".fmu"
 SAME_STROKE = 0.01
@@ -94,6 +94,6 @@ def of_rate(twin: Twin, what: str, rate_hz: float) -> Twin:
     own = twin.channels.rate_hz
     if own != rate_hz:
         raise ConfigError(
-            f"{what} has {figure(own)} Hz, the loops {figure(rate_hz)} Hz; set rate_hz = {setting_text(own)}"
+            f"{what} has {typed(own)} Hz, the loops {typed(rate_hz)} Hz; set rate_hz = {setting_text(own)}"
         )
     return twin

@@ -22,7 +22,7 @@ from edp.data.twin_channels import INTEGRAL
 from edp.errors import DataError
 from edp.recording import STRETCH_S, Recording, spread_recordings
 from edp.signals import KINDS, Kind
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 CELLS = 6
@@ -176,7 +176,7 @@ def cover(
     if sum(r.samples for r in recordings) < sum(r.samples for r in whole):
         shown = sum(r.samples for r in recordings) / first.rate_hz / 3600.0
         absent.append(
-            f"all but {len(recordings):,} evenly spread stretches of {figure(STRETCH_S)} s: counts, shares and "
+            f"all but {len(recordings):,} evenly spread stretches of {typed(STRETCH_S)} s: counts, shares and "
             "histograms "
             f"are of these {shown:.1f} h of {hours:,.1f} h"
         )

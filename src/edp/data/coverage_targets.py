@@ -7,7 +7,7 @@ from typing import Any
 
 from edp.data.coverage import Coverage
 from edp.data.spectrum import FLAT_DB
-from edp.wording import figure
+from edp.wording import typed
 
 OCCUPANCY = 0.9
 """Share of the cells of the strokes that should be visited."""
@@ -53,7 +53,7 @@ def wanted(coverage: Coverage) -> tuple[CoverageTarget, ...]:
     inputs = coverage.spectrum
     if inputs is not None and len(inputs.frequency_hz):
         targets += [
-            CoverageTarget(f"{name}: within {figure(FLAT_DB)} dB up to", flat, inputs.used_hz, True, "Hz")
+            CoverageTarget(f"{name}: within {typed(FLAT_DB)} dB up to", flat, inputs.used_hz, True, "Hz")
             for name, flat in zip(inputs.names, inputs.flat_to_hz, strict=True)
         ]
     if coverage.distance is not None:

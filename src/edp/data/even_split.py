@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from edp.data.splits import ByBlocks, ByRecording, ByTime, Stretch
 from edp.errors import DataError
 from edp.recording import Recording
-from edp.wording import figure
+from edp.wording import typed
 
 LEAST_OF_SHARE = 0.25
 """Of what the share of a part stands for: of 300 s and 4 s a draw of whole recordings let the 4 s train."""
@@ -162,7 +162,7 @@ def blocks_where_time_is_uneven(
         return None
     ticks = "1 tick" if span == 1 else f"{span} ticks"
     return blocks, (
-        f"the end, which would test, moves unlike the rest (changes of {name} in {ticks} are {figure(ratio, 2)} times "
+        f"the end, which would test, moves unlike the rest (changes of {name} in {ticks} are {typed(ratio, 2)} times "
         "as "
         "large)"
     )

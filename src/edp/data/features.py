@@ -13,7 +13,7 @@ from edp.recording import FloatArray, Recording
 from edp.registry import Registry
 from edp.settings.bounds import MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
 from edp.signals import TABLE_A1, VOCABULARY, Kind
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 STARTING = "starting"
 """The feature that tells a network whether channels of the start are read at this tick."""
@@ -102,11 +102,11 @@ class Derived:
         # A hair below, so that 0.03 s at 100 Hz, which floats make 2.9999 ticks, are 3.
         if exact < least - ROUNDING or round(exact) > MOST_LAG:
             raise ConfigError(
-                f"derived '{self.name}': seconds = {setting_text(self.seconds)} are {figure(exact)} ticks at "
-                f"{figure(rate_hz)} Hz; from "
-                f"{least} to {MOST_LAG} ticks must hold for how = '{self.how}': choose from {figure(least / rate_hz)} "
+                f"derived '{self.name}': seconds = {setting_text(self.seconds)} are {typed(exact)} ticks at "
+                f"{typed(rate_hz)} Hz; from "
+                f"{least} to {MOST_LAG} ticks must hold for how = '{self.how}': choose from {typed(least / rate_hz)} "
                 "to "
-                f"{figure(MOST_LAG / rate_hz)} s"
+                f"{typed(MOST_LAG / rate_hz)} s"
             )
         return round(exact)
 

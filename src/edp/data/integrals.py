@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.wording import figure
+from edp.wording import typed
 
 WINDOW_S = 1.0
 """Over which changes are compared: lags of sensors and noise of velocities are small in it, drift as well."""
@@ -65,10 +65,10 @@ def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> Integral
 
 def contradiction(velocity: str, stroke: str, fit: IntegralFit) -> str:
     """What a fit that `contradicts` says of two channels, and what to do."""
-    scale = figure(fit.ratio, 3)
+    scale = typed(fit.ratio, 3)
     return (
-        f"stroke '{stroke}' changes by {scale} times what velocity '{velocity}' adds up to (over {figure(WINDOW_S)} s, "
-        f"correlation {fit.correlation:.2f}); {figure(LOW)} to {figure(HIGH)} must hold, since a stroke is the "
+        f"stroke '{stroke}' changes by {scale} times what velocity '{velocity}' adds up to (over {typed(WINDOW_S)} s, "
+        f"correlation {fit.correlation:.2f}); {typed(LOW)} to {typed(HIGH)} must hold, since a stroke is the "
         "integral of its "
         f"velocity: correct the unit, the sign or the scale of one of them in the signal map (scale = {scale} for "
         f"'{velocity}', if it is the wrong one)"

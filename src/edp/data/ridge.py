@@ -14,7 +14,7 @@ from edp.data.ridge_moments import RidgeMoments, Standard, moments_of, standard_
 from edp.data.series import Series
 from edp.errors import ConfigError
 from edp.recording import FloatArray
-from edp.wording import figure
+from edp.wording import typed
 
 PENALTIES = tuple(10.0**power for power in range(-6, 2))
 """Ridge penalties per training row on standardised features, from almost none to strong."""
@@ -185,7 +185,7 @@ def _solve(fitted: RidgeMoments, size: int, relative: float) -> DoubleArray:
         factor = linalg.cho_factor(covariance, overwrite_a=True, check_finite=False)
     except linalg.LinAlgError as error:
         raise ConfigError(
-            f"ridge penalty {figure(relative)} is too small for these inputs, which depend on one another; use 1e-9 "
+            f"ridge penalty {typed(relative)} is too small for these inputs, which depend on one another; use 1e-9 "
             "or above"
         ) from error
     return np.asarray(linalg.cho_solve(factor, cross, check_finite=False))

@@ -16,7 +16,7 @@ from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
 from edp.registry import Registry
 from edp.settings.bounds import MOST_NAMES, SEED, above, below, check_bounds, integer, shown, span
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 PARTS = ("train", "validation", "test")
 PART = below(0.0, 1.0)
@@ -325,7 +325,7 @@ class ByMachine:
         if not matching:
             known_masses = [float(mass) for mass in masses.values() if mass is not None]
             span = (
-                f"they go from {figure(min(known_masses))} to {figure(max(known_masses))} t"
+                f"they go from {typed(min(known_masses))} to {typed(max(known_masses))} t"
                 if known_masses
                 else "no recording says its mass"
             )

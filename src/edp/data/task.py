@@ -16,7 +16,7 @@ from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, FloatArray, Recording
 from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
 from edp.signals import Kind
-from edp.wording import figure
+from edp.wording import typed
 
 
 class TargetMode(StrEnum):
@@ -157,7 +157,7 @@ class Task:
         # A thousandth: loggers state the same rate with different digits.
         if abs(recording.rate_hz - self.rate_hz) > 1e-3 * self.rate_hz:
             raise DataError(
-                f"recording '{recording.name}' has {figure(recording.rate_hz)} Hz, the task {figure(self.rate_hz)} "
+                f"recording '{recording.name}' has {typed(recording.rate_hz)} Hz, the task {typed(self.rate_hz)} "
                 "Hz; all rates "
                 "must be equal: set rate_hz in the signal map"
             )

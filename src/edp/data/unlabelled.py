@@ -8,7 +8,7 @@ from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import DataError
 from edp.recording import Recording
-from edp.wording import figure
+from edp.wording import typed
 
 
 def unlabelled(task: Task, recording: Recording) -> Series:
@@ -19,7 +19,7 @@ def unlabelled(task: Task, recording: Recording) -> Series:
     """
     if abs(recording.rate_hz - task.rate_hz) > 1e-3 * task.rate_hz:
         raise DataError(
-            f"recording '{recording.name}' has {figure(recording.rate_hz)} Hz, the task {figure(task.rate_hz)} Hz; "
+            f"recording '{recording.name}' has {typed(recording.rate_hz)} Hz, the task {typed(task.rate_hz)} Hz; "
             "the rates must "
             "be equal: set rate_hz in the signal map"
         )

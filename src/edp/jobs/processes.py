@@ -34,7 +34,7 @@ from edp.jobs.base import (
 )
 from edp.jobs.perform import BEGUN
 from edp.storage.ledger import Record, TrainingStatus
-from edp.wording import figure
+from edp.wording import typed
 
 TICK_S = 0.1
 """Interval of checks of the memory of a training; without a cap the pool sleeps until something happens."""
@@ -256,9 +256,9 @@ class LocalPool(ClosedAtExit):
             if not worker.begun:
                 self._died(worker)
                 return
-            status, message = TrainingStatus.TIMEOUT, f"it took longer than {figure(job.seconds)} s"
+            status, message = TrainingStatus.TIMEOUT, f"it took longer than {typed(job.seconds)} s"
         elif job.memory_mb is not None and worker.resident_mb() > job.memory_mb:
-            status, message = TrainingStatus.OOM, f"it took more than {figure(job.memory_mb)} MB of memory"
+            status, message = TrainingStatus.OOM, f"it took more than {typed(job.memory_mb)} MB of memory"
         else:
             return
         self._drop(worker)

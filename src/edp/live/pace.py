@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 from edp.errors import ConfigError
-from edp.wording import figure
+from edp.wording import typed
 
 SLOWEST, FASTEST = 0.01, 1000.0
 """Factors on real time that a viewer may ask for."""
@@ -117,5 +117,5 @@ def checked_speed(speed: float) -> float:
     if math.isinf(speed) and speed > 0:
         return speed
     if not SLOWEST <= speed <= FASTEST:
-        raise ConfigError(f"speed {figure(speed)}; from {figure(SLOWEST)} to {figure(FASTEST)} times real time, or inf")
+        raise ConfigError(f"speed {typed(speed)}; from {typed(SLOWEST)} to {typed(FASTEST)} times real time, or inf")
     return speed

@@ -19,7 +19,7 @@ from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform
 from edp.recording import FloatArray, Recording
 from edp.signals import SignalMap
 from edp.storage.memory import check_memory
-from edp.wording import figure
+from edp.wording import typed
 
 _CACHED_ROWS = 4096
 """Rows written at a time: blocks of 1,000 to 4,000 are fastest, 500 or 8,000 take 1.5 to 2 times as long (findings)."""
@@ -347,7 +347,7 @@ def _timelines(
     check_memory(
         raw.path,
         _TICK_BYTES * grid.count * (1 + sum(not each.clock.uniform for each in stamps.values())),
-        f"{grid.count} samples from {figure(grid.start_s)} s on at {figure(grid.rate_hz)} Hz",
+        f"{grid.count} samples from {typed(grid.start_s)} s on at {typed(grid.rate_hz)} Hz",
         "check the time column for a stamp that is far off, or set a lower rate_hz in the signal map",
     )
     lines = {key: _Timeline(each.clock, each.order, *hold_rows(each.clock, grid)) for key, each in stamps.items()}

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 from edp.errors import ConfigError, DataError, StorageError, brief
 from edp.storage import make_folder, replacing
-from edp.wording import figure
+from edp.wording import typed
 
 ADDRESS = re.compile(r"(s3|gs|az):/{1,2}([^/]+)(?:/(.*))?", re.DOTALL)
 """A path object leaves one of the two slashes."""
@@ -169,7 +169,7 @@ class BucketReader:
             return results[0]
         if not errors:
             raise StorageError(
-                f"'{address}' did not answer within {figure(STEP_S)} s; see that the server can be reached from here, "
+                f"'{address}' did not answer within {typed(STEP_S)} s; see that the server can be reached from here, "
                 "and "
                 "try again: what was copied stays"
             )
@@ -262,7 +262,7 @@ def check_room(folder: Path, size: int, address: str) -> None:
     free = shutil.disk_usage(folder).free
     if size > free:
         raise StorageError(
-            f"'{address}' has {figure(size / 1e9, 3)} GB, the disk of '{folder}' {figure(free / 1e9, 3)} GB left; "
+            f"'{address}' has {typed(size / 1e9, 3)} GB, the disk of '{folder}' {typed(free / 1e9, 3)} GB left; "
             "free space, or "
             "choose another disk (EDP_CACHE for stores, TMPDIR for logs)"
         )

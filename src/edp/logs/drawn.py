@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from edp.errors import ConfigError
 from edp.logs.quality.checks import Finding
 from edp.recording import STRETCH_S, Recording, spread_recordings
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,7 @@ class Drawn:
     def what(self) -> str:
         """The same in words."""
         return (
-            f"{figure(self.hours, 3)} of {figure(self.of_hours)} h: {self.stretches:,} evenly spread stretch(es) of "
-            "them"
+            f"{typed(self.hours, 3)} of {typed(self.of_hours)} h: {self.stretches:,} evenly spread stretch(es) of them"
         )
 
 

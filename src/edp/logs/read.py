@@ -19,7 +19,7 @@ from edp.logs.write import truth_path
 from edp.recording import Recording, columns
 from edp.signals import SignalMap
 from edp.storage.paths import files_below, is_file_at, is_there
-from edp.wording import figure
+from edp.wording import typed
 
 TEXT = (".txt", ".dat")
 """Endings that logs share with other files: taken where a folder holds no logs of other endings."""
@@ -251,7 +251,7 @@ def _check_same(recordings: Sequence[Recording], files: Sequence[Path]) -> None:
     for recording, file in zip(recordings, files):
         if abs(recording.rate_hz - first.rate_hz) > RATE_TOLERANCE * first.rate_hz:
             raise DataError(
-                f"mixed rates: {files[0].name} {figure(first.rate_hz)} Hz, {file.name} {figure(recording.rate_hz)} Hz; "
+                f"mixed rates: {files[0].name} {typed(first.rate_hz)} Hz, {file.name} {typed(recording.rate_hz)} Hz; "
                 "set rate_hz in the signal map (--map)"
             )
         if recording.channel_names != first.channel_names:

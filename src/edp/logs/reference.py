@@ -18,7 +18,7 @@ from edp.signals import (
     Channel,
     Kind,
 )
-from edp.wording import figure
+from edp.wording import typed
 
 _MEANING: Mapping[Kind, str] = {
     Kind.VELOCITY: "of a cylinder or another axis that moves straight",
@@ -101,14 +101,14 @@ def _words(names: Iterable[str]) -> str:
 def _kinds() -> Iterable[list[str]]:
     for kind, facts in KINDS.items():
         low, high = facts.plausible
-        limits = "any" if kind is Kind.GENERIC else f"{figure(low)} to {figure(high)}"
+        limits = "any" if kind is Kind.GENERIC else f"{typed(low)} to {typed(high)}"
         yield [f"`{kind}`", f"`{facts.si_unit}`", f"`{facts.report_unit}`", limits, _MEANING[kind]]
 
 
 def _units() -> Iterable[list[str]]:
     for name, unit in UNITS.items():
         spelt = [alias for alias, usual in ALIASES.items() if usual == name]
-        offset = figure(unit.offset) if unit.offset else ""
+        offset = typed(unit.offset) if unit.offset else ""
         yield [f"`{name}`", _words(unit.kinds), f"{unit.factor:.10g}", offset, _words(spelt)]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.errors import ConfigError, DataError
 from edp.logs.timebase import Clock, Rows, Stamps, judge
 from edp.recording import Recording
-from edp.wording import figure
+from edp.wording import typed
 
 Mask = NDArray[np.bool_]
 
@@ -64,7 +64,7 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
         if repair.falling == "refuse":
             raise DataError(
                 f"{where}: time goes back in {len(clock.falling)} row(s), first in row {clock.falling[0]} "
-                f'(t = {figure(stamps[clock.falling[0]])} s); repair the file or set repair falling = "sort" '
+                f'(t = {typed(stamps[clock.falling[0]])} s); repair the file or set repair falling = "sort" '
                 '(--repair falling=sort), or "cut" where the clock begins anew there (--repair falling=cut)'
             )
         fact = {"repair": f"falling = {repair.falling}", "count": len(clock.falling), "row": int(clock.falling[0])}
@@ -77,7 +77,7 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
         if repair.duplicates == "refuse":
             raise DataError(
                 f"{where}: {len(clock.duplicates)} duplicate time stamp(s), first in row {clock.duplicates[0]} "
-                f'(t = {figure(stamps[clock.duplicates[0]])} s); repair the file or set repair duplicates = "last" '
+                f'(t = {typed(stamps[clock.duplicates[0]])} s); repair the file or set repair duplicates = "last" '
                 "(--repair duplicates=last)"
             )
         repairs.append({"repair": "duplicates = last", "count": len(clock.duplicates), "row": int(clock.duplicates[0])})
@@ -107,8 +107,8 @@ def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tu
     if repair.gaps == "refuse":
         raise DataError(
             f"{where}: {len(starts)} gap(s) in time, first at row {starts[0]} (t = "
-            f"{figure(starts[0] / rate_hz)} s), longest "
-            f'{figure(longest)} s; set repair gaps = "hold" (--repair gaps=hold), "cut" (keep the longest stretch) '
+            f"{typed(starts[0] / rate_hz)} s), longest "
+            f'{typed(longest)} s; set repair gaps = "hold" (--repair gaps=hold), "cut" (keep the longest stretch) '
             'or "keep" (NaN)'
         )
     fact = {"repair": f"gaps = {repair.gaps}", "count": len(starts), "row": int(starts[0]), "longest_s": longest}
@@ -153,7 +153,7 @@ def repair_values(
         if repair.nan == "refuse":
             raise DataError(
                 f"{where}: channel '{name}' has {len(rows)} missing or infinite value(s), first in row {first} "
-                f'(t = {figure(first / rate_hz)} s); repair the file or set repair nan = "hold" (--repair nan=hold)'
+                f'(t = {typed(first / rate_hz)} s); repair the file or set repair nan = "hold" (--repair nan=hold)'
             )
         # Nothing is taken from later samples, which a machine would not have had.
         if bad[0]:

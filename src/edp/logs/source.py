@@ -32,7 +32,7 @@ from edp.recording import MACHINE, Recording
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
 from edp.storage.paths import full_path, is_file_at
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -408,7 +408,7 @@ def _check_listed(recordings: list[Recording], path: Path) -> None:
     rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
     # A thousandth, as `edp.logs.read.RATE_TOLERANCE`.
     if max(rates) > 1.001 * min(rates):
-        shown = ", ".join(f"{name} {figure(rate)} Hz" for rate, name in rates.items())
+        shown = ", ".join(f"{name} {typed(rate)} Hz" for rate, name in rates.items())
         raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.wording import figure
+from edp.wording import typed
 
 Stamps = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -97,7 +97,7 @@ def judge(stamps: Stamps, where: str) -> Clock:
     largest = float(np.abs(stamps).max())
     if largest > LATEST_SECONDS:
         raise DataError(
-            f"{where}: the time stamp of row {int(np.abs(stamps).argmax())} lies {figure(largest)} s from zero; where "
+            f"{where}: the time stamp of row {int(np.abs(stamps).argmax())} lies {typed(largest)} s from zero; where "
             "the "
             'file counts in another unit, set time_unit = "ms", "us" or "ns" in the signal map, else repair the stamp'
         )
@@ -113,7 +113,7 @@ def judge(stamps: Stamps, where: str) -> Clock:
         raise DataError(f"{where}: no time stamp is later than the first; is this the time column?")
     median = float(np.median(rising))
     if median < SHORTEST_STEP_S:
-        raise DataError(f"{where}: time steps of {figure(median)} s; is this the time column, and in which unit?")
+        raise DataError(f"{where}: time steps of {typed(median)} s; is this the time column, and in which unit?")
     start, step = _line(stamps)
     off = stamps - (start + step * np.arange(len(stamps))) if step > 0 else np.full(len(stamps), np.inf)
     jitter = float(np.sqrt(np.mean(off**2)) / step) if step > 0 else float("inf")
@@ -266,7 +266,7 @@ def common_grid(clocks: Sequence[Clock], rate_hz: float | None, where: str) -> G
     stop = min(float(clock.stamps[-1]) for clock in clocks)
     if stop < start:
         raise DataError(
-            f"{where}: times of columns do not overlap (latest start {figure(start)} s, earliest end {figure(stop)} s)"
+            f"{where}: times of columns do not overlap (latest start {typed(start)} s, earliest end {typed(stop)} s)"
         )
     # The last stamp is a tick of its own where it misses the grid by rounding only.
     ticks = (stop - start) * rate

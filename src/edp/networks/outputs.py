@@ -19,7 +19,7 @@ from edp.networks.losses import Prediction
 from edp.networks.streaming import Operation
 from edp.registry import Registry
 from edp.settings.bounds import between, check_bounds, check_count
-from edp.wording import figure
+from edp.wording import typed
 
 SMALLEST = 1e-4  # least distance of neighbouring quantiles, in standard deviations of the target
 LOW_LOG_VARIANCE = 2.0 * math.log(1e-3)
@@ -125,8 +125,8 @@ class Output(nn.Module):
                 return which
         if not self.coverages:
             raise ConfigError("a point output has no intervals; train with model.output kind 'quantiles' or 'normal'")
-        listed = ", ".join(figure(own_coverage) for own_coverage in self.coverages)
-        raise ConfigError(f"there is no interval of coverage {figure(coverage)}; this network has {listed}")
+        listed = ", ".join(typed(own_coverage) for own_coverage in self.coverages)
+        raise ConfigError(f"there is no interval of coverage {typed(coverage)}; this network has {listed}")
 
     def calibrate(self, answer: Prediction, target: Tensor) -> None:
         """Stretch each interval so that it holds its share of these targets (split conformal, multiplicative).

@@ -17,7 +17,7 @@ from edp.errors import ConfigError, DataError
 from edp.networks.input_range import HOLD_TICKS, input_limits
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import State
-from edp.wording import figure
+from edp.wording import typed
 
 Rows = NDArray[np.float32]
 Inputs = Sequence[float] | NDArray[np.floating] | Tensor
@@ -69,8 +69,8 @@ class StreamTick:
         for row, own_coverage in enumerate(self.coverages):
             if math.isclose(own_coverage, coverage, abs_tol=1e-6):
                 return self.lower[row], self.upper[row]
-        known_text = ", ".join(figure(own_coverage) for own_coverage in self.coverages) or "none: its output is a point"
-        raise ConfigError(f"no interval of coverage {figure(coverage)}; this network has {known_text}")
+        known_text = ", ".join(typed(own_coverage) for own_coverage in self.coverages) or "none: its output is a point"
+        raise ConfigError(f"no interval of coverage {typed(coverage)}; this network has {known_text}")
 
 
 class Stream:

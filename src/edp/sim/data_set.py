@@ -32,7 +32,7 @@ from edp.storage import (
     write_json,
 )
 from edp.storage.paths import is_entry_at, is_there
-from edp.wording import figure
+from edp.wording import typed
 
 MANIFEST = "data_set.json"
 LIMIT = "limit.json"
@@ -325,7 +325,7 @@ def check_room(folder: Path, plan: Sequence[Scenario], suffix: str) -> None:
     if needed > free:
         minutes = sum(s.duration_s for s in plan) / 60.0
         raise StorageError(
-            f"minutes: {figure(minutes)} min as {suffix} need about {needed / 1e9:,.1f} GB, but the disk of "
+            f"minutes: {typed(minutes)} min as {suffix} need about {needed / 1e9:,.1f} GB, but the disk of "
             f"'{folder}' has "
             f"{free / 1e9:,.1f} GB free; simulate at most {minutes * free / needed:,.0f} min, or choose another folder"
         )

@@ -97,7 +97,8 @@ def _keep_if_possible(fast: Any) -> None:
     save = cache.save_overload
 
     def save_if_possible(signature: Any, data: Any) -> None:
-        with contextlib.suppress(OSError):
+        # RuntimeError: Numba has no machine code yet to store, where another thread compiles the same function.
+        with contextlib.suppress(OSError, RuntimeError):
             save(signature, data)
 
     cache.save_overload = save_if_possible

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from edp.errors import ConfigError, DataError
-from edp.wording import figure
+from edp.wording import typed
 
 SHARE = 0.8
 """Of the memory that is free now, what a log may take."""
@@ -132,7 +132,7 @@ def check_memory(path: Path, needed: int, what: str, advice: str) -> None:
 
 def gigabytes(count: float) -> str:
     """A number of bytes for messages."""
-    return f"{figure(count / 1e9, 3)} GB"
+    return f"{typed(count / 1e9, 3)} GB"
 
 
 def check_setting(needed: float, what: str, advice: str) -> None:
@@ -154,4 +154,4 @@ def check_setting(needed: float, what: str, advice: str) -> None:
 def readable(count: float) -> str:
     """A number of bytes in MB, GB or TB."""
     unit, size = ("TB", 1e12) if count >= 1e12 else ("GB", 1e9) if count >= 1e9 else ("MB", 1e6)
-    return f"{figure(count / size, 3)} {unit}" if count < 1e15 else f"{count / size:,.0f} {unit}"
+    return f"{typed(count / size, 3)} {unit}" if count < 1e15 else f"{count / size:,.0f} {unit}"

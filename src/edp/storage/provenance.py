@@ -58,7 +58,7 @@ def read_provenance(folder: str | Path) -> dict[str, Any]:
     """
     file = Path(folder) / PROVENANCE
     if not is_file_at(file):
-        raise StorageError(missing_text(folder, "network", "a run with a provenance"))
+        raise StorageError(missing_text(folder, "network", "a run folder", PROVENANCE))
     provenance = read_object(file, ("data", "seconds"))
     data = object_with(provenance["data"], ("source", "reader", "digest"), f"'{file}', data,")
     reader = object_with(data["reader"], ("path",), f"'{file}', data.reader,")

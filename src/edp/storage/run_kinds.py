@@ -43,6 +43,7 @@ RUN_KINDS: Mapping[str, RunKind] = {
         RunKind("compression", "edp compress", "compression.json"),
         RunKind("monitor run", "edp monitor run", "alarms.jsonl"),
         RunKind("monitor", "edp monitor fit", "monitor.json", "monitor.json"),
+        RunKind("identification", "edp identify", "identification.json"),
         RunKind("fleet", "edp finetune --fleet", "fleet.json"),
         RunKind("network", "edp train", BUNDLE, BUNDLE),
     )

@@ -20,7 +20,7 @@ from edp.storage.reading import parse_json, read_text, read_toml
 from edp.storage.run_kinds import BUNDLE, CONTROLLER, RUN_KINDS, TWIN, RunKind
 from edp.storage.runs import ENDED, FINISHED, IDENTITY, STATUS
 from edp.storage.seals import unsealed
-from edp.wording import figure
+from edp.wording import typed
 
 MOST_FOLDERS = 20_000
 """Folders that are looked into: more is a whole disk."""
@@ -213,4 +213,4 @@ def _score(scores: Mapping[str, Any]) -> str:
     unit = str(targets[0]["unit"])
     of_unit = "" if unit == "1" else f" {unit}"
     more = "" if shared else f" ({name}; {len(targets)} outputs)"
-    return f"{figure(error)}{of_unit} at k = {horizon}{more}"
+    return f"{typed(error)}{of_unit} at k = {horizon}{more}"

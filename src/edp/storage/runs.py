@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from edp import __version__
-from edp.errors import BusyError, StorageError
+from edp.errors import BusyError, EdpError, StorageError
 from edp.storage.folders import check_kind
 from edp.storage.locks import check_held, held_by, hold
 from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
@@ -74,6 +74,8 @@ class Run:
 
         The state is ``running`` inside the block and ``finished`` after it. A block that raises leaves ``running``,
         which readers show as stopped as soon as no process holds the folder; `write_status` in the block replaces it.
+        A new run that is refused (`EdpError`) before it has written anything leaves the folder as it was, so that the
+        corrected command can have it.
         The state of a run that ended before does not become ``running``.
 
         Args:
@@ -88,12 +90,17 @@ class Run:
             StorageError: the folder holds another run, or something else.
         """
         with nullcontext(path) if isinstance(path, Run) else cls(path, kind) as run:
-            run.claim(key, settings)
+            is_new = not run.claim(key, settings)
             status = run.status().get("status")
             run.is_finished = status == FINISHED
             if status not in ENDED:
                 run.write_status("running")
-            yield run
+            try:
+                yield run
+            except EdpError:
+                if is_new:
+                    run.release()
+                raise
             if run is not path:
                 run.finish()
 
@@ -132,6 +139,14 @@ class Run:
         created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
         write_json(identity, {"schema": 1, "key": key, "kind": self.kind, "created": created})
         return False
+
+    def release(self) -> None:
+        """Free the folder of a run that has written nothing but its identity, settings and state."""
+        own = {*LEFT, IDENTITY, STATUS}
+        if {entry.name for entry in entries_of(self.path)} <= own:
+            # The identity last: a kill in between leaves the folder of a run, not of something else.
+            for name in (STATUS, "config.toml", IDENTITY):
+                self.file(name).unlink(missing_ok=True)
 
     def write_settings(self, settings: str) -> None:
         """Write the settings of the run, TOML."""
@@ -195,19 +210,20 @@ def unfinished_text(folder: str | Path) -> str:
     return f"'{path}' holds a run that is not finished ({state}); {todo}"
 
 
-def missing_text(folder: str | Path, kind: str, what: str = "") -> str:
+def missing_text(folder: str | Path, kind: str, what: str = "", file: str = "") -> str:
     """Return the message about a folder without the result of a kind of run: unfinished, of another kind, or no run.
 
     Args:
         folder: that a command was given.
         kind: name of the kind of run that the command reads, see `edp.storage.run_kinds`.
         what: noun phrase for what is read; by default the run of its command.
+        file: that is missing; by default the result of the kind.
 
     Raises:
         StorageError: the folder cannot be looked into, or its identity or status is damaged.
     """
     asked, present = RUN_KINDS[kind], run_kind(folder)
-    reason = f"it has no {Path(asked.result).name}"
+    reason = f"it has no {file or Path(asked.result).name}"
     if present is not None and present != asked:
         reason += f" and holds a run of {present.command}"
     what = what or f"a run of {asked.command}"

@@ -35,7 +35,7 @@ from edp.storage.headers import ARRAYS_BYTES, read_header
 from edp.storage.paths import entries_of, is_entry_at
 from edp.storage.runs import missing_text
 from edp.storage.seals import HASH, content_digest, digest_of_bytes
-from edp.wording import figure
+from edp.wording import typed
 
 SCHEMA = 8
 INTEGER_SCHEMA = 9
@@ -310,7 +310,7 @@ def _check_channels(header: Mapping[str, Any], task: Task, inputs: Sequence[Chan
         if entry["unit"] != channel.unit:
             raise ValueError(f"input '{channel.name}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
     if not (math.isfinite(task.rate_hz) and 0.0 < task.rate_hz <= MOST_RATE_HZ):
-        raise ValueError(f"its rate_hz is {task.rate_hz}; above 0 and at most {figure(MOST_RATE_HZ)} must hold")
+        raise ValueError(f"its rate_hz is {task.rate_hz}; above 0 and at most {typed(MOST_RATE_HZ)} must hold")
 
 
 def _text(value: Any) -> str:

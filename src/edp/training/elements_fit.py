@@ -14,7 +14,7 @@ from edp.data.series import Series
 from edp.errors import DataError
 from edp.networks.twin.elements import PRIOR, ElementsTwin
 from edp.training.free_run import FreeRunProgress, FreeRunValidation
-from edp.wording import figure
+from edp.wording import typed
 
 Doubles = NDArray[np.float64]
 NOISE = 0.02
@@ -66,9 +66,9 @@ class _Problem:
         ]
         if not cuts or ticks < 2:
             raise DataError(
-                f"elements: no training stretch has a free run of {figure(ticks / twin.channels.rate_hz)} s, the "
+                f"elements: no training stretch has a free run of {typed(ticks / twin.channels.rate_hz)} s, the "
                 "longest has "
-                f"{figure(longest / twin.channels.rate_hz)} s; shorten twin.length_s, to no less than two ticks"
+                f"{typed(longest / twin.channels.rate_hz)} s; shorten twin.length_s, to no less than two ticks"
             )
         lanes = len(twin.table) + self.hidden
         affordable = max(1, MOST_VALUES // (lanes * ticks * len(twin.channels.answers)))

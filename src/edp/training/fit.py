@@ -37,7 +37,7 @@ from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, by_gradient, check_training, thread_count
 from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, StreamStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
-from edp.wording import figure
+from edp.wording import typed
 
 
 def fit(
@@ -193,7 +193,7 @@ class Loop:
         if self.refitted is not None:
             saved = "this was the refit; the weights of the first training are kept"
         elif best_rows:
-            error = f"validation MAE {figure(best_rows[0]['validation_mae'])}"
+            error = f"validation MAE {typed(best_rows[0]['validation_mae'])}"
             saved = f"the weights of epoch {progress.best_epoch} ({error}) are kept"
         elif math.isfinite(progress.best_score):
             saved = "the weights of the start are kept"

@@ -42,7 +42,7 @@ from edp.storage.runs import KeyedRun
 from edp.training.blas import one_blas_thread
 from edp.training.checkpoint import FILE, TrainingPosition, Weights, damaged, load_checkpoint, save_checkpoint
 from edp.training.optimizers import OptimizerSpec, Soap
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 Array = NDArray[np.float32]
 MOST_LENGTH_S = 600.0
@@ -175,7 +175,7 @@ class FreeRunSampler:
         if not usable:
             rate = twin.channels.rate_hz
             raise DataError(
-                f"no stretch is longer than prefix and free run, {figure((twin.prefix_ticks + longest) / rate)} s; "
+                f"no stretch is longer than prefix and free run, {typed((twin.prefix_ticks + longest) / rate)} s; "
                 "give "
                 "longer recordings, or shorter free runs (training.lengths_s)"
             )
@@ -251,7 +251,7 @@ def _fitted(
     lengths = [max(1, round(length * rate)) for length in spec.lengths_s]
     if max(lengths) + twin.prefix_ticks > MOST_TICKS:
         raise ConfigError(
-            f"free runs: {figure(max(spec.lengths_s))} s at {figure(rate)} Hz are more than {MOST_TICKS:,} ticks"
+            f"free runs: {typed(max(spec.lengths_s))} s at {typed(rate)} Hz are more than {MOST_TICKS:,} ticks"
         )
     ticks = np.repeat(lengths, spec.updates)
     sampler = FreeRunSampler(twin, train, max(lengths))

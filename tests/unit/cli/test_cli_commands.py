@@ -229,9 +229,9 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     shown = edp(*command, *asked).out
     assert "10 (100 ms)" in shown
     assert "commands known" in shown
-    assert "write it without quotes" in edp(*command, "--set", "limit.horizons=[1,x]").err
-    assert "must be even" in edp(*command, "--set", "limit.branches=5").err
-    assert "unknown key 'limit.branch'" in edp(*command, "--set", "limit.branch=5").err
+    assert "write it without quotes" in edp(*command, "--limit", "--set", "limit.horizons=[1,x]").err
+    assert "must be even" in edp(*command, "--limit", "--set", "limit.branches=5").err
+    assert "unknown key 'limit.branch'" in edp(*command, "--limit", "--set", "limit.branch=5").err
 
 
 def test_faults_of_the_command_line_take_the_place_of_those_of_the_file(edp, tmp_path):

@@ -69,7 +69,7 @@ def test_a_controller_that_was_run_is_exported(edp, tmp_path, twin_run):
     for words, text in (
         ((run, "--w8a16", run), "only twins are brought into W8A16"),
         ((run, "--set", "tangent=true"), "no such option"),
-        ((twin_run,), "run edp control again"),
+        ((twin_run,), "give a folder that edp control wrote"),
     ):
         refused = edp("export", *words, "--to", "controller", "--out", tmp_path / "e")
         assert refused.code

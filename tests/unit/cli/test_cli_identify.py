@@ -1,6 +1,7 @@
 """``edp identify``: from logs to a machine file that ``edp simulate`` takes, and what it refuses."""
 
 import re
+import shutil
 import sys
 from importlib import resources
 
@@ -15,6 +16,7 @@ from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import read_json
+from edp.storage.run_listing import list_runs
 from edp.workflows.twin import train_twin
 
 SMALL = (
@@ -171,3 +173,35 @@ def test_a_twin_with_a_linkage_is_another_one_once_its_machine_file_changes(edp,
     ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", run)
     assert ended.code in (0, 6), ended.err  # the guess is the machine of these logs, and may be nearer
     assert load_machine(str(tmp_path / "mine.toml")).bodies != load_machine("M22").bodies
+
+
+def test_a_stopped_identification_continues_with_the_stages_that_it_has(logs, tmp_path, monkeypatch):
+    module, fits = sys.modules["edp.workflows.identify.identify"], []
+    fit, scores = module.fit_grey_box, module._scores
+
+    def counted(*arguments):
+        fits.append(arguments)
+        return fit(*arguments)
+
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    def identified(folder):
+        settings = load_twin_experiment(None, ["twin.kind=greybox", *SMALL])
+        return module.identify(DataSource.of(logs), tmp_path / folder / "mine.toml", experiment=settings)
+
+    monkeypatch.setattr(module, "fit_grey_box", counted)
+    monkeypatch.setattr(module, "_scores", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        identified("first")
+    assert not (tmp_path / "first" / "mine.toml").exists()
+    (row,) = list_runs(tmp_path)[0]
+    assert (row.kind, row.state) == ("identification", "stopped")
+    shutil.copytree(tmp_path / "first", tmp_path / "second")
+    monkeypatch.setattr(module, "_scores", scores)
+    first, second = identified("first"), identified("second")
+    # The grey box and the machine were fitted once each, before the stop.
+    assert len(fits) == 2
+    assert (first.rows, first.scores, first.notes) == (second.rows, second.scores, second.notes)
+    assert (tmp_path / "first" / "mine.toml").read_text() == (tmp_path / "second" / "mine.toml").read_text()
+    assert {run.state for run in list_runs(tmp_path)[0]} == {"finished"}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from edp.workflows.proposal import propose, write_proposal
-from edp.workflows.proposal_files import DATA
+from edp.workflows.proposal.files import DATA
 
 
 def save(path: Path, times: np.ndarray, seed: int = 0) -> Path:

@@ -123,9 +123,9 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     first = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", *QUICK, *trials)
     assert first.code == 0, first.err
     lines = [line for line in first.err.splitlines() if line.startswith("trials: ")]
-    assert lines[0] == "trials: proposed, training 1 of 5, 0 %"
+    assert lines[0] == "trials: proposed, training 1 of 5, 0.0 %"
     assert any(line.startswith("trials: random 1, training 5 of 5, epoch 1/1, 100 %") for line in lines)
-    assert not [line for line in lines if line.endswith(" 0 %, 0 s left")]
+    assert not [line for line in lines if line.endswith(" 0.0 %, 0 s left")]
     assert "MAE 10 ahead, mm/s" in first.out
     table = [
         line.split()[0] for line in first.out.splitlines() if line.startswith(("proposed ", "mine ", "persistence "))
@@ -182,7 +182,7 @@ def test_time_left_is_told_once_there_is_something_to_judge_it_by(monkeypatch):
     tell(0, "proposed", 1, TrainingProgress(1, 2, 5, 10, 0.0, 0.0, refit=True))
     tell(60, "random 1", 2)
     assert said.lines == [
-        "trials: kept, training 1 of 4, 0 %",
+        "trials: kept, training 1 of 4, 0.0 %",
         "trials: proposed, training 2 of 4, 25 %",
         "trials: proposed, training 2 of 4, epoch 1/2, 25 %",
         "trials: proposed, training 2 of 4, epoch 1/2, 38 %, 5 min 00 s left",

@@ -62,3 +62,36 @@ def test_seeds_of_the_judgement_never_reach_those_of_the_tuning(tmp_path):
     experiment = ControlExperiment(seed=TUNING_SEED)
     with pytest.raises(ConfigError, match="references from 1000000 on are for tuning"):
         tune_gains(experiment, tmp_path / "run", ControlSources(), ControlSources(), TuningSpec(trials=1, loops=1))
+
+
+def test_a_stopped_tuning_continues_after_its_last_trial_and_a_finished_one_is_read(tmp_path, monkeypatch):
+    made = []
+
+    def cost(bench, spec):
+        if len(made) == stop_at:
+            raise KeyboardInterrupt
+        made.append(spec)
+        return abs(spec.proportional - 3.0)
+
+    monkeypatch.setattr(ControlBench, "check", lambda bench: None)
+    monkeypatch.setattr(ControlBench, "cost", cost)
+    monkeypatch.setattr(ControlBench, "costs", lambda bench, spec: {"a": 1.0, "b": 2.0})
+    experiment = ControlExperiment(task=TASKS["grade"](), controller=CONTROLLERS["pi"](), loops=2)
+
+    def tune(folder):
+        spec = TuningSpec(trials=5, loops=1, sampler="random")
+        return tune_gains(experiment, tmp_path / folder, ControlSources(), ControlSources(), spec)
+
+    stop_at = -1
+    whole, trials = tune("whole"), list(made)
+    for stop_at in range(1, 5):
+        made.clear()
+        with pytest.raises(KeyboardInterrupt):
+            tune(f"stopped_{stop_at}")
+        folder, stop_at = f"stopped_{stop_at}", -1
+        assert tune(folder).content == whole.content
+        assert made == trials
+    made.clear()
+    assert tune("whole").content == whole.content
+    assert tune("whole").best == whole.best
+    assert made == []

@@ -66,7 +66,7 @@ def test_text_of_a_file_is_never_a_format():
     ("size", "unit", "text"),
     [
         (9.8, "bar", "9.8 bar"),
-        (1250.0, "kg", "1250 kg"),
+        (1250.0, "kg", "1,250 kg"),
         (0.31, "L/min", "0.31 L/min"),
         (1.5, "x", "1.5x"),
         (0.0, "%", "0 %"),

@@ -26,7 +26,7 @@ from edp.logs.proposal.names import unit_by_ending
 from edp.logs.source import DataSource, load_signal_map
 from edp.workflows.auto import load_auto
 from edp.workflows.proposal import LogsProposal, propose, write_proposal
-from edp.workflows.proposal_files import DATA, MAP, SETTINGS, horizons_for
+from edp.workflows.proposal.files import DATA, MAP, SETTINGS, horizons_for
 
 Rows = dict[str, np.ndarray]
 

@@ -9,7 +9,7 @@ import pytest
 
 from edp.logs.proposal.kinds import BOUND
 from edp.workflows.proposal import propose
-from edp.workflows.proposal_files import MAP, SETTINGS
+from edp.workflows.proposal.files import MAP, SETTINGS
 
 ROOT = Path(os.environ.get("EDP_SHARED_DATA") or Path(__file__).parents[3].parent / "shared" / "data")
 pytestmark = pytest.mark.shared_data

@@ -14,7 +14,7 @@ from edp.logs.read import read_recording
 from edp.logs.source import DataSource, load_signal_map
 from edp.signals import SignalMap
 from edp.workflows.proposal import LogsProposal, propose, write_proposal
-from edp.workflows.proposal_files import DATA, MAP
+from edp.workflows.proposal.files import DATA, MAP
 
 HEADER = "Time,lever_cmd,place_ms\n"
 

@@ -9,12 +9,11 @@ from safetensors.numpy import load_file, save_file
 
 from edp.errors import DataError
 from edp.report.common.interactive import plots
-from edp.report.run.charts import run_charts
+from edp.report.run.charts import run_charts, signal_chart
 from edp.report.run.facts import read_facts
 from edp.report.run.figures import prediction_lines, residual_histograms
 from edp.report.run.page import render
 from edp.report.run.residuals import correlations, correlogram, fit_table
-from edp.report.run.signals import signal_chart
 from edp.storage import write_json
 
 

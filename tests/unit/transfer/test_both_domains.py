@@ -12,7 +12,7 @@ from edp.networks.predictor import build_model
 from edp.networks.running import stream_predictions
 from edp.training.fit import fit
 from edp.training.transfer.both_domains import BothDomains, BothSpec, Classifier, ramp, reverse
-from edp.workflows.transfer.methods.rehearsal import share
+from edp.workflows.transfer.methods import share
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,9 @@ from edp.networks.predictor import build_model
 from edp.networks.running import stream_intervals, stream_predictions
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler
+from edp.training.transfer import centring
 from edp.training.transfer.centring import DEAREST, centre
-from edp.workflows.transfer import FinetuneRequest, centring, finetune
+from edp.workflows.transfer import FinetuneRequest, finetune
 from edp.workflows.transfer.source import read_source
 
 

@@ -13,7 +13,7 @@ from edp.errors import ConfigError, ExportError
 from edp.logs.source import DataSource
 from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
-from edp.report.twin.ground import ground_line
+from edp.report.twin.facts import ground_line
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import write_json
 from edp.testing.control import sample_excavator_twin, sample_grey_box

@@ -8,7 +8,8 @@ import pytest
 from edp.errors import StorageError
 from edp.evaluation.step_response import POINTS, step_responses
 from edp.networks.twin import TWINS
-from edp.report.twin.steps import FILE, read_steps, steps_chart
+from edp.report.twin.charts import steps_chart
+from edp.report.twin.facts import STEPS_FILE, read_steps
 from edp.storage import write_json
 from edp.testing.twins import sample_actuators, sample_twin
 
@@ -55,12 +56,12 @@ def test_a_command_that_never_moves_has_no_response(content):
 def test_what_is_on_disk_is_drawn_a_choice_for_each_command(content, tmp_path):
     _, _, found = content
     assert read_steps(tmp_path) == {}
-    write_json(tmp_path / FILE, found)
+    write_json(tmp_path / STEPS_FILE, found)
     chart = steps_chart(read_steps(tmp_path))
     assert [value for value, _ in chart.choices[0].options] == [step["command"] for step in found["steps"]]
     assert len(chart.panels) == min(6, len(found["steps"][0]["answers"]))
     damaged = json.loads(json.dumps(found))
     damaged["steps"][0]["answers"][0]["median"].pop()
-    write_json(tmp_path / FILE, damaged)
+    write_json(tmp_path / STEPS_FILE, damaged)
     with pytest.raises(StorageError, match="other lengths"):
         read_steps(tmp_path)

@@ -31,7 +31,7 @@ from edp.control.reference import TipReference
 from edp.errors import ConfigError
 from edp.networks.twin import Twin
 from edp.settings.bounds import above, check_bounds, check_count, integer, span
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 MOST_BLOCKS, MOST_BLOCK_TICKS = 30, 1_000
@@ -184,9 +184,9 @@ class NmpcController(Controller):
         tick_ms, first = 1e3 / self.model.plant.rate_hz, PredictiveControl.blocks
         longer = [*first[:-1], max(first[-1], enough - sum(first[:-1]))]
         raise ConfigError(
-            f"controller.blocks = {list(self.spec.blocks)} plans {figure(ticks * tick_ms)} ms ahead, but by its twin "
+            f"controller.blocks = {list(self.spec.blocks)} plans {typed(ticks * tick_ms)} ms ahead, but by its twin "
             "the "
-            f"machine takes {figure(enough * tick_ms)} ms from rest to half the speed that a lever asks for; plan "
+            f"machine takes {typed(enough * tick_ms)} ms from rest to half the speed that a lever asks for; plan "
             f"{enough} "
             f"ticks or more, such as {longer}"
         )

@@ -19,7 +19,7 @@ from edp.control.twin_environment import MIDDLE, OPTIONS, TIP, check_air
 from edp.errors import ConfigError, closest
 from edp.sim.environment.library import gymnasium
 from edp.sim.scenario import SimulationError
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 Array = NDArray[np.float64]
 REST_S = 2.0
@@ -187,6 +187,6 @@ def _check_step(description: FmuDescription, rate_hz: float, where: str) -> None
     whole = max(1, round(ratio)) if description.version == 3 else 1
     if abs(ratio - whole) > STEP_SLACK * whole:
         raise ConfigError(
-            f"{where} takes steps of {figure(own)} s ({figure(1.0 / own)} Hz), the loops have {figure(rate_hz)} Hz; "
+            f"{where} takes steps of {typed(own)} s ({typed(1.0 / own)} Hz), the loops have {typed(rate_hz)} Hz; "
             f"set rate_hz = {setting_text(1.0 / own)}"
         )

@@ -16,7 +16,7 @@ from edp.control.limits import LoopLimits
 from edp.control.models import ControlModels
 from edp.control.reference import TipReference
 from edp.errors import ConfigError
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 Policy = Callable[[NDArray[np.float32]], Any]
@@ -116,7 +116,7 @@ def check_rate(spec: LearningSpec, plant: PlantInterface) -> None:
     """
     if spec.rate_hz != plant.rate_hz:
         raise ConfigError(
-            f"the policy was learned at {figure(spec.rate_hz)} Hz, {plant.source} has {figure(plant.rate_hz)} Hz; "
+            f"the policy was learned at {typed(spec.rate_hz)} Hz, {plant.source} has {typed(plant.rate_hz)} Hz; "
             "learn one at its "
             "rate"
         )

@@ -16,7 +16,7 @@ from edp.networks.twin import Twin
 from edp.settings.bounds import MOST_SEED, above, check_bounds, integer, span
 from edp.signals import TABLE_A1, Kind
 from edp.sim.environment import EnvironmentSpec
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 PRESSURES = tuple(name for name, channel in TABLE_A1.items() if channel.kind is Kind.PRESSURE)
 OBSERVED = (*VELOCITIES, *STROKES, *PRESSURES)
@@ -94,7 +94,7 @@ class LearningSpec:
             raise ConfigError(f"task environment: seeds = {list(self.seeds)}; the lowest and the highest must hold")
         if not self.ticks > self.hold or self.ticks > MOST_TICKS:
             raise ConfigError(
-                f"task environment: duration_s = {setting_text(self.duration_s)} at {figure(self.rate_hz)} Hz is "
+                f"task environment: duration_s = {setting_text(self.duration_s)} at {typed(self.rate_hz)} Hz is "
                 f"{self.ticks} ticks; "
                 f"more than one action ({self.hold} ticks) and at most {MOST_TICKS} must hold"
             )

@@ -13,7 +13,7 @@ from edp.errors import ConfigError, closest
 from edp.networks.twin import Twin
 from edp.networks.twin.base import TwinState
 from edp.networks.twin.load import LoadEstimate
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ def _check(twin: Twin, plant: PlantInterface, answers: list[str], commands: list
     """Refuse a twin that is not one of this plant."""
     if twin.channels.rate_hz != plant.rate_hz:
         raise ConfigError(
-            f"the twin has {figure(twin.channels.rate_hz)} Hz, {plant.source} {figure(plant.rate_hz)} Hz; train one "
+            f"the twin has {typed(twin.channels.rate_hz)} Hz, {plant.source} {typed(plant.rate_hz)} Hz; train one "
             "at the rate of "
             "the loop"
         )

@@ -16,7 +16,7 @@ from edp.errors import ConfigError
 from edp.registry import Registry
 from edp.settings.bounds import SEED, above, below, check_bounds, integer, span
 from edp.sim.excitation.levers import speed_table
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 Array = NDArray[np.float64]
 TRIES = 200
@@ -84,7 +84,7 @@ class TaskSpec(ABC):
         if self.margin < self.limits.stroke_margin:
             raise ConfigError(
                 f"task: margin = {setting_text(self.margin)} lets references go where limits.stroke_margin = "
-                f"{figure(self.limits.stroke_margin)} does not; margin >= stroke_margin must hold"
+                f"{typed(self.limits.stroke_margin)} does not; margin >= stroke_margin must hold"
             )
 
     @abstractmethod
@@ -145,7 +145,7 @@ def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) 
     if not SEED.holds(seed):
         raise ConfigError(f"task: seed = {seed}; {SEED.rule('seed')} must hold")
     if not integer(1, 100_000).holds(round(rate_hz)):
-        raise ConfigError(f"task: {figure(rate_hz)} Hz; 1 to 100,000 Hz must hold")
+        raise ConfigError(f"task: {typed(rate_hz)} Hz; 1 to 100,000 Hz must hold")
     name = TASKS.name_of(spec)
     fastest = SPEED_RESERVE * speed_table(geometry.machine)[1][:, :, -1].T
     rng = np.random.default_rng(seed)

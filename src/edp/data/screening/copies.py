@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from edp.data.screening.compiled import spread
 from edp.data.screening.linear import Tap, gram, peaks, unexplained
 from edp.data.screening.result import Array, Flag, FlagKind
-from edp.wording import figure, number
+from edp.wording import number, typed
 
 LEAKING, DETERMINED = 0.25, 0.5
 """Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak; the
@@ -133,7 +133,7 @@ def _leak(
         names[source],
         -ahead,
         share,
-        f"the pasts of the other channels leave {figure(left[0], 3)} of its variance; {names[source]} up to {ahead} "
+        f"the pasts of the other channels leave {typed(left[0], 3)} of its variance; {names[source]} up to {ahead} "
         "samples "
         f"later takes away {100 * share:.0f} % of that: it knows what has not happened yet"
         + (f" (or it causes {names[source]}: then name it as trusted)" if differences else ""),
@@ -257,7 +257,7 @@ def explained_flags(
         taps = [(k, a) for k in others for a in (_LONG_PAST if k in near else _SPARSE_PAST) if a <= reach]
         if not taps or (left := unexplained(correlations, channel, taps)[1]) > EXPLAINED:
             continue
-        text = f"the presents and pasts of {names[near[0]]} and others make up all but {figure(100 * left, 2)} % of it"
+        text = f"the presents and pasts of {names[near[0]]} and others make up all but {typed(100 * left, 2)} % of it"
         value = 1.0 - left
         flags.append(Flag(names[channel], FlagKind.REDUNDANT, names[near[0]], value=value, evidence=text))
         # From now on it explains no other channel, so that something remains of each set.

@@ -15,7 +15,7 @@ from edp.data.screening.spec import ScreeningSpec
 from edp.errors import DataError, closest
 from edp.recording import MOST_ROWS, FloatArray, Recording, spread_stretches
 from edp.signals import TABLE_A1, Kind
-from edp.wording import figure
+from edp.wording import typed
 
 LEAST_LAGS, LAGS_A_STRETCH = 5, 40
 """Largest lags that a recording is long at least, and that a stretch of a large data set is."""
@@ -145,7 +145,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
     for other in recordings[1:]:
         if abs(other.rate_hz - first.rate_hz) > 1e-3 * first.rate_hz:
             raise DataError(
-                f"recording '{other.name}' has {figure(other.rate_hz)} Hz, '{first.name}' {figure(first.rate_hz)} Hz; "
+                f"recording '{other.name}' has {typed(other.rate_hz)} Hz, '{first.name}' {typed(first.rate_hz)} Hz; "
                 "screening "
                 "needs one rate: set rate_hz in the signal map"
             )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ExportError
-from edp.wording import figure
+from edp.wording import typed
 
 Fixed = NDArray[np.int64]
 """Integers of any width; NumPy computes with 64 bits, and `saturated` keeps them in theirs."""
@@ -79,7 +79,7 @@ def factor(real: Any) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     shift = 31 - exponent
     if (shift < 1).any():
         raise ExportError(
-            f"a factor of {figure(values.max(), 3)} between two formats is beyond 2^30: their ranges differ too much"
+            f"a factor of {typed(values.max(), 3)} between two formats is beyond 2^30: their ranges differ too much"
         )
     small = shift > 62  # A factor this small is no more than zero after rounding.
     return np.where(small, 0, multiplier).astype(np.int32), np.where(small, 62, shift).astype(np.uint8)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from edp.errors import ExportError
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16.rounding import WeightRounding, nearest
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.floating]
 COARSER = 1.02
@@ -79,8 +79,8 @@ def _check(name: str, weight: NDArray[np.int8], bias: Array) -> None:
     if worst > fixed.ACCUMULATOR:
         count = int(np.prod([weight.shape[axis] for axis in terms]))
         raise ExportError(
-            f"layer '{name}': a sum of {count} products may reach {figure(worst, 3)}, and 32 bits end at "
-            f"{figure(fixed.ACCUMULATOR, 3)}; {int(count * fixed.ACCUMULATOR / worst)} inputs of this size would fit: "
+            f"layer '{name}': a sum of {count} products may reach {typed(worst, 3)}, and 32 bits end at "
+            f"{typed(fixed.ACCUMULATOR, 3)}; {int(count * fixed.ACCUMULATOR / worst)} inputs of this size would fit: "
             "make "
             "the layer before it narrower (edp.workflows.compression.prune, student), or export in float32"
         )

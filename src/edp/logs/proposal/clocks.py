@@ -13,7 +13,7 @@ from edp.logs.proposal.columns import LogColumn, LogLook
 from edp.logs.proposal.names import is_counter_name, is_sample_time_name, is_time_name
 from edp.logs.timebase import judge
 from edp.signals import TIME_UNITS, SignalMap
-from edp.wording import figure
+from edp.wording import typed
 
 _SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 5e8}
 """Least value of a stamp that counts from 1970 in a unit: 2,000 or so."""
@@ -158,7 +158,7 @@ def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> Clock
         behaviour = behaviours[column.name]
         if behaviour.constant and behaviour.high > 0 and is_sample_time_name(column.name):
             step = behaviour.high
-            return ClockGuess(None, "s", step, 1.0 / step, None, (column.name,), 0.8, f"a row each {figure(step)} s?")
+            return ClockGuess(None, "s", step, 1.0 / step, None, (column.name,), 0.8, f"a row each {typed(step)} s?")
     for column in look.columns:
         behaviour = behaviours[column.name]
         if behaviour.restarts and behaviour.even and is_time_name(column.name):
@@ -178,7 +178,7 @@ def _brought_down(clock: ClockGuess, rows: int) -> ClockGuess:
     wanted_hz = next(plain, None)
     if wanted_hz is None:
         return clock
-    check = f"{figure(clock.rate_hz)} Hz are brought to {figure(wanted_hz)} Hz: set rate_hz"
+    check = f"{typed(clock.rate_hz)} Hz are brought to {typed(wanted_hz)} Hz: set rate_hz"
     return ClockGuess(
         clock.column, clock.unit, None, clock.rate_hz, wanted_hz, clock.beside, clock.confidence, clock.check or check
     )

@@ -25,7 +25,7 @@ from edp.logs.proposal.names import (
     words_of,
 )
 from edp.signals import TABLE_A1, VOCABULARY, ChannelMap, Kind, SignalMap
-from edp.wording import figure
+from edp.wording import typed
 
 SURE = 0.85
 """Confidence from which nothing needs to be checked."""
@@ -232,7 +232,7 @@ def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | No
             name, "", "remark", _NO_KIND, 0.85, f"filled in {behaviour.filled:.1%} of the rows", "not taken"
         )
     if behaviour.constant:
-        value = _EMPTY if not behaviour.filled else f"always {figure(behaviour.high)}"
+        value = _EMPTY if not behaviour.filled else f"always {typed(behaviour.high)}"
         return ColumnGuess(name, "", "constant", _NO_KIND, 0.95, value, "" if is_known(name) else "not taken")
     # A logger that was restarted has stamps that fall now and then.
     rising = behaviour.rises or behaviour.falls <= _MOST_FALLS

@@ -13,7 +13,7 @@ from edp.logs.formats.base import Column
 from edp.logs.proposal.clocks import ClockGuess
 from edp.logs.proposal.columns import LogLook, names_in_log
 from edp.storage.paths import files_below, is_file_at, is_folder_at
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 _LEAST_COLUMNS = 20
 """Columns without names from which a row may hold samples of one signal."""
@@ -74,8 +74,8 @@ def pace_notes(look: LogLook, clock: ClockGuess, targets: Collection[str]) -> li
     name = max(lost, key=lambda one: lost[one])
     better = next((hz for hz in _RATES_HZ if hz < rate and _faster(pieces[name], rate, hz / _SLOWER) < _FEW), rate)
     return [
-        f"{lost[name]:.0%} of the motion of {name[:40]} is faster than {figure(wanted_hz / _SLOWER)} Hz, which "
-        f"{figure(wanted_hz)} Hz show badly: set rate_hz = {setting_text(better)} in the map if it matters"
+        f"{lost[name]:.0%} of the motion of {name[:40]} is faster than {typed(wanted_hz / _SLOWER)} Hz, which "
+        f"{typed(wanted_hz)} Hz show badly: set rate_hz = {setting_text(better)} in the map if it matters"
     ]
 
 

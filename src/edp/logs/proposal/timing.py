@@ -13,7 +13,7 @@ from edp.logs.proposal.clocks import ClockGuess
 from edp.logs.proposal.columns import LogLook
 from edp.logs.timebase import Clock, judge
 from edp.signals import TIME_UNITS
-from edp.wording import figure
+from edp.wording import typed
 
 _ONE_RATE = 1.0005
 """Ratio of rates up to which logs count as one; reading allows a thousandth."""
@@ -54,7 +54,7 @@ class Timing:
         rate = (
             ()
             if self.rate_hz is None
-            else (f"the logs differ in rate: all are brought to {figure(self.rate_hz)} Hz (rate_hz)",)
+            else (f"the logs differ in rate: all are brought to {typed(self.rate_hz)} Hz (rate_hz)",)
         )
         cut = (
             f"{path.name[:40]}: a long break in time; its longest stretch is used ({', '.join(repairs)})"

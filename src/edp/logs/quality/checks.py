@@ -15,7 +15,7 @@ from edp.logs.quality.measures import Measures, Values, measure
 from edp.logs.repair import runs
 from edp.recording import Recording
 from edp.signals import KINDS, UNITS, Channel, Kind
-from edp.wording import figure
+from edp.wording import typed
 
 SEVERITIES = ("error", "warning", "note")
 """Worst first."""
@@ -122,13 +122,13 @@ def look_at(channel: Channel, values: Values, rate_hz: float, in_gaps: int = 0) 
 
 def place_of(row: int, rate_hz: float) -> str:
     """Row and time for messages."""
-    return f"row {row} (t = {figure(row / rate_hz)} s)"
+    return f"row {row} (t = {typed(row / rate_hz)} s)"
 
 
 def shown(value: float, channel: Channel) -> str:
     """A value in the report unit with that unit; a pure number stands alone."""
     unit = KINDS[channel.kind].report_unit
-    return figure(value) + ("" if unit == "1" else f" {unit}")
+    return typed(value) + ("" if unit == "1" else f" {unit}")
 
 
 def copies(recording: Recording) -> list[Finding]:
@@ -174,14 +174,14 @@ def _check_range(at: Looked) -> list[Finding]:
     with np.errstate(invalid="ignore"):
         outside = np.flatnonzero((values < low) | (values > high))
     if len(outside):
-        what = f"outside the plausible range {figure(low)} to {figure(high)} {facts.si_unit}"
+        what = f"outside the plausible range {typed(low)} to {typed(high)} {facts.si_unit}"
         return [_unit_finding(channel, what, largest, len(outside), place_of(int(outside[0]), at.rate_hz))]
     if 0 < largest < _TOO_SMALL.get(channel.kind, 0.0) * facts.nominal and largest > 1.0:
-        return [_unit_finding(channel, f"never above {figure(largest)} {facts.si_unit}", largest, len(at.good), "")]
+        return [_unit_finding(channel, f"never above {typed(largest)} {facts.si_unit}", largest, len(at.good), "")]
     if largest > _TOO_LARGE.get(channel.kind, math.inf):
         row = int(np.nanargmax(np.abs(values)))
         return [
-            _unit_finding(channel, f"reaches {figure(largest)} {facts.si_unit}", largest, 1, place_of(row, at.rate_hz))
+            _unit_finding(channel, f"reaches {typed(largest)} {facts.si_unit}", largest, 1, place_of(row, at.rate_hz))
         ]
     return []
 
@@ -227,7 +227,7 @@ def _check_stuck(at: Looked) -> list[Finding]:
         return []
     longest = long[np.argmax(at.stuck_lengths[long])]
     where = place_of(int(at.stuck[longest]), at.rate_hz)
-    duration_text = f"longest {figure(at.stuck_lengths[longest] / at.rate_hz)} s"
+    duration_text = f"longest {typed(at.stuck_lengths[longest] / at.rate_hz)} s"
     if busy:
         what, advice = (
             f"frozen: elsewhere each sample is new, {duration_text}",
@@ -252,7 +252,7 @@ def _check_clipped(at: Looked) -> list[Finding]:
         if share < _CLIPPED_SHARE or value == 0:
             continue
         limit = shown(KINDS[at.channel.kind].to_report(float(value)), at.channel)
-        what = f"clipped at its {end} end, {limit}, for {figure(100 * share, 2)} % of the time"
+        what = f"clipped at its {end} end, {limit}, for {typed(100 * share, 2)} % of the time"
         advice = "the range of the sensor or the data type ends here: what lies beyond was not recorded"
         row = int(np.flatnonzero(at.values == value)[0])
         count = round(share * len(at.good))
@@ -287,7 +287,7 @@ def _check_noise(at: Looked) -> list[Finding]:
     ratio = float(at.good.astype(np.float64).std()) / noise
     if ratio >= _NOISY_RATIO:
         return []
-    what = f"mostly noise: its deviation is {figure(ratio, 2)} times its noise floor"
+    what = f"mostly noise: its deviation is {typed(ratio, 2)} times its noise floor"
     return [Finding("note", at.channel.name, what, len(at.good), "", "it says little by the sample: check the sensor")]
 
 
@@ -295,7 +295,7 @@ def _check_rate(at: Looked) -> list[Finding]:
     every = at.measures.every
     if every < 1.5:
         return []
-    what = f"a new value only every {figure(every, 3)} samples ({figure(at.rate_hz / every, 3)} Hz)"
+    what = f"a new value only every {typed(every, 3)} samples ({typed(at.rate_hz / every, 3)} Hz)"
     advice = "sent more slowly than logged: its age adds to the lag, and its differences are spikes"
     return [Finding("note", at.channel.name, what, len(at.good), "", advice)]
 

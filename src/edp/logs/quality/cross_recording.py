@@ -15,7 +15,7 @@ from edp.logs.quality.quality import QualityReport, plain, verdict_of
 from edp.logs.quality.repeats import Repeat, find_repeats
 from edp.logs.quality.sketches import Sketches
 from edp.signals import UNITS, Kind
-from edp.wording import figure
+from edp.wording import typed
 
 _LEAST_RATIO = 9.0
 """Units nearer than this cannot be told from a recording that is merely livelier."""
@@ -110,7 +110,7 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
             unit = _unit_ratio(Kind(kind), ratios)
             if unit:
                 what = (
-                    f"in '{recording}' {figure(ratios[0], 2)} times its usual size, its noise {figure(ratios[1], 2)} "
+                    f"in '{recording}' {typed(ratios[0], 2)} times its usual size, its noise {typed(ratios[1], 2)} "
                     f"times: {unit}"
                 )
                 advice = "give that log a map of its own with the right unit"

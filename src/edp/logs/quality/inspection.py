@@ -24,7 +24,7 @@ from edp.logs.resolve import ChannelSource, resolve
 from edp.logs.timebase import Clock, judge
 from edp.recording import Recording
 from edp.signals import VOCABULARY, Kind, SignalMap
-from edp.wording import figure
+from edp.wording import typed
 
 # Everything is read, so that every defect can be found and counted.
 _LEFT_OUT = {
@@ -220,14 +220,14 @@ def _time_findings(name: str, clock: Clock, repair: Repair) -> list[Finding]:
         (
             "gaps",
             clock.gaps,
-            f"gaps in time ('{name}'), longest {figure(longest)} s",
+            f"gaps in time ('{name}'), longest {typed(longest)} s",
             '"hold" or "cut" (--repair gaps=hold)',
         ),
     )
     for defect, rows, what, how in defects:
         if not len(rows):
             continue
-        where = f"{'after ' if defect == 'gaps' else ''}row {int(rows[0])} (t = {figure(at[rows[0]])} s)"
+        where = f"{'after ' if defect == 'gaps' else ''}row {int(rows[0])} (t = {typed(at[rows[0]])} s)"
         allowed = getattr(repair, defect)
         severity, advice = "error", f"repair {defect} = {how}"
         if allowed != "refuse":
@@ -235,9 +235,9 @@ def _time_findings(name: str, clock: Clock, repair: Repair) -> list[Finding]:
         findings.append(Finding(severity, None, what, len(rows), where, advice))
     if not clock.uniform:
         what = (
-            f"time steps are not uniform ('{name}'): rms {figure(clock.jitter, 3)} of a step, median "
-            f"{figure(clock.step_s)} s"
+            f"time steps are not uniform ('{name}'): rms {typed(clock.jitter, 3)} of a step, median "
+            f"{typed(clock.step_s)} s"
         )
-        advice = f"rows are resampled causally to {figure(clock.rate_hz)} Hz; set rate_hz for another rate"
+        advice = f"rows are resampled causally to {typed(clock.rate_hz)} Hz; set rate_hz for another rate"
         findings.append(Finding("note", None, what, len(at), "", advice))
     return findings

@@ -17,7 +17,7 @@ from edp.networks.twin.lowering import bounded_layers, plant_graph
 from edp.networks.twin.scales import Array, TwinScales
 from edp.registry import Registry
 from edp.settings.bounds import MOST_TICKS, integer
-from edp.wording import figure
+from edp.wording import typed
 
 TwinState = dict[str, Array]
 """All that a twin remembers, by name; the first dimension is the batch. ``answer`` is what its free ports read next."""
@@ -105,7 +105,7 @@ class Twin(ABC):
         if ticks < self.prefix_ticks:
             raise DataError(
                 f"a prefix of {ticks} ticks came; the twin needs {self.prefix_ticks} measured ticks "
-                f"({figure(self.prefix_ticks / self.channels.rate_hz)} s) before it runs free: give a longer one"
+                f"({typed(self.prefix_ticks / self.channels.rate_hz)} s) before it runs free: give a longer one"
             )
         self._check("measured", measured, (*commands.shape[:2], len(self.channels.answers)))
         self._check_start(measured[:, 0])
@@ -233,9 +233,9 @@ class Twin(ABC):
             stroke = self.channels.strokes[which]
             low, high = (ends[len(self.channels.velocities) + which] for ends in (self.scales.low, self.scales.high))
             raise DataError(
-                f"'{stroke.name}' starts {figure(beyond[which] * (high - low))} {stroke.unit} beyond an end stop of "
+                f"'{stroke.name}' starts {typed(beyond[which] * (high - low))} {stroke.unit} beyond an end stop of "
                 "the "
-                f"twin ({figure(low)} to {figure(high)} {stroke.unit}); check its unit and zero, or train on "
+                f"twin ({typed(low)} to {typed(high)} {stroke.unit}); check its unit and zero, or train on "
                 "recordings that "
                 "go there"
             )

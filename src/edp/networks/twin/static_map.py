@@ -17,7 +17,7 @@ from edp.ir.memory import Convolution
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, integer
-from edp.wording import figure
+from edp.wording import typed
 
 PENALTY = 1e-6
 """Of the regression, per row on standardised features: knots that no command passed stay flat."""
@@ -86,7 +86,7 @@ class StaticTwin(Twin):
         super().__init__(channels, scales, prefix_ticks)
         self.numbers, delay = dict(numbers), float(numbers["delay"][0])
         if not (0 <= delay <= MOST_TICKS and delay == int(delay)):
-            raise ValueError(f"its delay is {figure(delay)} ticks; an integer from 0 to {MOST_TICKS:,} must hold")
+            raise ValueError(f"its delay is {typed(delay)} ticks; an integer from 0 to {MOST_TICKS:,} must hold")
         self.delay = int(delay)
         lengths = np.diff(numbers["corners"].astype(np.float64), axis=0)
         # Evenly spaced up to the rounding of single precision; a length of zero would divide by it.

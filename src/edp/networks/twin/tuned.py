@@ -28,7 +28,7 @@ from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.load import LoadEstimate
 from edp.registry import Registry
 from edp.settings.bounds import above, check_bounds, integer, span
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -106,7 +106,7 @@ class TunedSpec:
                      load_share=span(0.0, 1.0))  # fmt: skip
         if not (math.isnan(self.oil_c) or abs(self.oil_c) <= HOTTEST_C):
             raise ConfigError(
-                f"tuning: oil_c = {self.oil_c}; degrees Celsius within {figure(HOTTEST_C)}, or NaN, must hold"
+                f"tuning: oil_c = {self.oil_c}; degrees Celsius within {typed(HOTTEST_C)}, or NaN, must hold"
             )
         for name in self.groups:
             NUMBER_GROUPS[name]

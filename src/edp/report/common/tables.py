@@ -8,8 +8,7 @@ from typing import Any
 
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME
-from edp.report.run.budget import budget_rows
-from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
+from edp.report.run.facts import NETWORK, Facts, budget_rows, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
 from edp.wording import MISSING, count_text, decimals_for, duration, number, percent, unit_text
 

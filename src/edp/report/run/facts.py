@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 from edp.errors import DataError, StorageError, count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import read_scores
-from edp.report.run.budget import budget_name, budget_rows
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
-from edp.report.run.predictability import limit_line, read_limit
 from edp.signals import display_offset
-from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_object, read_text
+from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_json, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
 from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
-from edp.wording import decimals_for, figure, listed, number, percent, unit_text
+from edp.wording import decimals_for, figure, interval, interval_decimals, listed, number, percent, unit_text
 
 NETWORK = "network"
 TRUTH = "truth"
@@ -41,6 +39,8 @@ MAKERS = {
     "predictions.safetensors": "edp evaluate",
     "footprint.json": "edp evaluate",
 }
+LIMIT_FILE = "limit.json"
+LIMIT_KINDS = ("commands_unknown", "commands_known", "persistence")
 METRICS = ("rmse", "mae", "p95", "p99", "r2", "bias", "composite")
 
 
@@ -67,9 +67,9 @@ class Facts:
     """What a run folder holds; a part that is missing is None or empty, and `absent` names its file.
 
     Attributes:
-        limit: the limit of predictability of the run's data, see `edp.report.run.predictability`.
+        limit: the limit of predictability of the run's data, see `read_limit`.
         foundation: errors on machines that were never seen, of a run over many machines, see
-            `edp.report.run.foundation`.
+            `edp.report.run.sheets`.
         predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI;
             so are both ends of the network's interval, where it has one.
     """
@@ -217,6 +217,27 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     return tuple(epochs)
 
 
+def read_limit(path: Path | None, provenance: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The limit in a file, or in the folder that the run's data came from; None where there is none.
+
+    Raises:
+        StorageError: the file that was named is missing, or a limit is damaged.
+    """
+    if path is None:
+        data = (provenance or {}).get("data", {})
+        source = Path(str((data.get("reader") or {}).get("path") or data.get("source") or ""))
+        path = source / LIMIT_FILE
+        if not is_folder_at(source) or not is_file_at(path):
+            return None
+    elif is_folder_at(path):
+        path = path / LIMIT_FILE
+    limit = read_json(path)
+    complete = isinstance(limit, dict) and {"unit", "rate_hz", "horizons", "targets", *LIMIT_KINDS} <= limit.keys()
+    if not complete:
+        raise StorageError(f"'{path}' holds no limit of predictability; `edp simulate FOLDER --limit` writes one")
+    return dict(limit)
+
+
 def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
     """What `edp pretrain` found; None where the run is another."""
     path = folder / "foundation.json"
@@ -343,6 +364,26 @@ def _figures(facts: Facts, rows: Sequence[Mapping[str, Any]], samples: int) -> s
     return f"{'; '.join([f'{start} ({MEASURE_NAME})', *shown])}."
 
 
+def limit_line(facts: Facts, samples: int | None) -> str:
+    """The limit at `samples` ahead in a sentence; empty where it is of other signals, or not known there."""
+    limit = facts.limit
+    if limit is None or samples is None or facts.rate_hz != limit["rate_hz"] or samples not in limit["horizons"]:
+        return ""
+    if [target.name for target in facts.targets] != list(limit["targets"]) or facts.unit != limit["unit"]:
+        return ""
+    row = list(limit["horizons"]).index(samples)
+    unknown = limit["commands_unknown"]
+    least, low, high = (unknown[key][row][-1] for key in ("mae", "low", "high"))
+    least_error = number(least, interval_decimals(low, high))
+    error_with_commands = number(limit["commands_known"]["mae"][row][-1], 2)
+    return (
+        f"The limit of predictability here is {least_error} {facts.unit} (95 %: {interval(low, high)}): even a "
+        "predictor that "
+        f"knows the true state has that mean absolute error, for it knows neither the operator's next choices nor the "
+        f"noise to come; with the commands known, its error would be {error_with_commands}."
+    )
+
+
 def verdict_lines(facts: Facts) -> list[str]:
     """What the headline means: against the best baseline, over the recordings, against the hardware budget."""
     lines = []
@@ -370,6 +411,21 @@ def verdict_lines(facts: Facts) -> list[str]:
         verdict = f"exceeded in {listed(over)}" if over else "met on every count"
         lines.append(f"Budget ({name}): {verdict}.")
     return lines
+
+
+def budget_name(footprint: Mapping[str, Any] | None) -> str:
+    """Return the name of the stated controller in a run's ``footprint.json``; empty without one."""
+    # Here, since pages are also written where torch cannot be imported, which this module needs.
+    from edp.evaluation.controller import Budget
+
+    budget = (footprint or {}).get("budget")
+    # Earlier versions held every run against the thesis's controller.
+    return str(budget.get("name") or "") if isinstance(budget, Mapping) and budget != asdict(Budget()) else ""
+
+
+def budget_rows(footprint: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
+    """Return the verdict by resource against the stated controller; empty without one."""
+    return list((footprint or {}).get("verdict", ())) if budget_name(footprint) else []
 
 
 def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:

@@ -14,13 +14,10 @@ from edp.report.common.chart import Chart
 from edp.report.common.provenance import provenance_rows
 from edp.report.common.templates import asset, stylesheet, template
 from edp.report.run import facts as run
-from edp.report.run.budget import budget_name
-from edp.report.run.charts import DOTS_AT_MOST, run_charts
+from edp.report.run.charts import DOTS_AT_MOST, run_charts, signal_chart, signals_of
 from edp.report.run.choice import candidates_table, model_tables, promise_line, promise_table, read_choice
-from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.report.run.residuals import correlogram, fit_table
-from edp.report.run.signals import signal_chart, signals_of
-from edp.report.run.situations import situation_sheet
+from edp.report.run.sheets import contexts_sheet, machines_sheet, parts_sheet, situation_sheet
 from edp.storage import write_bytes
 from edp.storage.paths import full_path
 from edp.wording import moment, unbroken
@@ -86,7 +83,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "signals": signals_of(facts),
         **shown(chart for chart in (signal_chart(facts), *run_charts(facts), correlogram(facts)) if chart is not None),
         "checks": tables.budget_checks(facts),
-        "budget": budget_name(facts.footprint),
+        "budget": run.budget_name(facts.footprint),
         "parts": tables.parts_table(facts),
         "footprint": tables.footprint_rows(facts),
         "provenance": provenance_rows(facts.provenance),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +28,12 @@ from edp.report.common.chart import (
 )  # fmt: skip
 from edp.report.common.picture import write_pictures
 from edp.report.twin.facts import PARTS, TWIN, FreeRunFacts
-from edp.report.twin.steps import steps_chart
 from edp.signals import KINDS, Kind, display_offset
-from edp.wording import label_by_name
+from edp.wording import figure, label_by_name
 
-RECORDING, MODEL = "recording", "model"
+RECORDING, MODEL, COMMAND = "recording", "model", "command"
+MOST_PANELS = 6
+"""Panels of step responses."""
 DIGITS = 4
 """Significant digits of drawn values: more than a picture shows, a third of the bytes."""
 MOST_DRAWN = 4_000
@@ -112,6 +115,31 @@ def horizon_chart(facts: FreeRunFacts) -> Chart:
     options = tuple((model, "The twin" if model == TWIN else f"Floor: {model}") for model in facts.models)
     choice = Control(MODEL, "Model", options)
     return Chart("horizon", tuple(panels), columns=len(panels), choices=(choice,), height=460)
+
+
+def steps_chart(steps: Mapping[str, Any]) -> Chart | None:
+    """Response of each answer to a step of the command that is chosen; None where there is none."""
+    if not steps.get("steps"):
+        return None
+    seconds, panels = steps["seconds"], []
+    labels = label_by_name(answer["name"] for answer in steps["steps"][0]["answers"])
+    for row, first in enumerate(steps["steps"][0]["answers"][:MOST_PANELS]):
+        marks: list[Mark] = []
+        for step in steps["steps"]:
+            answer, when = step["answers"][row], {COMMAND: step["command"]}
+            low, high = (np.array(answer[end]) for end in ("low", "high"))
+            marks.append(Range(x=seconds, low=low, high=high, name="Middle 80 % of the moments", hover=None, when=when))
+            marks.append(DataSeries(x=seconds, y=answer["median"], name="Median", width=1.8, when=when))
+        title = with_unit(labels[first["name"]], first["unit"])
+        panels.append(Panel(tuple(marks), ChartAxis("Time since the step [s]"), title=title))
+    options = tuple(
+        (step["command"], f"{step['command']}, step of {figure(step['size'])} {step['unit']}")
+        for step in steps["steps"]
+    )
+    return Chart(
+        "steps", tuple(panels), columns=2, choices=(Control(COMMAND, "Command", options),),
+        height=80 + 210 * -(-len(panels) // 2),
+    )  # fmt: skip
 
 
 def _short(values: NDArray[np.floating]) -> list[float | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,16 +29,14 @@ from edp.evaluation.scores_file import (
     read_shaped,
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
-from edp.report.twin.ground import ground_line
-from edp.report.twin.steps import read_steps
 from edp.storage import read_object
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_file_at
 from edp.wording import figure, listed, number, percent, short_labels
 
 CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
+STEPS_FILE = "step_response.json"
 TWIN = "twin"
 PARTS = ("velocities", "strokes", "pressures")
 SITUATIONS = {"end_stops": "at an end stop", "rest": "at rest (idling)", "motion": "in motion"}
@@ -123,6 +122,17 @@ SHAPE = KeyedObject(
         "models": NamedValues(MODEL, (TWIN,)),
     },
     ("schema", "channels", "models"),
+)
+ANSWER = KeyedObject(
+    {"name": NAME, "unit": NAME, **dict.fromkeys(("median", "low", "high"), Listed(REAL))},
+    ("name", "unit", "median", "low", "high"),
+)
+STEP = KeyedObject(
+    {"command": NAME, "size": SIZE, "unit": NAME, "answers": Listed(ANSWER)}, ("command", "size", "unit", "answers")
+)
+STEPS_SHAPE = KeyedObject(
+    {"schema": COUNT, "seconds": Listed(SIZE), "moments": COUNT, "steps": Listed(STEP)},
+    ("schema", "seconds", "moments", "steps"),
 )
 
 
@@ -215,6 +225,25 @@ def _check_arrays(facts: FreeRunFacts, path: Path) -> None:
         raise StorageError(f"'{path}' does not fit its scores: '{wrong[0][:80]}'; run edp evaluate again")
 
 
+def read_steps(folder: Path) -> Mapping[str, Any]:
+    """What `edp twin` or `edp evaluate` wrote of step responses; empty where there is none, as of an older version.
+
+    Raises:
+        StorageError: damaged content.
+    """
+    path = folder / STEPS_FILE
+    if not is_file_at(path):
+        return {}
+    content: Mapping[str, Any] = read_shaped(path, STEPS_SHAPE)
+    count = len(content["seconds"])
+    lines = [
+        answer[key] for step in content["steps"] for answer in step["answers"] for key in ("median", "low", "high")
+    ]
+    if any(len(line) != count for line in lines):
+        raise StorageError(f"'{path}' has lines of other lengths than its times; run edp evaluate again")
+    return content
+
+
 def headline(facts: FreeRunFacts) -> str:
     """The error of the strokes at the end of the runs in one sentence; of the answers where they are plain numbers."""
     judged = twin_verdict(facts.models)
@@ -261,6 +290,23 @@ def verdict(facts: FreeRunFacts) -> list[str]:
             last = scores["stroke_error"][-1]
             lines.append(f"The floor {name} is off by {number(last['mean'])} {last['unit']} then.")
     return lines
+
+
+def ground_line(provenance: Mapping[str, Any]) -> str:
+    """The law of the ground and what it explains, in a sentence; empty where the twin knows free air alone.
+
+    Args:
+        provenance: of the run; what is not as `edp twin` wrote it is passed over.
+    """
+    facts = provenance.get("ground")
+    if not isinstance(facts, Mapping):
+        return ""
+    explained, kind = facts.get("explained"), facts.get("kind")
+    parts = explained.items() if isinstance(explained, Mapping) else ()
+    shares = [f"{percent(x)} ({part})" for part, x in parts if isinstance(x, float) and math.isfinite(x)]
+    name = f"ground '{kind}'" if isinstance(kind, str) else "ground"
+    what = listed(shares) or "nothing"
+    return f"{name}: explains {what} of the squares of the forces where the tip touches the ground"
 
 
 def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
@@ -398,3 +444,56 @@ def _beside_sheet(beside: Mapping[str, Any]) -> Sheet:
         f"Beside a look-ahead predictor, {figure(beside['seconds'])} s ahead at the same {beside['moments']:,} moments"
     )
     return Sheet("beside", caption, heads, tuple(rows))
+
+
+def mixed_units(scores: Mapping[str, Any]) -> bool:
+    """Whether velocities of a twin have more than one unit."""
+    return bool(scores["velocity_mae"].get("units"))
+
+
+def actuator_sheet(models: Mapping[str, Mapping[str, Any]]) -> Sheet:
+    """A row for each actuator and model: errors of its velocity, and of its stroke by time, with their units."""
+    columns = {
+        name: [("Velocity MAE", one["velocity_mae"])]
+        + [(f"Stroke after {figure(row['at_s'])} s", row) for row in one["stroke_error"]]
+        for name, one in models.items()
+    }
+    return _by_actuator("actuators", "The twin and its floors, each actuator in its units", columns)
+
+
+def ahead_by_actuator(models: Mapping[str, Mapping[str, Any]], caption: str) -> Sheet:
+    """The same a few ticks ahead of measured ports."""
+    columns = {
+        name: [("Velocity MAE", one["ahead"]["velocity_mae"]), ("Stroke error", one["ahead"]["stroke_error"])]
+        for name, one in models.items()
+        if "ahead" in one
+    }
+    return _by_actuator("ahead", caption, columns)
+
+
+def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]]) -> Sheet:
+    """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
+    first = next(iter(columns.values()))
+    rows: list[tuple[Value, ...]] = []
+    for which, velocity in enumerate(first[0][1]["by_channel"]):
+        for model, entries in columns.items():
+            cells = []
+            for _, row in entries:
+                if row["by_channel"]:
+                    channel, value = list(row["by_channel"].items())[which]
+                    cells.append(f"{number(value)} {_unit(row, channel)}".strip())
+            rows.append((velocity, model, *cells))
+    titles = [title for title, row in first if row["by_channel"]]
+    heads = tuple(Column(title) for title in ("Actuator", "Model", *titles))
+    return Sheet(name, caption, heads, tuple(rows), frozenset(range(0, len(rows), len(columns))))
+
+
+def actuator_tiles(twin: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Key figures of each actuator: value, unit, what it is."""
+    row = twin["stroke_error"][-1] if twin["stroke_error"] else twin["velocity_mae"]
+    what = f"error of {{}} after {figure(row['at_s'])} s" if "at_s" in row else "mean absolute error of {}"
+    return [(number(value), _unit(row, name), what.format(name)) for name, value in row["by_channel"].items()]
+
+
+def _unit(row: Mapping[str, Any], channel: str) -> str:
+    return str(row.get("units", {}).get(channel) or row["unit"] or "")

@@ -18,7 +18,7 @@ from edp.sim.machine.family import MASSES_T, WIDEST, member_mass
 from edp.sim.scenario import START_STROKES, Scenario
 from edp.sim.sensors import chain
 from edp.sim.sensors.sensors import shown_names, truth_columns
-from edp.wording import figure
+from edp.wording import typed
 
 OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
 """What is shown unless told otherwise: Table A.1, and the strokes, which have no model of a sensor."""
@@ -92,7 +92,7 @@ class EnvironmentSpec:
             member_mass(0, 0, *self.masses_t)
         if not 0.0 < self.spread <= WIDEST:
             raise ConfigError(
-                f"environment: randomise = {self.randomise}; a spread is above 0 and at most {figure(WIDEST)}"
+                f"environment: randomise = {self.randomise}; a spread is above 0 and at most {typed(WIDEST)}"
             )
 
     @property

@@ -15,7 +15,7 @@ from edp.errors import ConfigError, closest
 from edp.registry import Registry
 from edp.settings.bounds import Bound, shown, span
 from edp.sim.machine.machine import Machine
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 Array = NDArray[np.float64]
 Units = Mapping[str, float]
@@ -253,7 +253,7 @@ def _check_size(what: str, kind: FaultKind, size: float | None, unit: str) -> No
             raise ConfigError(f"{what}: size = {shown(size)} {shown(unit)} must be left out: this kind is there or not")
         return
     if size is None:
-        raise ConfigError(f"{what}: it needs a size, such as {figure(kind.ladder[0])}{kind.unit}")
+        raise ConfigError(f"{what}: it needs a size, such as {typed(kind.ladder[0])}{kind.unit}")
     if isinstance(size, bool) or not isinstance(size, int | float) or not math.isfinite(size):
         raise ConfigError(f"{what}: size = {shown(size)} must be a finite number")
     if not isinstance(unit, str) or unit not in kind.units:

@@ -38,7 +38,7 @@ from edp.sim.machine.machine import (
     Triple,
     Valves,
 )
-from edp.wording import figure
+from edp.wording import typed
 
 BASE_MASS_T = 21.7
 """Operating weight of M22, t."""
@@ -97,7 +97,7 @@ def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float
     if not LIGHTEST_T <= low_t <= high_t <= HEAVIEST_T:
         raise ConfigError(
             f"family of machines from {low_t} to {high_t} t; the lower must not exceed the upper, "
-            f"both within {figure(LIGHTEST_T)} to {figure(HEAVIEST_T)} t"
+            f"both within {typed(LIGHTEST_T)} to {typed(HEAVIEST_T)} t"
         )
     # Stream 0 is the masses'; machine i draws from stream 1 + i, so members do not depend on how many there are.
     first = np.random.default_rng([seed, 0]).random()
@@ -121,7 +121,7 @@ def scaled_machine(
         ConfigError: the mass is out of range.
     """
     if not LIGHTEST_T <= mass_t <= HEAVIEST_T:
-        raise ConfigError(f"machine of {mass_t} t; choose from {figure(LIGHTEST_T)} to {figure(HEAVIEST_T)} t")
+        raise ConfigError(f"machine of {mass_t} t; choose from {typed(LIGHTEST_T)} to {typed(HEAVIEST_T)} t")
     s = (mass_t / base_mass_t) ** (1.0 / 3.0)
     front = s * draws.uniform(0.94, 1.06, 3)  # boom, arm, bucket
     linkage = s * draws.uniform(0.95, 1.05, 3)  # pins and stroke of each cylinder

@@ -19,7 +19,7 @@ from edp.sim.machine.machine import Machine, Rating, Ratings, Triple
 from edp.sim.machine.option_checks import CYLINDERS as CYLINDERS
 from edp.sim.machine.parameters import FLOW_SHARING, pack
 from edp.sim.physics import linkage
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 MACHINE_FILE = SettingsTree(what="machine file", positions={Triple: CYLINDERS, Ratings: CYLINDERS})
 BEYOND_STOPS = math.radians(4.0)
@@ -51,9 +51,9 @@ class ParameterBound:
     def __str__(self) -> str:
         text = "an integer " if self.integer else ""
         if self.high == LARGEST:
-            return f"{text}{'above' if self.above else 'at least'} {figure(self.low)} and at most {figure(self.high)}"
-        low = f"above {figure(self.low)} and at most" if self.above else f"from {figure(self.low)} to"
-        return f"{text}{low} {figure(self.high)}"
+            return f"{text}{'above' if self.above else 'at least'} {typed(self.low)} and at most {typed(self.high)}"
+        low = f"above {typed(self.low)} and at most" if self.above else f"from {typed(self.low)} to"
+        return f"{text}{low} {typed(self.high)}"
 
 
 ANY = ParameterBound()
@@ -310,13 +310,13 @@ def _check_triangle(axis: int, axes: Any, plant: Any, where: str) -> None:
     if closed <= least:
         raise ConfigError(
             f"machine file {where} [{name}_cylinder]: closed_length = {setting_text(closed)} m must be above "
-            f"|base_radius - rod_radius| = {figure(least)} m, or the pins cannot come that close"
+            f"|base_radius - rod_radius| = {typed(least)} m, or the pins cannot come that close"
         )
     if closed + stroke >= most:
         raise ConfigError(
             f"machine file {where} [cylinders]: stroke[{name}] = {setting_text(stroke)} m with closed_length = "
             f"{setting_text(closed)} m needs "
-            f"pins {figure(closed + stroke)} m apart; must be below base_radius + rod_radius = {figure(most)} m"
+            f"pins {typed(closed + stroke)} m apart; must be below base_radius + rod_radius = {typed(most)} m"
         )
     ends = [linkage.angle_at_stroke(axis, s, axes, plant) for s in (0.0, stroke)]
     _check_levers(axis, min(ends), max(ends), axes, plant, where)
@@ -340,8 +340,8 @@ def _check_bucket(axes: Any, plant: Any, where: str) -> None:
         raise ConfigError(
             f"{where_table}: closed_length = {setting_text(closed)} m with stroke[bucket] = {setting_text(stroke)} m "
             "needs pins from "
-            f"{figure(closed)} to "
-            f"{figure(closed + stroke)} m apart; this linkage gives {figure(length[-1])} to {figure(length[0])} m "
+            f"{typed(closed)} to "
+            f"{typed(closed + stroke)} m apart; this linkage gives {typed(length[-1])} to {typed(length[0])} m "
             "(bucket angles "
             f"{low:.0f} to {high:.0f} deg) before it cannot close or turns over; change closed_length, stroke, rocker "
             "or link"
@@ -369,5 +369,5 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
             f"machine file {where} [{table}]: the lever arm of the {name} cylinder at joint angle "
             f"{math.degrees(psi[worst]):.0f} deg is {lever_text}; from 4 deg below to 4 deg above the working range "
             f"({math.degrees(low):.0f} to {math.degrees(high):.0f} deg) it must keep its sign and be at least "
-            f"{least:.3f} m/rad ({figure(LEAST_LEVER)} of the stroke); change the pins, closed_length or stroke"
+            f"{least:.3f} m/rad ({typed(LEAST_LEVER)} of the stroke); change the pins, closed_length or stroke"
         )

@@ -15,7 +15,7 @@ from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.storage import SETTINGS_BYTES, parse_toml, read_text
 from edp.storage.paths import full_path
-from edp.wording import figure
+from edp.wording import typed
 
 FAMILY = re.compile(
     r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?(?:-X(\d(?:P\d{1,3})?))?"
@@ -99,7 +99,7 @@ def family_member(
         ConfigError: the range of masses is empty or out of bounds, or the scatter is.
     """
     if not 0.0 < scatter <= WIDEST:
-        raise ConfigError(f"family with scatter = {scatter}; must be above 0 and at most {figure(WIDEST)}")
+        raise ConfigError(f"family with scatter = {scatter}; must be above 0 and at most {typed(WIDEST)}")
     draws = Draws(np.random.default_rng([seed, 1 + index]), scatter)
     mass = member_mass(seed, index, low_t, high_t)
     name = member_name(seed, index, (low_t, high_t), scatter)

@@ -8,7 +8,7 @@ from edp.errors import ConfigError
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import conductance
 from edp.sim.physics import lines
-from edp.wording import figure
+from edp.wording import typed
 
 CYLINDERS = ("boom", "arm", "bucket")
 MOST_BLED = 0.1
@@ -62,11 +62,11 @@ def check_load_sensing(machine: Machine, where: str) -> None:
     least, most = pumps.min_displacement * pumps.max_flow, MOST_BLED * pumps.max_flow
     if not least <= bled <= most:
         raise ConfigError(
-            f"machine file {where} [pumps]: bypass = {list(pumps.bypass)!r} bleeds {figure(bled * 6e4, 3)} L/min at "
+            f"machine file {where} [pumps]: bypass = {list(pumps.bypass)!r} bleeds {typed(bled * 6e4, 3)} L/min at "
             f"load_margin = {pumps.load_margin!r} Pa; with load sensing the centre is closed but for a bleed, from "
-            f"{figure(least * 6e4, 3)} L/min (min_displacement, which must go somewhere) to {figure(most * 6e4, 3)} "
+            f"{typed(least * 6e4, 3)} L/min (min_displacement, which must go somewhere) to {typed(most * 6e4, 3)} "
             "L/min "
-            f"({figure(MOST_BLED)} of max_flow); change bypass or min_displacement"
+            f"({typed(MOST_BLED)} of max_flow); change bypass or min_displacement"
         )
 
 
@@ -87,19 +87,19 @@ def check_lines(machine: Machine, where: str) -> None:
     if min(cylinders.line_bore) < LEAST_BORE:
         raise ConfigError(
             f"machine file {where} [cylinders]: line_bore = {list(cylinders.line_bore)!r} must be at least "
-            f"{figure(LEAST_BORE)} m for all cylinders, or 0 for all"
+            f"{typed(LEAST_BORE)} m for all cylinders, or 0 for all"
         )
     for name, modulus in zip(CYLINDERS, cylinders.line_modulus, strict=True):
         if 0.0 < modulus < SOFTEST:
             raise ConfigError(
                 f"machine file {where} [cylinders]: line_modulus[{name}] = {modulus!r} Pa must be at least "
-                f"{figure(SOFTEST)}, or 0 for a rigid line"
+                f"{typed(SOFTEST)}, or 0 for a rigid line"
             )
     for name, bore, length in zip(CYLINDERS, cylinders.line_bore, lines.lengths(cylinders), strict=True):
         if not LINE_LENGTHS[0] <= length <= LINE_LENGTHS[1]:
             raise ConfigError(
                 f"machine file {where} [cylinders]: line_bore[{name}] = {bore!r} m makes of hose_volume[{name}] a line "
-                f"of {figure(length, 3)} m; must be from {figure(LINE_LENGTHS[0])} to {figure(LINE_LENGTHS[1])} m"
+                f"of {typed(length, 3)} m; must be from {typed(LINE_LENGTHS[0])} to {typed(LINE_LENGTHS[1])} m"
             )
 
 
@@ -118,5 +118,5 @@ def check_motors(machine: Machine, where: str) -> None:
         if motor.coulomb >= most:
             raise ConfigError(
                 f"machine file {where} [{section}]: coulomb = {motor.coulomb!r} must be below what the motor gives at "
-                f"its relief, {figure(most)} (displacement times pressure), or it never moves"
+                f"its relief, {typed(most)} (displacement times pressure), or it never moves"
             )

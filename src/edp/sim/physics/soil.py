@@ -17,7 +17,7 @@ from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.physics import ground_profile, terramechanics
 from edp.storage import SETTINGS_BYTES, parse_toml, read_text
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 Array = NDArray[np.float64]
 SPACING_M = ground_profile.SPACING
@@ -105,7 +105,7 @@ class Material:
         if self.back_friction_deg > self.friction_deg:
             raise ConfigError(
                 f"material: back_friction_deg = {setting_text(self.back_friction_deg)} must be at most friction_deg = "
-                f"{figure(self.friction_deg)}; beyond it soil slides on soil"
+                f"{typed(self.friction_deg)}; beyond it soil slides on soil"
             )
         if self.cone_index[0] > self.cone_index[1]:
             raise ConfigError(f"material: cone_index = {list(self.cone_index)} Pa; the smaller one must come first")

@@ -24,7 +24,7 @@ from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Bodies, Machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import linkage
-from edp.wording import figure
+from edp.wording import typed
 
 Doubles = NDArray[np.float64]
 NAMES = ("X_1", "Y_1", "X_2", "Y_2", "X_3", "Y_3", "H_1", "H_2", "H_3")
@@ -184,7 +184,7 @@ def realised(base: Doubles, guess: Machine) -> Bodies:
         worst = int(np.argmin(inertia))
         raise ConfigError(
             f"no rigid bodies have the joint inertia and gravity torques of the logs (the inertia of body {worst + 1} "
-            f"about its centre would be {figure(inertia[worst])} kg m^2); check that pins, lengths and bores of "
+            f"about its centre would be {typed(inertia[worst])} kg m^2); check that pins, lengths and bores of "
             "--machine "
             "are those of the machine that was logged, and that the logs move every cylinder"
         )

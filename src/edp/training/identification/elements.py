@@ -17,7 +17,7 @@ from edp.signals import Channel, Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import CYLINDERS
 from edp.training.identification.mapping import GreyParts
-from edp.wording import figure
+from edp.wording import typed
 
 NO_MOTORS = (
     "the grey box has motors; a machine of the simulator has the cylinders of boom, arm and bucket alone: leave "
@@ -140,8 +140,8 @@ def parts_of(twin: GreyTwin, elements: Elements, machine: Machine, celsius: floa
     far = [j for j, share in enumerate(reach) if share > 1.0 + BEYOND]
     if far:
         raise ConfigError(
-            f"commands of valve '{elements.valves[far[0]].name}' reach {figure(reach[far[0]], 3)} of the full pilot of "
-            f"machine {machine.name} ({figure(full[far[0]])} in SI units); correct valves.pilot_pressure of --machine"
+            f"commands of valve '{elements.valves[far[0]].name}' reach {typed(reach[far[0]], 3)} of the full pilot of "
+            f"machine {machine.name} ({typed(full[far[0]])} in SI units); correct valves.pilot_pressure of --machine"
         )
     tick_s, steps = twin.time
     return GreyParts(twin.table, places[0], places[1], reach, celsius, tick_s / steps)
@@ -157,9 +157,9 @@ def check_strokes(channels: Sequence[Channel], low: np.ndarray, high: np.ndarray
         stroke = machine.cylinders.stroke[i]
         if low[i] < -BEYOND * stroke or high[i] > (1.0 + BEYOND) * stroke:
             raise ConfigError(
-                f"'{channel.name}' goes from {figure(low[i])} to {figure(high[i])} m in the logs, but the {name} "
+                f"'{channel.name}' goes from {typed(low[i])} to {typed(high[i])} m in the logs, but the {name} "
                 "cylinder of "
-                f"machine {machine.name} from 0 to {figure(stroke)} m; give the --machine that was logged, with "
+                f"machine {machine.name} from 0 to {typed(stroke)} m; give the --machine that was logged, with "
                 "strokes "
                 "measured from closed"
             )

@@ -15,7 +15,7 @@ from edp.sim.machine.machine_checks import CYLINDERS
 from edp.training.identification.bodies import NAMES, Poses, base_parameters, grey_load, linked_bodies, solved_base
 from edp.training.identification.machine_numbers import MACHINE_NUMBERS
 from edp.training.identification.tie import STEP, MachineTie
-from edp.wording import figure
+from edp.wording import typed
 
 Doubles = NDArray[np.float64]
 TOLD = 0.2
@@ -54,7 +54,7 @@ class IdentifiedNumber:
         """For readers: its ends, roughly or not, or `unknown`."""
         if not self.excited:
             return unknown
-        return f"{'' if self.is_told else 'roughly '}{figure(self.low, 3)} to {figure(self.high, 3)}"
+        return f"{'' if self.is_told else 'roughly '}{typed(self.low, 3)} to {typed(self.high, 3)}"
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""

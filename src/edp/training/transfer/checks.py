@@ -17,7 +17,7 @@ from edp.errors import DataError, closest
 from edp.networks.frontend import FrontEnd
 from edp.recording import Recording
 from edp.signals import KINDS, Kind
-from edp.wording import figure
+from edp.wording import typed
 
 SEARCHED_S = 0.5
 """Longest lag from a pilot pressure to the motion that it commands."""
@@ -65,13 +65,13 @@ def check_channels(recordings: Sequence[Recording], task: Task) -> None:
         )
     # A thousandth: rates from time stamps are never exact.
     other = [
-        f"'{r.name}' {figure(r.rate_hz)} Hz" for r in recordings if abs(r.rate_hz - task.rate_hz) > 1e-3 * task.rate_hz
+        f"'{r.name}' {typed(r.rate_hz)} Hz" for r in recordings if abs(r.rate_hz - task.rate_hz) > 1e-3 * task.rate_hz
     ]
     if other:
         raise DataError(
-            f"the network runs at {figure(task.rate_hz)} Hz, the logs have another rate: {', '.join(other)}; set "
+            f"the network runs at {typed(task.rate_hz)} Hz, the logs have another rate: {', '.join(other)}; set "
             "rate_hz = "
-            f"{figure(task.rate_hz)} in the signal map (--map) to resample them, or train the source at the rate of "
+            f"{typed(task.rate_hz)} in the signal map (--map) to resample them, or train the source at the rate of "
             "the logs"
         )
 
@@ -109,7 +109,7 @@ def check_moving(data: Prepared) -> None:
     for part in ("train", "test"):
         values = np.concatenate([series.targets for series in getattr(data, part)]).astype(np.float64)
         still = [
-            f"{name} is {figure(mean)} throughout"
+            f"{name} is {typed(mean)} throughout"
             for name, kind, mean, std, largest in zip(
                 data.task.targets,
                 data.target_kinds,
@@ -156,12 +156,12 @@ def check_units(data: Prepared, scaler: FrontEnd) -> None:
             wrong |= same
     if wrong.any():
         differences = "; ".join(
-            f"{names[i]} up to {figure(here[i], 3)}, in the source about {figure(there[i], 3)} "
+            f"{names[i]} up to {typed(here[i], 3)}, in the source about {typed(there[i], 3)} "
             f"{KINDS[data.inputs[i].kind].si_unit}"
             for i in np.flatnonzero(wrong)
         )
         raise DataError(
-            f"channels of the logs are more than {figure(FAR)} times as large or as small as those that the network "
+            f"channels of the logs are more than {typed(FAR)} times as large or as small as those that the network "
             "learned "
             f'from: {differences}. Say the unit of these columns in the signal map (--map), such as unit = "bar"'
         )
@@ -204,7 +204,7 @@ def check_signs(data: Prepared, source: Prepared | None) -> list[str]:
     if blind:
         return [
             f"The sign of {', '.join(blind)} was not checked: no pilot pressure moves with it clearly (correlation of "
-            f"{figure(TOGETHER)} or more within {figure(SEARCHED_S)} s) in both the source and the logs."
+            f"{typed(TOGETHER)} or more within {typed(SEARCHED_S)} s) in both the source and the logs."
         ]
     return []
 

@@ -18,7 +18,7 @@ from edp.networks.twin.tuned import HOTTEST_C, TunedSpec, TunedTwin
 from edp.networks.twin.tuned_correction import TunedCorrection
 from edp.recording import Recording
 from edp.training.twin_bundle import OIL_C, TwinBundle
-from edp.wording import figure
+from edp.wording import typed
 
 Rows = NDArray[np.float32]
 
@@ -51,7 +51,7 @@ def correction_of(twin: Twin, adaptation: Adaptation, task: Task, spec: TunedSpe
     """
     if twin.channels.rate_hz != task.rate_hz:
         raise ConfigError(
-            f"the twin has {figure(twin.channels.rate_hz)} Hz, the network {figure(task.rate_hz)} Hz; train a twin at "
+            f"the twin has {typed(twin.channels.rate_hz)} Hz, the network {typed(task.rate_hz)} Hz; train a twin at "
             "the "
             "network's rate"
         )

@@ -13,7 +13,7 @@ from edp.logs.read import RATE_TOLERANCE
 from edp.logs.units import check_unit
 from edp.recording import Recording
 from edp.signals import KINDS, Kind
-from edp.wording import figure
+from edp.wording import typed
 
 
 def check_together(recordings: Sequence[Recording]) -> None:
@@ -33,8 +33,8 @@ def check_together(recordings: Sequence[Recording]) -> None:
         # Rates from time stamps differ in their last digits; equal within the tolerance is equal.
         if abs(recording.rate_hz - first.rate_hz) > RATE_TOLERANCE * first.rate_hz:
             raise DataError(
-                f"mixed rates: '{first.name}' {figure(first.rate_hz)} Hz, '{recording.name}' "
-                f"{figure(recording.rate_hz)} Hz; bring "
+                f"mixed rates: '{first.name}' {typed(first.rate_hz)} Hz, '{recording.name}' "
+                f"{typed(recording.rate_hz)} Hz; bring "
                 "them to one rate"
             )
         ours, theirs = ([(c.name, c.unit) for c in entry.channels] for entry in (first, recording))

@@ -14,7 +14,7 @@ from edp.report.common.tables import TextTable
 from edp.report.notebook import BandLine, html_of, prediction_figure, text_of
 from edp.report.run.figures import aligned
 from edp.signals import KINDS, Channel, Kind
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.api.frames import OneFrame
 
 
@@ -70,7 +70,7 @@ class Predictions(OneFrame):
             raise ConfigError(f"horizon = {ahead}; this predictor has {', '.join(map(str, self.horizons))}")
         source = self.recordings[which]
         lines = [self._line(source, which, output, ahead) for output in range(len(self.targets))]
-        title = f"{source.name}, {figure(1000 * ahead / source.rate_hz)} ms ahead"
+        title = f"{source.name}, {typed(1000 * ahead / source.rate_hz)} ms ahead"
         return prediction_figure(lines, source.rate_hz, title)
 
     def _number(self, recording: int | str) -> int:
@@ -119,7 +119,7 @@ class Predictions(OneFrame):
         rows = tuple((entry.name, f"{entry.samples:,}", f"{entry.duration_s:,.1f}") for entry in self.recordings)
         targets = [f"{name} [{KINDS[kind].si_unit}]" for name, kind in zip(self.targets, self.kinds, strict=True)]
         ahead = f"{', '.join(map(str, self.horizons))} sample(s) ahead"
-        intervals = "".join(f", interval {figure(coverage)}" for coverage in self.coverages)
+        intervals = "".join(f", interval {typed(coverage)}" for coverage in self.coverages)
         caption = f"Predictions of {', '.join(targets)}, {ahead}{intervals}"
         return TextTable(caption, (("Recording", ""), ("Samples", ""), ("Duration", "s")), rows)
 

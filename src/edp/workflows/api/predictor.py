@@ -23,7 +23,7 @@ from edp.report.notebook import html_of, text_of
 from edp.signals import KINDS
 from edp.storage.paths import is_file_at
 from edp.training import load_bundle
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows import deployment, train_evaluate
 from edp.workflows.api.predictions import Predictions
 from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
@@ -207,11 +207,11 @@ class TrainedPredictor:
         return JudgedScores(Facts(folder=self.folder, scores=judged.scores))
 
     def _table(self) -> TextTable:
-        ahead = ", ".join(f"{k} ({figure(1000 * k / self.rate_hz)} ms)" for k in self.horizons)
+        ahead = ", ".join(f"{k} ({typed(1000 * k / self.rate_hz)} ms)" for k in self.horizons)
         parameters = sum(parameter.numel() for parameter in self._bundle.predictor.parameters())
         rows = (
             ("Predicts", ", ".join(f"{name} [{self.units[name]}]" for name in self.targets)),
-            ("Samples ahead", f"{ahead} at {figure(self.rate_hz)} Hz"),
+            ("Samples ahead", f"{ahead} at {typed(self.rate_hz)} Hz"),
             ("Reads", ", ".join(f"{name} [{self.units[name]}]" for name in self.inputs)),
             ("Parameters", f"{parameters:,}"),
             ("Folder", str(self.folder)),

@@ -22,7 +22,7 @@ from edp.report.notebook import html_of, recordings_figure, text_of
 from edp.settings.bounds import SEED, between, check_bounds
 from edp.settings.tree import build
 from edp.signals import SignalMap
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.api.arguments import check_together, check_width, matrix_of, names_of, units_of
 from edp.workflows.api.frames import columns_of, frame_of
 
@@ -259,7 +259,7 @@ class Recordings(Sequence[Recording]):
         columns = (("Recording", ""), ("Samples", ""), ("Duration", "s"))
         channels = tuple((c.name, str(c.kind), c.unit, c.description) for c in self._recordings[0].channels)
         return [
-            TextTable(f"Recordings at {figure(self.rate_hz)} Hz{more}", columns, rows),
+            TextTable(f"Recordings at {typed(self.rate_hz)} Hz{more}", columns, rows),
             TextTable("Channels", (("Channel", ""), ("Kind", ""), ("SI unit", ""), ("Description", "")), channels),
         ]
 

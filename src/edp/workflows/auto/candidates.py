@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 
+from edp.config.experiment import plain_tree
+from edp.data.prepared import Prepared
+from edp.errors import ConfigError
+from edp.networks.backbones import CommitteeSpec
+from edp.recording import Recording
 from edp.registry import Registry
 from edp.settings.tree import Table
 from edp.training.bagging.radial import JUDGED_ROWS, LENGTHS
 from edp.training.bagging.spec import BaggingSpec
-from edp.workflows.auto.foundation import Foundation
+from edp.training.bundle import weights_digest
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import TrainingStrategy
+from edp.training.transfer.centring import Centred
+from edp.training.transfer.checks import check_channels, check_lengths, check_signs, check_units
+from edp.training.transfer.spec import FinetuneSpec
+from edp.training.warm_start import WarmStart
+from edp.workflows.transfer.case import tuned
+from edp.workflows.transfer.source import SourceModel, read_source
 
 LEAST_SPAN = 32
 """Ticks that changes reach back at least, as far as the data allow: at 100 Hz a third of a second."""
@@ -91,6 +104,119 @@ RECURRENT_ROWS = 20_000
 RECURRENT_LANES, RECURRENT_CHUNK, RECURRENT_BURN_IN = 8, 128, 50
 RECURRENT_TICK = 70_000
 """Weights that a tick of the recurrent network passes through."""
+SETTING = "auto.foundation"
+LEAST_UPDATES = 120
+"""Of a fine-tuning, where ten passes over the recordings are fewer: those of the measured ones (docs/results.md)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Foundation:
+    """A network to begin with, as ``auto.foundation`` names it.
+
+    Attributes:
+        path: as the settings have it.
+        source: the network and the settings of its run.
+    """
+
+    path: str
+    source: SourceModel
+
+    @property
+    def window(self) -> int:
+        """W of the network, which every candidate then has: all are cut from the recordings in the same way."""
+        return self.source.predictor.spec.window
+
+    @property
+    def facts(self) -> Table:
+        """What identifies it."""
+        return {"weights": weights_digest(self.source.predictor)}
+
+    @property
+    def weights(self) -> int:
+        """Parameters, which a tick of training passes through."""
+        return sum(parameter.numel() for parameter in self.source.predictor.parameters())
+
+    @property
+    def ticks(self) -> int:
+        """Of an update, all lanes together."""
+        chunks = self._training(0, 1).chunks
+        return chunks.length * chunks.batch
+
+    def check_recordings(self, recordings: Sequence[Recording]) -> None:
+        """Refuse recordings without the channels, or of another rate, than the network's.
+
+        Raises:
+            DataError: which channels of which recordings, and what to do.
+        """
+        check_channels(recordings, self.source.bundle.task)
+
+    def check_task(self, data: Prepared) -> None:
+        """Refuse a task other than the network's, and recordings that it cannot be trained on with.
+
+        Raises:
+            ConfigError: every part of the task that differs.
+            DataError: recordings that are too short, in other units or of another sign convention.
+        """
+        own, asked = self.source.bundle.task, data.task
+        pairs = {
+            "targets": (own.targets, asked.targets),
+            "horizons": (own.horizons, asked.horizons),
+            "mode": (own.mode, asked.mode),
+            "features": (own.features.features, asked.features.features),
+        }
+        other = [f"{name} {its}, the settings {here}" for name, (its, here) in pairs.items() if its != here]
+        if not other and own != asked:
+            other = ["derived targets or hidden channels that the settings do not have"]
+        if other:
+            raise ConfigError(
+                f"{SETTING}: the network of '{self.path}' has {'; '.join(other)}; these must be equal: change [task], "
+                "pretrain with this task, or leave the setting out"
+            )
+        check_lengths(data, self._training(0, 1).chunks, self.window)
+        check_units(data, self.source.predictor.front)
+        check_signs(data, None)
+
+    def tables(self, rows: int, affordable: float, seed: int, threads: int) -> Table:
+        """The tables ``model`` and ``training`` of the candidate.
+
+        Args:
+            rows: ticks to train on.
+            affordable: updates that the budget allows.
+            seed: of all random choices.
+            threads: CPU threads.
+        """
+        rounds = FinetuneSpec().rounds
+        updates = int(min(affordable, max(LEAST_UPDATES, rounds * rows / self.ticks))) // rounds
+        training = replace(self._training(max(1, updates), threads), seed=seed)
+        experiment = replace(self.source.experiment, model=self.source.predictor.spec, training=training)
+        return {part: plain_tree(experiment)[part] for part in ("model", "training")}
+
+    def _training(self, updates: int, threads: int) -> TrainingSpec:
+        """As `edp finetune --method full` trains, so many updates an epoch."""
+        own = tuned(self.source.experiment.training, FinetuneSpec())
+        return replace(own, updates=updates, threads=threads, bagging=None)
+
+    def strategy(self) -> TrainingStrategy:
+        """Weights to begin with; the mean error over the training part is taken out at the end."""
+        return Centred(WarmStart(self.source.predictor))
+
+
+def read_foundation(path: str) -> Foundation | None:
+    """The network that the settings name; None where they name none.
+
+    Raises:
+        ConfigError: a committee, whose parts do not learn by gradient.
+        EdpError: no run or bundle in float32 is there.
+    """
+    if not path:
+        return None
+    foundation = Foundation(path, read_source(path, recordings=False))
+    if isinstance(foundation.source.predictor.spec.backbone, CommitteeSpec):
+        raise ConfigError(
+            f"{SETTING}: '{path}' is a committee, which the preset makes of the recordings itself; give a network that "
+            "was trained by gradient, such as a run of edp pretrain, or leave the setting out"
+        )
+    return foundation
 
 
 class RecurrentTrial(Enum):
@@ -151,19 +277,15 @@ class Amount:
         """Processor time for a kind of learner."""
         budget = 60 * self.minutes
         left = max(budget - _fixed_seconds(self), LEAST_SHARE * budget)
-        return left * self._shares()[kind]
-
-    def _shares(self) -> dict[str, float]:
-        """Of that time, by kind of learner."""
         shares = LONG_SHARE if self.rows > LONG_ROWS else SHARE
         match self.trial:
             case RecurrentTrial.RUNNING:
-                return dict.fromkeys(shares, 0.0) | {"recurrent": TRIAL}
+                shares = dict.fromkeys(shares, 0.0) | {"recurrent": TRIAL}
             case RecurrentTrial.PASSED:
-                return shares | {"recurrent": shares["recurrent"] - TRIAL}
+                shares = shares | {"recurrent": shares["recurrent"] - TRIAL}
             case RecurrentTrial.FAILED:
-                return ALONE
-        return shares
+                shares = ALONE
+        return left * shares[kind]
 
     @property
     def window(self) -> int:
@@ -261,12 +383,12 @@ class TreePlan:
 
     @property
     def trees(self) -> int:
-        """Of each output."""
+        """Trees of each output."""
         return self.rounds * self.models
 
     @property
     def rate(self) -> float:
-        """Of boosting."""
+        """Learning rate of boosting."""
         return min(MOST_TREE_RATE, max(0.1, TREE_RATE / max(1, self.rounds)))
 
 
@@ -294,10 +416,6 @@ def tree_plan(amount: Amount) -> TreePlan:
                 if rounds >= (ROUNDS if folds > parts[-1] else least):
                     return TreePlan(min(rounds, ROUNDS), models, rows, folds)
     return TreePlan(0, len(TREE_MODELS), TREE_ROWS[-1], fewest)
-
-
-def _linear(amount: Amount) -> Table:
-    return _tables(amount, {"activations": []}, {})
 
 
 def _committee(amount: Amount) -> Table:
@@ -335,7 +453,7 @@ def _tables(amount: Amount, parts: Table, bagging: Table) -> Table:
     }
 
 
-CANDIDATES.register("linear")(Candidate("the linear model", _linear))
+CANDIDATES.register("linear")(Candidate("the linear model", lambda amount: _tables(amount, {"activations": []}, {})))
 CANDIDATES.register("committee")(Candidate("the committee", _committee))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -212,8 +211,3 @@ def by_output(values: DoubleArray, data: Prepared) -> dict[str, dict[str, float]
         str(horizon): dict(zip(data.task.targets, map(float, row), strict=True))
         for horizon, row in zip(data.task.horizons, values.reshape(len(data.task.horizons), -1), strict=True)
     }
-
-
-def to_json(choice: PortfolioChoice) -> dict[str, Any]:
-    """Plain values of a choice."""
-    return {"chosen": choice.name, "best": choice.best, "excess": dict(choice.excess), "doubt": dict(choice.doubt)}

@@ -10,7 +10,7 @@ from edp.errors import ExportError
 from edp.export.c.sizes import constant_bytes
 from edp.networks.integer import integer_predictor
 from edp.networks.running import mean_error
-from edp.storage import write_bytes, write_json
+from edp.storage import check_writable, write_bytes, write_json
 from edp.storage.paths import is_file_at
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training import save_bundle
@@ -40,6 +40,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     bundle, experiment, provenance, data = trained_run(folder)
     if bundle.predictor.number_format != "float32":
         raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
+    check_writable(out)
     key = run_key({"quantised": ticks, "weights": weights_digest(bundle.predictor)}, data.digest)
     with Run.create(out, "network", key, experiment_toml(experiment)) as target:
         integer_network = integer_predictor(bundle.predictor, data.train, ticks)

@@ -24,7 +24,7 @@ from edp.progress import SILENT, Progress
 from edp.storage.headers import model_digest
 from edp.storage.paths import is_folder_at
 from edp.training.bundle import load_bundle
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class ControlBench:
             if channel.name.startswith("CylPressures_") and value > first.limits.pressure_pa:
                 raise ConfigError(
                     f"limits: pressure_pa = {setting_text(first.limits.pressure_pa)} Pa, but the machine rests with "
-                    f"{channel.name} at {figure(value, 3)} Pa; allow more"
+                    f"{channel.name} at {typed(value, 3)} Pa; allow more"
                 )
         measured = row[self.plant.columns(controller.reads)]
         # A channel that is missing at the start is named where the loop begins.

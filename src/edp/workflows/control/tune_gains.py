@@ -117,7 +117,8 @@ def tune_gains(
             study.tell(trial.number, [cost])
             best = spec if not rows or cost < min(row["cost_mm"] for row in rows) else best
             rows.append({"gains": dict(trial.values), "cost_mm": cost})
-            write_json(run.file(TRIALS), {"costs_mm": [row["cost_mm"] for row in rows]})
+            if number >= len(earlier):
+                write_json(run.file(TRIALS), {"costs_mm": [row["cost_mm"] for row in rows]})
             trials.step(number + 1)
         before, after = judge.costs(experiment.controller), judge.costs(best)
         content = {

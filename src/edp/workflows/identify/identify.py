@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config.twin import TwinExperiment, load_twin_experiment
+from edp.config.twin import TWIN_SETTINGS, TwinExperiment, load_twin_experiment, twin_toml
 from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
@@ -28,8 +29,11 @@ from edp.recording import Recording
 from edp.signals import Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine, parse_machine
-from edp.storage import check_writable, write_bytes, write_json
+from edp.storage import check_writable, read_object, write_bytes, write_json
+from edp.storage.headers import model_digest
 from edp.storage.paths import is_there
+from edp.storage.provenance import PROVENANCE
+from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.identification.bodies import Poses, linked_bodies, realised
 from edp.training.identification.elements import (
@@ -47,12 +51,14 @@ from edp.training.identification.rows import TOLD, IdentifiedNumber, body_rows, 
 from edp.training.identification.stability import covariance
 from edp.training.identification.tie import MachineTie, deviations, kept_back, nearest
 from edp.training.progress_steps import free_run_steps
-from edp.training.twin_bundle import load_twin
-from edp.wording import figure
+from edp.training.provenance import training_provenance
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
+from edp.wording import typed
 from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 Doubles = NDArray[np.float64]
+KIND, RUN, RESULT, GREY_FOLDER = "identification", ".run", "identification.json", "grey"
 OIL = "OilTemperature"
 FREEZING = 273.15
 LAST_STAGES = 2
@@ -109,7 +115,8 @@ def identify(
 ) -> Identified:
     """Find the machine of the simulator whose numbers are those of the logs, and write its file.
 
-    Beside it a file of the same name that ends in ``.json`` has every number and the scores.
+    Next to it a file of the same name that ends in ``.json`` has every number and the scores, and a run folder that
+    ends in ``.run`` the stages of the fit: the same call continues after a stop.
 
     Args:
         source: the logs.
@@ -121,9 +128,10 @@ def identify(
 
     Raises:
         EdpError: logs, guess, settings or run that do not fit each other, or an identified machine that cannot be;
-            nothing is written then.
+            no machine file is written then.
     """
-    target = _new_file(out)
+    target, began = _new_file(out), time.process_time()
+    check_claimable(target.with_suffix(RUN), KIND)
     if run is not None and experiment is not None:
         raise ConfigError(
             f"--run {run} comes with settings; a run keeps its own: leave --config and --set out, or --run to fit anew"
@@ -146,35 +154,55 @@ def identify(
     celsius, notes = _celsius(recordings, base)
     scales, judge = fit_scales(channels, data.train) if loaded is None else loaded[0].scales, settings.judge
     check_runs(channels, scales, grey.prefix_ticks, data.test, judge.seconds, judge.starts)
-    if loaded is None:
-        fitted = _fitted(base, machine, grey, (channels, data, settings.training.seed), progress)
-    else:
+    if loaded is not None:
         check_same_linkage(loaded[0], base, machine)
-        fitted = _informed(loaded[0], data, settings.training.seed)
-    parts = parts_of(fitted.twin, fitted.elements, base, celsius)
-    notes += _notes(parts)
-    progress.note("fitting the machine itself to free runs")
-    fit = _refined(base, parts, fitted, (data, settings), progress)
-    progress.note("asking what parts of the logs, and runs of other lengths, would say")
-    spread = covariance(fit.twin, fit.tie, fit.theta, data.train, settings.training.seed)
-    machine_found, rows, doubts = _machine(fit, spread, data)
-    notes += doubts
-    machine_found = replace(machine_found, name=_name(target), description=_description(base))
-    text = machine_text(machine_found, _head(base, rows, notes), line_comments(rows))
-    try:
-        # As a reader of the file will check it: what cannot be simulated is not written.
-        written = parse_machine(text, target.name)
-    except ConfigError as error:
-        raise ConfigError(
-            f"the identified machine cannot be ({error}); the logs do not fit machine {base.name}: check units, map, "
-            "and pins and bores of --machine"
-        ) from error
-    progress.note("driving both machines by the commands of held-out recordings")
-    scores = _scores(fitted, (base, written), parts, (data, settings))
-    write_bytes(target, text.encode())
-    facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
-    write_json(target.with_suffix(".json"), facts | {"numbers": [row.plain() for row in rows], "models": scores})
+    made_of = {"machine": asdict(base), "from": None if run is None else model_digest(run)}
+    key = run_key({"identify": TWIN_SETTINGS.plain(settings)} | made_of, data.digest)
+    with Run.create(target.with_suffix(RUN), KIND, key, twin_toml(settings)) as opened:
+        if loaded is None:
+            fitted = _fitted(opened, base, machine, grey, (channels, data, settings.training.seed), progress)
+        else:
+            fitted = _informed(loaded[0], data, settings.training.seed)
+        parts = parts_of(fitted.twin, fitted.elements, base, celsius)
+        notes += _notes(parts)
+        progress.note("fitting the machine itself to free runs")
+        fit = _refined(opened, base, parts, fitted, (data, settings), progress)
+        progress.note("asking what parts of the logs, and runs of other lengths, would say")
+        spread = _stage(
+            opened,
+            "covariance",
+            lambda: {"covariance": covariance(fit.twin, fit.tie, fit.theta, data.train, settings.training.seed)},
+        )["covariance"]
+        machine_found, rows, doubts = _machine(fit, spread, data)
+        notes += doubts
+        machine_found = replace(machine_found, name=_name(target), description=_description(base))
+        text = machine_text(machine_found, _head(base, rows, notes), line_comments(rows))
+        try:
+            # As a reader of the file will check it: what cannot be simulated is not written.
+            written = parse_machine(text, target.name)
+        except ConfigError as error:
+            raise ConfigError(
+                f"the identified machine cannot be ({error}); the logs do not fit machine {base.name}: check units, "
+                "map, and pins and bores of --machine"
+            ) from error
+        progress.note("driving both machines by the commands of held-out recordings")
+        scores = _scores(fitted, (base, written), parts, (data, settings))
+        write_bytes(target, text.encode())
+        facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
+        write_json(target.with_suffix(".json"), facts | {"numbers": [row.plain() for row in rows], "models": scores})
+        seconds = time.process_time() - began
+        write_json(opened.file(PROVENANCE), training_provenance(source, data, settings.training.seed, 1, seconds))
+        write_json(opened.file(RESULT), {"schema": 1, "machine": str(target)})
     return Identified(written, rows, scores, notes)
+
+
+def _stage(run: Run, name: str, compute: Callable[[], Mapping[str, Doubles]]) -> dict[str, Doubles]:
+    """Return the arrays of a stage of the fit, which are computed once for a run."""
+    file = run.file(f"{name}.json")
+    if not is_there(file):
+        write_json(file, {key: np.asarray(values).tolist() for key, values in compute().items()})
+    # Read back after the first computation, too, so that a continued run has the same bits.
+    return {key: np.array(values) for key, values in read_object(file).items()}
 
 
 def _new_file(out: str | Path) -> Path:
@@ -229,7 +257,7 @@ def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
 
 
 def _fitted(
-    base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], progress: Progress
+    run: Run, base: Machine, machine: str, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], progress: Progress
 ) -> _Fitted:
     """A grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed.
 
@@ -243,9 +271,18 @@ def _fitted(
     spec = replace(spec, linkage=machine) if spec.degrees == POLYNOMIALS else spec
     begun = spec.start(channels, fit_scales(channels, data.train), data.train, seed)
     twin = GreyTwin(channels, begun.scales, spec, (begun.table, begun.wiring), begun.numbers, full)
-    progress.note("fitting a grey box to free runs")
-    fit = fit_grey_box(twin, data.train, data.validation, seed, free_run_steps(progress))
-    return _Fitted(fit.twin, elements, fit.information)
+
+    def fit() -> dict[str, Doubles]:
+        progress.note("fitting a grey box to free runs")
+        fitted = fit_grey_box(twin, data.train, data.validation, seed, free_run_steps(progress))
+        save_twin(TwinBundle(fitted.twin.spec, fitted.twin), run.file(GREY_FOLDER))
+        return {"information": fitted.information}
+
+    information = _stage(run, "grey_box", fit)["information"]
+    grey = load_twin(run.file(GREY_FOLDER)).twin
+    if not isinstance(grey, GreyTwin):
+        raise StorageError(f"'{run.file(GREY_FOLDER)}' holds no grey box; remove '{run.path}' and start again")
+    return _Fitted(grey, elements, information)
 
 
 def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
@@ -260,6 +297,7 @@ def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
 
 
 def _refined(
+    run: Run,
     base: Machine,
     parts: GreyParts,
     fitted: _Fitted,
@@ -275,10 +313,17 @@ def _refined(
     twin = fitted.twin
     spec = replace(twin.spec, fit=last)
     tied = GreyTwin(twin.channels, twin.scales, spec, (twin.table, twin.wiring), tie.numbers(tie.begin), twin.full)
-    result = fit_grey_box(tied, data.train, data.validation, settings.training.seed + 1, free_run_steps(progress), tie)
+
+    def refine() -> dict[str, Doubles]:
+        result = fit_grey_box(
+            tied, data.train, data.validation, settings.training.seed + 1, free_run_steps(progress), tie
+        )
+        return {"theta": result.theta, "information": result.information}
+
+    stage = _stage(run, "machine", refine)
     every = replace(twin.spec, fit=fit)
-    end = GreyTwin(twin.channels, twin.scales, every, (twin.table, twin.wiring), tie.numbers(result.theta), twin.full)
-    return _Tied(end, tie, result.theta, result.information)
+    end = GreyTwin(twin.channels, twin.scales, every, (twin.table, twin.wiring), tie.numbers(stage["theta"]), twin.full)
+    return _Tied(end, tie, stage["theta"], stage["information"])
 
 
 def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list[IdentifiedNumber], list[str]]:
@@ -321,9 +366,7 @@ def _machine(fit: _Tied, spread: Doubles, data: Prepared) -> tuple[Machine, list
 
 def _check_strokes(channels: TwinChannels, data: Prepared, base: Machine) -> None:
     count = len(channels.velocities)
-    if len(channels.strokes) != count:
-        # The elements say what is missing.
-        excavator_elements(channels, base)
+    excavator_elements(channels, base)  # raises if a channel is missing
     rows = [part.targets[:, count : 2 * count] for part in (*data.train, *data.validation, *data.test)]
     low, high = (getattr(np.concatenate(rows), end)(axis=0) for end in ("min", "max"))
     if len(channels.strokes) == 3:
@@ -339,7 +382,7 @@ def _celsius(recordings: Sequence[Recording], base: Machine) -> tuple[float, lis
     ]
     if len(logged) < len(recordings):
         celsius = base.oil.temperature
-        return celsius, [f"the logs have no {OIL}: {figure(celsius)} degC of machine {base.name} is taken"]
+        return celsius, [f"the logs have no {OIL}: {typed(celsius)} degC of machine {base.name} is taken"]
     celsius = float(np.nanmean(np.concatenate(logged).astype(np.float64))) - FREEZING
     if not np.isfinite(celsius):
         raise DataError(f"'{OIL}' holds no number; correct the log, or leave the channel out")

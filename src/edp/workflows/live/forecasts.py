@@ -11,7 +11,7 @@ from edp.errors import ConfigError
 from edp.live.layout import Forecast
 from edp.recording import Recording
 from edp.report.animation.page import ForecastLine
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.live.run_live import LiveOrder, LiveRun
 from edp.workflows.live.sources import SourceOptions
 from edp.workflows.live.sources.log import LogSource
@@ -65,7 +65,7 @@ def _line(one: Forecast, measured: int, rows: NDArray[np.float32], rate_hz: floa
         name: None if column is None else shown(column, one.ticks)
         for name, column in (("lower", one.lower), ("upper", one.upper))
     }
-    how = one.model if one.model != "network" else f"{figure(1e3 * one.ticks / rate_hz)} ms ahead"
+    how = one.model if one.model != "network" else f"{typed(1e3 * one.ticks / rate_hz)} ms ahead"
     return ForecastLine(
         f"{one.name}, {how}", one.unit, shown(one.column, one.ticks), shown(measured, 0), ends["lower"],
         ends["upper"],

@@ -10,7 +10,7 @@ from edp.monitor.monitor_file import load_monitor
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.live.sources import LiveSource, Needs
 
 MOST_LEVERS = 12
@@ -69,7 +69,7 @@ def check_rate(source: LiveSource, models: LiveModels) -> None:
     # A thousandth: loggers state the same rate with different digits.
     if rate is not None and abs(source.rate_hz - rate) > 1e-3 * rate:
         raise ConfigError(
-            f"{source.text} has {figure(source.rate_hz)} Hz, the run {figure(rate)} Hz; set rate_hz in the signal "
+            f"{source.text} has {typed(source.rate_hz)} Hz, the run {typed(rate)} Hz; set rate_hz in the signal "
             "map, or choose "
             "a run of this rate"
         )

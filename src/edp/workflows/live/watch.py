@@ -13,7 +13,7 @@ from edp.monitor.diagnosis.causes import NONE_OF_THESE
 from edp.monitor.monitor import Monitor, MonitorStream
 from edp.recording import Recording
 from edp.signals import Channel
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.live.parts import LivePart, Note, Row
 
 MOST_TICKS = 100
@@ -66,7 +66,7 @@ class LiveMonitor(LivePart):
         names = [channel.name for channel in channels]
         if abs(rate_hz - monitor.rate_hz) > 1e-3 * monitor.rate_hz:
             raise ConfigError(
-                f"the source has {figure(rate_hz)} Hz, the monitor {figure(monitor.rate_hz)} Hz; set rate_hz in the "
+                f"the source has {typed(rate_hz)} Hz, the monitor {typed(monitor.rate_hz)} Hz; set rate_hz in the "
                 "signal map"
             )
         lacking = [name for name in monitor.inputs if name not in names]

@@ -24,7 +24,7 @@ from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
 from edp.signals import Channel
 from edp.sim.machine.machine_files import load_machine, machine_names
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.monitor.fault_sessions import (
     FaultSession,
     cases_of,
@@ -101,7 +101,7 @@ def check_dictionary_inputs(
 
 
 def _too_short(block_s: float) -> ConfigError:
-    return ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {figure(block_s)} s")
+    return ConfigError(f"dictionary: after_s must hold more than {ONSET} blocks of {typed(block_s)} s")
 
 
 def _check_machine(inputs: Sequence[str], machine: str, rate_hz: float) -> None:
@@ -141,6 +141,7 @@ def build_dictionary(
         DataError: too few healthy sessions.
     """
     began = time.process_time()
+    _check_machine(monitor.inputs, machine, monitor.rate_hz)
     rows = [monitor.conditioned_rows(session) for session in healthy[:HEALTHY_SESSIONS]]
     rows = [part[np.isfinite(part).any(axis=1)] for part in rows]
     if not rows:

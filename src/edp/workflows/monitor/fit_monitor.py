@@ -38,7 +38,7 @@ from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
-from edp.wording import figure, percent
+from edp.wording import percent, typed
 from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, check_dictionary_inputs, machine_of
 
 LEAST_SESSIONS = 8
@@ -284,7 +284,7 @@ def watched_channels(recordings: Sequence[Recording], experiment: MonitorExperim
     rates = sorted({recording.rate_hz for recording in recordings})
     if rates[-1] > rates[0] * 1.001:
         raise DataError(
-            f"healthy logs have rates from {figure(rates[0])} to {figure(rates[-1])} Hz; set rate_hz in the signal map"
+            f"healthy logs have rates from {typed(rates[0])} to {typed(rates[-1])} Hz; set rate_hz in the signal map"
         )
     for name in experiment.channels:
         for recording in recordings:
@@ -398,10 +398,10 @@ def _check_hours(sessions: Sequence[Recording], rest: Sequence[Recording], exper
     if left < promised:
         share = left / hours
         raise ConfigError(
-            f"{figure(hours, 3)} h of healthy logs are too few for one false alarm in {figure(promised)} h: "
-            f"{percent(1.0 - share)} of them train residuals, and what is left supports one in {figure(left, 3)} h; "
-            f"ask for one in {figure(ROOM * left, 3)} (--hours-per-false-alarm {figure(ROOM * left, 3)}), which leaves "
-            f"room for sessions that turn out doubtful, or bring {figure(promised / (ROOM * share) - hours, 3)} h more"
+            f"{typed(hours, 3)} h of healthy logs are too few for one false alarm in {typed(promised)} h: "
+            f"{percent(1.0 - share)} of them train residuals, and what is left supports one in {typed(left, 3)} h; "
+            f"ask for one in {typed(ROOM * left, 3)} (--hours-per-false-alarm {typed(ROOM * left, 3)}), which leaves "
+            f"room for sessions that turn out doubtful, or bring {typed(promised / (ROOM * share) - hours, 3)} h more"
         )
 
 

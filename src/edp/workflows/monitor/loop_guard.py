@@ -15,7 +15,7 @@ from edp.monitor.alarms import MonitorAlarm
 from edp.monitor.monitor import Monitor, MonitorStream
 from edp.monitor.monitor_file import load_monitor
 from edp.sim.faults.shown import falsified_channels
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 HOLD_S = 60.0
@@ -60,7 +60,7 @@ class MonitorGuard:
         names = {channel.name: i for i, channel in enumerate(plant.channels)}
         if abs(plant.rate_hz - self.monitor.rate_hz) > 1e-3 * self.monitor.rate_hz:
             raise ConfigError(
-                f"{plant.source} has {figure(plant.rate_hz)} Hz, the monitor {figure(self.monitor.rate_hz)} Hz; run "
+                f"{plant.source} has {typed(plant.rate_hz)} Hz, the monitor {typed(self.monitor.rate_hz)} Hz; run "
                 "the loop at "
                 "the rate of the monitor's recordings"
             )

@@ -24,7 +24,7 @@ from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record, check_uncoordinated
 from edp.storage.portable import cores
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.search.context import Decision, SearchContext, is_enough, set_apart
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.networks import JudgedNetwork, frozen_split, network_name, write_networks
@@ -167,7 +167,7 @@ def run_search(
         source = DataSource(target / SESSIONS_FILE)
         callbacks.on_note(
             f"too few logs for sessions ({len(recordings)}): divided into {len(data.names)} sessions of "
-            f"{figure(parts.seconds, 3)} s or more ({source.path}); what is found holds for these logs, not for other "
+            f"{typed(parts.seconds, 3)} s or more ({source.path}); what is found holds for these logs, not for other "
             "days"
         )
     with ExitStack() as open_things:

@@ -22,7 +22,7 @@ from edp.report.twin.candidates import MOST_TEXT
 from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec
 from edp.training.free_run_members import MemberTraining, joined_members
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.pace import paced
 from edp.workflows.twin.training_cost import training_seconds
@@ -220,7 +220,7 @@ class TwinChoice:
     def _beyond_budget(self, form: Recurrent, training: FreeRunSpec, seconds: float) -> TwinCandidate:
         """A training that is left out, and why."""
         why = (
-            f"about {figure(seconds / 60.0, 2)} min of counted time with those before it, of minutes = "
+            f"about {typed(seconds / 60.0, 2)} min of counted time with those before it, of minutes = "
             f"{setting_text(self.auto.minutes)}"
         )
         return TwinCandidate(labelled(form, training), 0.0, why=why)

@@ -25,7 +25,7 @@ from edp.storage.runs import PARTS, KeyedRun
 from edp.training.free_run import FittedTwin
 from edp.training.free_run_members import MemberTraining
 from edp.training.twin_bundle import TwinBundle, load_twin, twin_hash
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.twin.choose_twin import AT, LENGTHENED, TwinCandidate, shortened
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 
@@ -105,8 +105,8 @@ class BaseTwin:
         before = self.bundle.twin.channels
         if channels.rate_hz != before.rate_hz:
             raise DataError(
-                f"the recordings have {figure(channels.rate_hz)} Hz, that of --start {self.folder} "
-                f"{figure(before.rate_hz)} Hz; "
+                f"the recordings have {typed(channels.rate_hz)} Hz, that of --start {self.folder} "
+                f"{typed(before.rate_hz)} Hz; "
                 "its memory counts ticks: record at that rate, or train a twin anew"
             )
         for ours, theirs in zip((*channels.commands, *channels.answers), (*before.commands, *before.answers)):
@@ -132,8 +132,8 @@ class BaseTwin:
             if not 1.0 / UNLIKE < ratio < UNLIKE:
                 name = getattr(channels, part)[int(np.argmax(now))].name
                 raise DataError(
-                    f"{part} of the recordings (largest: '{name}') are {figure(ratio, 3)} times those that the twin of "
-                    f"--start {self.folder} knows; {figure(1.0 / UNLIKE, 2)} to {figure(UNLIKE)} must hold: check "
+                    f"{part} of the recordings (largest: '{name}') are {typed(ratio, 3)} times those that the twin of "
+                    f"--start {self.folder} knows; {typed(1.0 / UNLIKE, 2)} to {typed(UNLIKE)} must hold: check "
                     "units and "
                     "scales in the signal map"
                 )

@@ -24,7 +24,7 @@ from edp.storage import replacing_folder
 from edp.storage.paths import entries_of, is_folder_at, is_there
 from edp.storage.provenance import recording_names
 from edp.training.twin_bundle import TwinBundle, load_twin
-from edp.wording import figure
+from edp.wording import typed
 
 AHEAD = "_in_"
 """Between the name of an answer and the ticks ahead, in the name of a forecast."""
@@ -129,7 +129,7 @@ def _refuse_used(folder: Path) -> None:
 def _checked(twin: Twin, logged: Recording) -> Recording:
     if logged.rate_hz != twin.channels.rate_hz:
         raise DataError(
-            f"recording '{logged.name}' has {figure(logged.rate_hz)} Hz, the twin {figure(twin.channels.rate_hz)} Hz; "
+            f"recording '{logged.name}' has {typed(logged.rate_hz)} Hz, the twin {typed(twin.channels.rate_hz)} Hz; "
             "train a twin "
             "on logs of this rate"
         )
@@ -161,7 +161,7 @@ def _channels(twin: Twin, horizons: Sequence[int], columns: list[int]) -> list[C
     for k in horizons:
         for column in columns:
             answer = twin.channels.answers[column]
-            text = f"{answer.name} in {figure(k / rate)} s, as a twin forecasts it with the commands held"
+            text = f"{answer.name} in {typed(k / rate)} s, as a twin forecasts it with the commands held"
             described.append(Channel(f"{answer.name}{AHEAD}{k}", answer.kind, text))
     return described
 

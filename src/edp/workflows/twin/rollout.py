@@ -22,7 +22,7 @@ from edp.report import FreeRunFacts, write_rollout_plots, write_twin_page
 from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 from edp.workflows.twin.judge_twin import channel_facts, shown_runs
 
 FREE = "_twin"
@@ -112,7 +112,7 @@ def rollout_log(
         write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, plots)
     if page is not None:
         content = {"channels": channel_facts(twin.channels), "models": {"twin": result.scores}}
-        title = f"{recording.name} from {figure(result.start_s)} s"
+        title = f"{recording.name} from {typed(result.start_s)} s"
         write_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals)), page)
     return result
 
@@ -135,24 +135,24 @@ def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | Non
     ticks = max(1, round(seconds * rate))
     if recording.samples < prefix + 2:
         raise DataError(
-            f"'{recording.name}' has {recording.samples} ticks ({figure(recording.duration_s)} s); the twin needs a "
+            f"'{recording.name}' has {recording.samples} ticks ({typed(recording.duration_s)} s); the twin needs a "
             "prefix "
-            f"of {prefix} measured ones ({figure(prefix / rate)} s) and two more: give a longer log"
+            f"of {prefix} measured ones ({typed(prefix / rate)} s) and two more: give a longer log"
         )
     if start < prefix:
         raise DataError(
-            f"a free run from {figure(start / rate)} s has {start} measured ticks before it; the twin needs a prefix "
+            f"a free run from {typed(start / rate)} s has {start} measured ticks before it; the twin needs a prefix "
             "of "
-            f"{prefix} ({figure(prefix / rate)} s): begin at --from {setting_text(prefix / rate)} or later"
+            f"{prefix} ({typed(prefix / rate)} s): begin at --from {setting_text(prefix / rate)} or later"
         )
     # One more row than answers: the last answer is compared with the tick after the last command.
     if start + ticks + 1 > recording.samples:
         longest = (recording.samples - 1 - start) / rate
         room = f"at most --seconds {setting_text(longest)} from there" if longest > 0 else "begin earlier"
         raise DataError(
-            f"a free run of {figure(seconds)} s from {figure(start / rate)} s goes beyond the end of "
+            f"a free run of {typed(seconds)} s from {typed(start / rate)} s goes beyond the end of "
             f"'{recording.name}' at "
-            f"{figure(recording.duration_s)} s; {room}"
+            f"{typed(recording.duration_s)} s; {room}"
         )
     return start, ticks
 

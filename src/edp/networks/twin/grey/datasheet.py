@@ -12,7 +12,7 @@ from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.known_linkage import GIGA
 from edp.networks.twin.grey.linkage import balance_by_base, base_of
 from edp.networks.twin.grey.numbers import NumberTable
-from edp.wording import figure
+from edp.wording import typed
 
 Doubles = NDArray[np.float64]
 NORMAL = 1.96
@@ -128,6 +128,6 @@ def datasheet_text(rows: Sequence[dict[str, Any]], basis: str = BASIS) -> str:
     ]
     for row in rows:
         label = f"{row['element']}.{row['name']}".ljust(width)
-        value = figure(row["value"]) if row["excited"] else f"({figure(row['value'])})"
+        value = typed(row["value"]) if row["excited"] else f"({typed(row['value'])})"
         lines.append(f"{label}  {value:>12}  {row['low']:>10.3g} to {row['high']:<10.3g}  {row['unit']}")
     return "\n".join(lines) + "\n"

@@ -15,7 +15,7 @@ from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.elements import Elements
 from edp.networks.twin.grey.plausible import GreyNumber
 from edp.networks.twin.scales import TwinScales
-from edp.wording import figure
+from edp.wording import typed
 
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -156,9 +156,9 @@ def _check_stroke(
     low, high = float(scales.low[answer]), float(scales.high[answer])
     if low < -BEYOND * stroke or high > (1.0 + BEYOND) * stroke:
         raise ConfigError(
-            f"grey box: '{channels.strokes[column].name}' lies from {figure(low)} to {figure(high)} m in the "
+            f"grey box: '{channels.strokes[column].name}' lies from {typed(low)} to {typed(high)} m in the "
             "recordings; the "
-            f"linkage of machine {machine} has strokes from 0 to {figure(stroke)} m (retracted to extended): correct "
+            f"linkage of machine {machine} has strokes from 0 to {typed(stroke)} m (retracted to extended): correct "
             "offset and scale in the signal map, or name another machine in twin.linkage"
         )
 

@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from edp.errors import DataError
-from edp.wording import figure, setting_text
+from edp.wording import setting_text, typed
 from edp.workflows.live.sources.base import Row, Sink
 
 SILENT_S = 0.5
@@ -74,7 +74,7 @@ class RowClock:
             DataError: the time is not a number within `MAX_TIME_S`, or that of the row before.
         """
         if not abs(seconds) <= MAX_TIME_S:
-            raise DataError(f"its time is {figure(seconds)} s; a number up to {figure(MAX_TIME_S)} is expected")
+            raise DataError(f"its time is {typed(seconds)} s; a number up to {typed(MAX_TIME_S)} is expected")
         last, changed = self._last, stamped != self._stamped
         step = 0.0 if last is None else seconds - last
         if last is not None and stamped and not changed and abs(step) < SAME_TIME / self.rate_hz:
@@ -87,7 +87,7 @@ class RowClock:
             elif step < 0.0:
                 restart = "time went back"
             elif stamped and step > MAX_JUMP_S:
-                restart = f"time jumped by {figure(step)} s"
+                restart = f"time jumped by {typed(step)} s"
         if last is None or restart:
             self._steps.clear()
             return Step(restart=restart)
@@ -119,7 +119,7 @@ class Arrivals:
         if not self._silent and time.monotonic() - self._heard > SILENT_S:
             self._silent = True
             self._sink.note(
-                "warning", f"no row for {figure(SILENT_S)} s: nothing is predicted until rows come again", "silent"
+                "warning", f"no row for {typed(SILENT_S)} s: nothing is predicted until rows come again", "silent"
             )
 
     def take(self, row: Row, seconds: float | None = None, more: bool = False) -> None:
@@ -153,11 +153,11 @@ class Arrivals:
     def _tell_rate(self) -> None:
         clock, rate = self._clock, self._clock.measured_hz or math.nan
         if clock.trusted:
-            self._sink.note("note", f"rows come at {figure(rate)} Hz again: models begin anew", "rate right")
+            self._sink.note("note", f"rows come at {typed(rate)} Hz again: models begin anew", "rate right")
             self._sink.begin_anew()
         else:
             self._sink.note(
                 "warning",
-                f"rows come at {figure(rate)} Hz, the models know {figure(clock.rate_hz)} Hz: nothing is predicted",
+                f"rows come at {typed(rate)} Hz, the models know {typed(clock.rate_hz)} Hz: nothing is predicted",
                 "rate wrong",
             )

@@ -8,7 +8,7 @@ from typing import ClassVar
 from edp.data.derived_velocities import matched
 from edp.logs.source import DataSource, read_with_truth
 from edp.recording import MACHINE, Recording
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Sink, SourceOptions
 
 SIMULATED = "sim:"
@@ -24,8 +24,8 @@ class LogSource(LiveSource):
         self.recording: Recording = recording
         self.channels, self.rate_hz, self.ticks = recording.channels, recording.rate_hz, recording.samples
         self.machine = machine or _machine_of(recording)
-        self.text = f"log {recording.name}, {figure(recording.duration_s)} s"
-        self.ending = f"the log has ended after {figure(recording.duration_s)} s"
+        self.text = f"log {recording.name}, {typed(recording.duration_s)} s"
+        self.ending = f"the log has ended after {typed(recording.duration_s)} s"
 
     @classmethod
     def of(cls, options: SourceOptions, needs: Needs) -> LogSource:

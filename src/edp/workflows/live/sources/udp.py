@@ -17,7 +17,7 @@ from edp.logs.units import check_unit, mapped_channel, unit_for
 from edp.settings.bounds import shown
 from edp.signals import VOCABULARY, Channel, Kind, SignalMap
 from edp.storage.reading import parse_json
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.live.sources.arrivals import Arrivals
 from edp.workflows.live.sources.base import SOURCES, LiveSource, Needs, Row, Sink, SourceOptions, chosen_rate
 
@@ -147,7 +147,7 @@ class UdpSource(LiveSource):
             return tuple(VOCABULARY.get(name, Channel(name, Kind.GENERIC)) for name in names[:MOST_CHANNELS])
         self._socket.close()
         raise DataError(
-            f"{self.text}: no row with a value came for {figure(STARTUP_S)} s, and no model or signal map says which "
+            f"{self.text}: no row with a value came for {typed(STARTUP_S)} s, and no model or signal map says which "
             "channels there are; start the sender first, or give --map"
         )
 

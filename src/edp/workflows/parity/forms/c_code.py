@@ -19,7 +19,7 @@ from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.storage import write_bytes
 from edp.storage.paths import entries_of
 from edp.training.bundle import Bundle
-from edp.wording import figure
+from edp.wording import typed
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
 
 # Without contraction of products and sums: the tolerance is that of single precision, W8A16 asks for equal bits.
@@ -107,6 +107,6 @@ class WholeNumbers:
         expected = stream(whole, case.inputs)
         deviations = np.abs(expected - case.expected).max() / float(predictor.code.width.max())
         note = (
-            f"against the Python reference of the same; that is {figure(deviations, 2)} deviations from float32 at most"
+            f"against the Python reference of the same; that is {typed(deviations, 2)} deviations from float32 at most"
         )
         return [("w8a16", Ran(predictions, seconds, expected, np.zeros_like(case.allowed), note))]

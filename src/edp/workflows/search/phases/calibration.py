@@ -12,7 +12,7 @@ from edp.errors import DataError
 from edp.stats.efficiency import SizeScore, most_efficient
 from edp.stats.paired import fill_worst
 from edp.stats.pareto import pareto
-from edp.wording import behind, figure, percent, percent_interval
+from edp.wording import behind, percent, percent_interval, typed
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.phases.base import (
     PHASES,
@@ -80,12 +80,12 @@ class Calibration:
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
             text = (
-                f"{backbone}: {_values(picked)} gives {figure(picked.score, 3)}{behind(context.unit)} with {size} "
+                f"{backbone}: {_values(picked)} gives {typed(picked.score, 3)}{behind(context.unit)} with {size} "
                 "parameters"
             )
             if lowest is not None and lowest is not picked:
                 size = f"{lowest.costs['parameters']:,.0f}"
-                text += f"; the lowest, {figure(lowest.score, 3)}, has {size} and does not repay the difference"
+                text += f"; the lowest, {typed(lowest.score, 3)}, has {size} and does not repay the difference"
             sentences += [f"{text}.", *(f"{backbone}: {sentence}" for sentence in said_of_pruned(context, own))]
         if not chosen:
             raise DataError(
@@ -96,7 +96,7 @@ class Calibration:
         if final:
             facts["final"] = _final(context, list(chosen), final)
             scores = facts["final"]["scores"]
-            listed = ", ".join(f"{name} {figure(score, 3)}" for name, score in scores.items())
+            listed = ", ".join(f"{name} {typed(score, 3)}" for name, score in scores.items())
             against = "".join(
                 f"; {item['best']} against {name} {percent(item['change'], signed=True)} "
                 f"({percent_interval(item['low'], item['high'])})"
@@ -170,7 +170,7 @@ def _plain(context: SearchContext, answer: AnsweredQuestion) -> dict[str, Any]:
 
 def _values(answer: AnsweredQuestion) -> str:
     return ", ".join(
-        f"{name} {figure(value, 3)}" if isinstance(value, float) else f"{name} {value}"
+        f"{name} {typed(value, 3)}" if isinstance(value, float) else f"{name} {value}"
         for name, value in answer.trial.values.items()
     )
 

@@ -15,7 +15,7 @@ from edp.stats.confirm import ModuleEvidence, Rule, confirm
 from edp.stats.paired import fill_worst
 from edp.stats.race import INTERIM_ANALYSES, InterimAnalysis
 from edp.stats.thesis_confirm import ThesisEvidence, thesis_confirm
-from edp.wording import figure, percent
+from edp.wording import percent, typed
 from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
 from edp.workflows.search.modules import MODULES
 from edp.workflows.search.phases.base import PHASES, Course
@@ -133,7 +133,7 @@ def _thesis_text(name: str, evidence: Sequence[ThesisEvidence]) -> str:
     best = min(evidence, key=lambda entry: entry.adjusted)
     verdict = "confirmed" if any(entry.confirmed for entry in evidence) else "not confirmed"
     return (
-        f"{MODULES[name].title}: {verdict}; on {best.metric} adjusted p {figure(best.adjusted, 2)}, "
+        f"{MODULES[name].title}: {verdict}; on {best.metric} adjusted p {typed(best.adjusted, 2)}, "
         f"d_z {best.d_z:.2f}, wins {percent(best.stability)}."
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 from edp.errors import count_of
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
-from edp.wording import figure, percent
+from edp.wording import percent, typed
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import fitting, options_of, title_of
 from edp.workflows.search.phases.base import PHASES, Course, changed
@@ -71,7 +71,7 @@ class Exploration:
         sentences = (
             f"Best of {len(facts['trials'])} questions about all modules: {names}.",
             f"Against the winner of phase 4 on {count_of(size, 'fresh run')}: "
-            f"{percent(comparison['change'], signed=True)} (one-sided p {figure(comparison['p'], 2)}); {verdict}.",
+            f"{percent(comparison['change'], signed=True)} (one-sided p {typed(comparison['p'], 2)}); {verdict}.",
             *facts["said_of_pruned"],
         )
         return Decision("exploration", facts, sentences)

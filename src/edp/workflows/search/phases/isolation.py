@@ -13,7 +13,7 @@ from edp.errors import DataError, count_of
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
-from edp.wording import behind, figure, percent, percent_interval
+from edp.wording import behind, percent, percent_interval, typed
 from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
 from edp.workflows.search.phases.base import PHASES, Course, changed
 
@@ -100,13 +100,13 @@ class Isolation:
         facts["variance"] = _proxy(context, tables, arms)
         sentences = [
             f"Feature set {chosen} goes on: mean {what} "
-            + ", ".join(f"{name} {figure(value, 3)}" for name, value in means.items())
+            + ", ".join(f"{name} {typed(value, 3)}" for name, value in means.items())
             + f"{behind(context.unit)} over all backbones."
         ]
         for backbone, comparison in facts["comparisons"].items():
             sentences.append(
                 f"{backbone}: {chosen} against {comparison['reference']} {percent(comparison['change'], signed=True)} "
-                f"(one-sided p {figure(comparison['p'], 2)}, two-way clustered t over "
+                f"(one-sided p {typed(comparison['p'], 2)}, two-way clustered t over "
                 f"{count_of(spec.variance_runs, 'run')})."
             )
         for backbone, comparison in facts["backbones"].items():

@@ -8,7 +8,7 @@ from edp.errors import count_of
 from edp.stats.power import plan_runs
 from edp.stats.thesis_power import thesis_plan
 from edp.stats.variance import PairedVariance
-from edp.wording import behind, figure
+from edp.wording import behind, typed
 from edp.workflows.search.context import Decision, SearchContext
 from edp.workflows.search.phases.base import PHASES, Course
 
@@ -47,9 +47,7 @@ def _sound(context: SearchContext) -> Decision:
     )
     # Whole repeats of the folds, even where the power is not reached.
     runs = plan.runs or spec.most_runs - spec.most_runs % spec.folds
-    sentences = [
-        f"To see {figure(100 * spec.least_effect)} % of {figure(mean, 3)}{behind(context.unit)}: {plan.reason}."
-    ]
+    sentences = [f"To see {typed(100 * spec.least_effect)} % of {typed(mean, 3)}{behind(context.unit)}: {plan.reason}."]
     if plan.runs is None:
         sentences.append(
             f"{count_of(runs, 'run')} are made nevertheless; effects below what they can show will be missed."
@@ -79,8 +77,8 @@ def _thesis(context: SearchContext) -> Decision:
         plan = asdict(power_plan)
     runs = min(int(plan["splits"] or 2), spec.most_runs)
     text = (
-        f"J = {plan['splits']} splits of {spec.run_seeds} seeds after eq. 3.42 (seeds differ by {figure(sigma, 3)}"
-        f"{behind(context.unit)}, {figure(100 * spec.least_effect)} % of an MAE of {figure(mean, 3)} are to be seen); "
+        f"J = {plan['splits']} splits of {spec.run_seeds} seeds after eq. 3.42 (seeds differ by {typed(sigma, 3)}"
+        f"{behind(context.unit)}, {typed(100 * spec.least_effect)} % of an MAE of {typed(mean, 3)} are to be seen); "
         f"{runs} "
         "are made."
     )

@@ -12,7 +12,7 @@ from edp.config.experiment import Table
 from edp.errors import count_of
 from edp.stats.factorial import Factorial, least_runs, two_level_design
 from edp.stats.importance import main_effects
-from edp.wording import behind, figure
+from edp.wording import behind, typed
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import MODULES, contradicting, fitting
 from edp.workflows.search.phases.base import PHASES, AnsweredQuestion, Course, Quest, answer_all, new_study
@@ -139,7 +139,7 @@ def _thesis(context: SearchContext) -> Course:
     table = {name: _gain(own, reference) for name, own in zip(free, answers, strict=True)}
     passed = [name for name, row in table.items() if row["gain"] is not None and row["gain"] > 0]
     sentences = (
-        f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {figure(reference, 3)}"
+        f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {typed(reference, 3)}"
         f"{behind(context.unit)} and go on; by chance alone most do, since the best of {spec.module_trials} is "
         "compared with a "
         "median.",

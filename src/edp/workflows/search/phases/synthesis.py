@@ -9,7 +9,7 @@ import numpy as np
 
 from edp.config.experiment import Table
 from edp.stats.clustered import clustered_t
-from edp.wording import behind, figure, percent
+from edp.wording import behind, percent, typed
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import title_of
 from edp.workflows.search.phases.base import PHASES, Course, changed
@@ -49,7 +49,7 @@ class Synthesis:
         facts["antagonistic"] = [name for name in confirmed if name not in facts["modules"]]
         names = ", ".join(map(title_of, facts["modules"])) or "no module"
         sentences = [
-            f"Best together: {names}; {figure(facts['score'], 3)}{behind(context.unit)} on development sessions."
+            f"Best together: {names}; {typed(facts['score'], 3)}{behind(context.unit)} on development sessions."
         ]
         sentences += facts["said_of_pruned"]
         if facts["antagonistic"]:
@@ -58,7 +58,7 @@ class Synthesis:
         test = facts["test"]
         ours, base = (_shown(test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
         gain = facts["test_gain"]
-        interval = "" if gain is None else f"; {percent(gain['change'], signed=True)}, p {figure(gain['p'], 2)}"
+        interval = "" if gain is None else f"; {percent(gain['change'], signed=True)}, p {typed(gain['p'], 2)}"
         sentences.append(
             f"On {len(context.test)} test sessions, opened once: {ours}, the baseline {base} (composite score, mean of "
             f"{context.spec.run_seeds} seeds{interval})."
@@ -119,7 +119,7 @@ def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> dict[str, flo
 
 
 def _shown(score: float | None, unit: str) -> str:
-    return "no score, since a training failed" if score is None else figure(score, 3) + behind(unit)
+    return "no score, since a training failed" if score is None else typed(score, 3) + behind(unit)
 
 
 PHASES.register("synthesis")(Synthesis())

@@ -1,0 +1,113 @@
+"""Tables of a run for its page and the command line: error by situation, and machines of a foundation run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from edp.evaluation.guard import NETWORK
+from edp.report.common.sheets import Column, Sheet, Value, figures, plainly
+from edp.wording import figure, percent
+
+WORDS = {
+    "rest": "at rest, now and then",
+    "starting": "starting",
+    "stopping": "stopping",
+    "reversing": "reversing",
+    "fast": "faster than half of the fastest",
+    "dead_band": "moving, command in its dead band",
+    "end_stop": "near an end stop",
+    "other": "none of these",
+}
+"""How a table calls what `edp.evaluation.by_situation` tells apart."""
+
+
+def situation_sheet(scores: Mapping[str, Any], horizon: int) -> Sheet | None:
+    """The network's error by situation beside the best baseline's, most of the error first; None without such scores.
+
+    Args:
+        scores: the content of ``scores.json``.
+        horizon: samples ahead.
+    """
+    models = scores["models"]
+    ours = models.get(NETWORK, {}).get("by_situation", {}).get(str(horizon), [])
+    if not ours:
+        return None
+    targets = scores["targets"]
+    shown = [t for t in targets if any(row["mae"].get(t["name"]) is not None for row in ours)]
+    best = _best_baseline(models, horizon, [t["name"] for t in shown])
+    beside = {
+        row["situation"]: row for row in models.get(best, {}).get("by_situation", {}).get(str(horizon), [])
+    }  # fmt: skip
+    rows = []
+    for row in sorted(ours, key=lambda row: -row["of_error"]):
+        name = row["situation"]
+        errors = [row["mae"].get(t["name"]) for t in shown]
+        theirs = [beside.get(name, {"mae": {}})["mae"].get(t["name"]) for t in shown] if best else []
+        ratio = _ratio(errors, theirs)
+        cells = [WORDS.get(name, name), percent(row["share"]), percent(row["of_error"]), *errors]
+        rows.append((*cells, *((percent(ratio),) if best else ())))
+    errors_of = [Column(t["name"], t.get("unit", ""), figures(r[3 + i] for r in rows)) for i, t in enumerate(shown)]
+    label = str(models[best].get("label") or best) if best else ""
+    relative = (Column("Relative to", label),) if best else ()
+    columns = (Column("Situation"), Column("Of the time"), Column("Of the error"), *errors_of, *relative)
+    return Sheet("situations", "Mean absolute error by what the axis does", columns, tuple(rows))
+
+
+def _best_baseline(models: Mapping[str, Any], horizon: int, targets: list[str]) -> str:
+    """The baseline with the least sum of errors, each in those of the network; empty where there is none."""
+    ours = models[NETWORK]["overall"].get(str(horizon), {})
+    sums: dict[str, float] = {}
+    for name, model in models.items():
+        theirs = model["overall"].get(str(horizon), {})
+        pairs = [(theirs.get(t, {}).get("mae"), ours.get(t, {}).get("mae")) for t in targets]
+        if name != NETWORK and model.get("by_situation") and all(a is not None and b for a, b in pairs):
+            sums[name] = sum(a / b for a, b in pairs)
+    return min(sums, key=lambda name: sums[name], default="")
+
+
+def _ratio(ours: list[float | None], theirs: list[float | None]) -> float | None:
+    """Geometric mean of the ratios of both, over the targets of which both have an error."""
+    logs = [math.log(a / b) for a, b in zip(ours, theirs) if a and b]
+    return math.exp(sum(logs) / len(logs)) if logs else None
+
+
+def parts_sheet(foundation: Mapping[str, Any]) -> Sheet:
+    """Machines, recordings and minutes of each part."""
+    heads = ("machines", "recordings", "minutes")
+    rows = tuple((part, *(facts[key] for key in heads)) for part, facts in foundation["data"].items())
+    columns = (Column("Part"), *(Column(head.capitalize(), show=_short) for head in heads))
+    return Sheet("parts", f"{foundation['label']} over many machines", columns, rows)
+
+
+def contexts_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Sheet:
+    """Error by the time since the state was reset, always on the same ticks."""
+    unseen = foundation["unseen"]
+    rows: list[tuple[Value, ...]] = []
+    for row in unseen["contexts"]:
+        spread = row["change_error"]
+        half_width = None if spread is None else 196 * spread
+        rows.append((row["seconds"], row["mae"], 100 * row["change"], half_width))
+    columns = (
+        Column("Since reset", "s", _short),
+        Column("MAE", unit, figures([row[1] for row in rows], decimals=3)),
+        Column("Change", "%", figures([row[2] for row in rows], signed=True, decimals=1)),
+        Column("95 %", "+- %", figures([row[3] for row in rows], decimals=1)),
+    )
+    caption = (
+        f"Machines that were never seen ({len(unseen['machines'])}), k = {foundation['horizon']}: error by the time "
+        f"since the state was reset, {unseen['ticks']} ticks"
+    )
+    return Sheet("contexts", caption, columns, tuple(rows))
+
+
+def _short(value: Value) -> str:
+    return figure(value) if isinstance(value, int | float) else plainly(value)
+
+
+def machines_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Sheet:
+    """Each machine that tests, the hardest first."""
+    each = sorted(foundation["unseen"]["machines"].items(), key=lambda entry: -entry[1])
+    columns = (Column("Machine"), Column("MAE", unit, figures([mae for _, mae in each])))
+    return Sheet("machines", "Machines that were never seen, the hardest first", columns, tuple(each))
