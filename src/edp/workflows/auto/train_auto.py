@@ -46,8 +46,6 @@ from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.auto.train_candidates import (
     TrainedCandidate,
     TrainedPortfolio,
-    Trainer,
-    candidate_experiments,
     train_portfolio,
 )
 from edp.workflows.train_evaluate import keep_fitted
@@ -109,9 +107,8 @@ def train_auto(
         return finished
     check_moving(data)
     check_size(data)
-    candidate_experiments(settings, amount)  # refuse unknown or unsuitable candidates before the folder is claimed
     with Run.create(out, "auto", key, tomli_w.dumps(plain_tree(settings))) as run:
-        portfolio = train_portfolio(settings, data, amount, run.path, Trainer(workers, progress))
+        portfolio = train_portfolio(settings, data, amount, run.path, workers, progress)
         return _write_choice(run, source, portfolio, data, settings, [*of_channels, *of_parts, *still_inputs(data)])
 
 

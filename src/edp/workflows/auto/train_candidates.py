@@ -210,26 +210,6 @@ def _noted(job: CandidateTraining) -> TrainingProgress | None:
         return None  # a note is for readers: what cannot be read now is read at the next look
 
 
-@dataclass(frozen=True)
-class Trainer:
-    """How candidates are trained, and who is told.
-
-    Attributes:
-        workers: processes that train side by side; 0 for one a core.
-        progress: receiver of the progress; its units are models.
-    """
-
-    workers: int = 1
-    progress: Progress = SILENT
-
-    def train(
-        self, jobs: Sequence[CandidateTraining], done: int = 0, total: int = 0
-    ) -> dict[str, TrainedCandidate | str]:
-        """By name; `done` others of `total` came before."""
-        trained = train_all(jobs, self.workers, self.progress, done, total)
-        return {job.name: one for job, one in zip(jobs, trained, strict=True)}
-
-
 @dataclass(frozen=True, eq=False)
 class TrainedPortfolio:
     """Every candidate, trained.
@@ -246,38 +226,44 @@ class TrainedPortfolio:
 
 
 def train_portfolio(
-    settings: AutoSettings, data: Prepared, amount: Amount, folder: Path, trainer: Trainer
+    settings: AutoSettings, data: Prepared, amount: Amount, folder: Path, workers: int = 1, progress: Progress = SILENT
 ) -> TrainedPortfolio:
     """Train every candidate that suits the data.
 
-    Where a recurrent network is among them it first trains for a share of its time. Unless it comes near the linear
-    model in that, the committee gets more of the budget, and the trial stands for the network.
+    A recurrent network first trains for a share of its time. Unless its error comes near that of the linear model, the
+    committee gets more of the budget, and the trial stands for the network.
 
     Args:
         settings: task, budget, which candidates.
         data: prepared series.
         amount: what there is to learn from.
         folder: of the run; checkpoints lie in it.
-        trainer: how.
+        workers: processes that train in parallel; 0 for one a core.
+        progress: receiver of the progress; its units are models.
 
     Raises:
         ConfigError: no candidate suits the data.
         EdpError: see `train_all`.
     """
-    experiments = candidate_experiments(settings, amount)
+
+    def train(jobs: Sequence[CandidateTraining], done: int = 0, total: int = 0) -> dict[str, TrainedCandidate | str]:
+        trained = train_all(jobs, workers, progress, done, total)
+        return {job.name: one for job, one in zip(jobs, trained, strict=True)}
+
+    experiments = _experiments(settings, amount)
     if amount.foundation is not None or not {LINEAR, COMMITTEE, RECURRENT} <= experiments.keys():
-        return TrainedPortfolio(trainer.train(_jobs(experiments, data, amount, folder)), amount)
+        return TrainedPortfolio(train(_jobs(experiments, data, amount, folder)), amount)
     amount = replace(amount, trial=RecurrentTrial.RUNNING)
-    experiments = candidate_experiments(settings, amount)
+    experiments = _experiments(settings, amount)
     linear, trial = _jobs({name: experiments[name] for name in (LINEAR, RECURRENT)}, data, amount, folder)
     trial = replace(trial, folder=folder / "candidates" / TRIAL_FOLDER, trial=True)
-    first = trainer.train([linear, trial], total=len(experiments))
+    first = train([linear, trial], total=len(experiments))
     ratio = _over_linear(first)
     passed = ratio is not None and ratio <= MARGIN
     amount = replace(amount, trial=RecurrentTrial.PASSED if passed else RecurrentTrial.FAILED)
-    experiments = candidate_experiments(settings, amount)
+    experiments = _experiments(settings, amount)
     rest = {name: one for name, one in experiments.items() if name != LINEAR and (passed or name != RECURRENT)}
-    second = trainer.train(_jobs(rest, data, amount, folder), done=len(first), total=len(first) + len(rest))
+    second = train(_jobs(rest, data, amount, folder), done=len(first), total=len(first) + len(rest))
     outcomes = first | second
     notes = []
     if not passed:
@@ -297,7 +283,7 @@ def _over_linear(outcomes: Mapping[str, TrainedCandidate | str]) -> float | None
     return math.exp(excess[RECURRENT] - excess[LINEAR])
 
 
-def candidate_experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment]:
+def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment]:
     """Return the settings of the candidates that suit the data, the simplest first.
 
     Raises:
