@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.logs import find_repeats, inspect, sketch, write_recording
 from edp.logs.quality import columns
@@ -256,9 +257,9 @@ def test_data_set_tells_repeats_and_a_channel_in_two_units(tmp_path):
         write_recording(replace(entry, values=values), tmp_path / f"{entry.name}.parquet")
         if entry.name == "b":
             write_recording(replace(entry, values=values[500:9000].copy()), tmp_path / "again.csv")
-    said = []
-    quality = DataSource.of(tmp_path).inspect(lambda path, number, count: said.append((path.name, number, count)))
-    assert said[-1] == ("c.parquet", 4, 4)
+    told = NotedProgress()
+    quality = DataSource.of(tmp_path).inspect(told)
+    assert (told.stages, told.notes[-1], len(told.notes)) == ([("log", 4)], "c.parquet", 4)
     texts = [finding.what for finding in quality.findings]
     assert any("repeats 85 s of 'again'" in text or "repeats 85 s of 'b'" in text for text in texts)
     assert [f.where for f in quality.findings if "bar read as Pa?" in f.what] == ["c"]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, err, listing, out, progress
-from edp.cli.quality import LogDisplay
+from edp.cli.console import JsonFlag, emit, err, listing, out
+from edp.cli.progress import shown_progress
 from edp.errors import ConfigError, count_of
 from edp.wording import figure
 
@@ -49,8 +49,8 @@ def init(
     if not yes and not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigError("edp init asks before it writes, and there is no terminal to ask on; give --yes")
     check_kind(folder, what="edp init")
-    with progress(as_json) as shown:
-        proposal = propose(logs, LogDisplay(shown, Steps(as_json)).on_log)
+    with shown_progress("read", as_json) as progress:
+        proposal = propose(logs, progress)
     if not as_json:
         show_proposal(proposal)
     if not yes and not typer.confirm(f"Write {' and '.join(proposal.files)} into '{folder}'?", err=True):

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
+from edp.cli.console import JsonFlag, emit, err, out, table
 from edp.cli.options import ClusterOption, LogsArgument, MapOption, OpenOption, WorkersOption, workforce_of
-from edp.cli.quality import AtMostOption, LogDisplay, show_between, show_lines, show_report, verdict_text
+from edp.cli.progress import shown_progress
+from edp.cli.quality import AtMostOption, show_between, show_lines, show_report, verdict_text
 from edp.errors import DataError, EdpError, count_of
 from edp.storage.paths import full_path, is_file_at
 from edp.wording import figure, number, percent
@@ -71,15 +72,14 @@ def inspect(
     asked = page is not None or bool(split or inputs)
     names, inspection = tuple(filter(None, inputs.split(","))), None
     workforce = workforce_of(workers, cluster, open_cluster)
-    with progress(as_json) as shown:
-        on_log = LogDisplay(shown, Steps(as_json)).on_log
+    with shown_progress("read", as_json) as progress:
         if workforce.alone:
-            quality = source.inspect(on_log)
+            quality = source.inspect(progress)
         else:
             from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
 
             order = CoverageOrder(names, split) if covered or asked else None
-            inspection = inspect_with(workforce, source, order, on_log)
+            inspection = inspect_with(workforce, source, order, progress)
             quality = inspection.quality
     errors = quality.errors
     coverage_facts, why = None, "" if covered or asked else "not asked for"

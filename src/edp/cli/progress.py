@@ -22,6 +22,9 @@ WORDS = {
 }
 """Text of each value that a step may have, for its figure."""
 
+FEW = 20
+"""Units of a stage up to which each has a line of its own, however short it is."""
+
 
 class Display:
     """Progress of a command on standard error.
@@ -106,7 +109,7 @@ class StageDisplay:
         counts = self.total is not None
         spent = f", {duration(time.monotonic() - self.display.began)} so far" if self.display.timed else ""
         left = self._estimated() if counts else spent
-        force = not (counts and self.display.counted)
+        force = not counts or (not self.display.counted and (self.total or 0) <= FEW)
         self.display.show(self._path(), self._share() if counts else None, left, force=force)
 
     def _estimated(self) -> str:

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import Steps, count_text, out, table
+from edp.cli.console import out, table
 from edp.cli.options import MOST_HOURS, within
 from edp.errors import count_of
 from edp.settings.bounds import above
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from edp.logs import DataQuality, Finding, QualityReport
 
 AtMostOption = Annotated[
@@ -38,21 +35,6 @@ VERDICT_TEXTS = {
     "check": "check: read the warnings before training",
     "unusable": "unusable as they are: training would refuse them",
 }
-
-
-class LogDisplay:
-    """Shows which log is read."""
-
-    def __init__(self, shown: Progress, steps: Steps) -> None:
-        self.shown, self.steps = shown, steps
-        self.bar = shown.add_task("read", total=1.0, note="")
-
-    def on_log(self, path: Path, number: int, count: int) -> None:
-        """Show one log."""
-        self.shown.update(
-            self.bar, completed=(number - 1) / max(1, count), note=f"{path.name}, {count_text(number, count)}"
-        )
-        self.steps.say(f"read: {path.name}, {count_text(number, count)}")
 
 
 def show_report(report: QualityReport) -> None:

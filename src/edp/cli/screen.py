@@ -24,21 +24,22 @@ from edp.cli.options import (
     source_of,
     workforce_of,
 )
-from edp.cli.quality import AtMostOption, LogDisplay, show_between, verdict_text
+from edp.cli.progress import Display, StageDisplay
+from edp.cli.quality import AtMostOption, show_between, verdict_text
 from edp.errors import count_of
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress as Bars
 
     from edp.config.experiment import FeatureSettings
     from edp.jobs import Workforce
     from edp.logs import DataQuality
     from edp.logs.source import DataSource
+    from edp.progress import Progress
     from edp.settings.tree import Change
     from edp.training import TrainingProgress
     from edp.workflows.feature_selection.select import Selection, SelectionOrder
-    from edp.workflows.fleet.inspecting import OnLog
 
 # A terminal's page; everything is in the files.
 SHOWN = 40
@@ -133,20 +134,20 @@ def run_screening(
     if workforce is not None and not workforce.alone:
         from edp.workflows.fleet.inspecting import inspect_with
 
-        def inspected(source: DataSource, on_log: OnLog | None) -> DataQuality:
-            return inspect_with(workforce, source, None, on_log).quality
+        def inspected(source: DataSource, progress: Progress) -> DataQuality:
+            return inspect_with(workforce, source, None, progress).quality
 
     with progress(quiet) as shown:
         display = ScreeningDisplay(shown, Steps(quiet))
-        logs = LogDisplay(shown, Steps(quiet))
-        listeners = Listeners(on_log=logs.on_log, on_progress=display.on_progress, on_trial=display.on_trial)
+        logs = StageDisplay(Display(shown, Steps(quiet), "read"))
+        listeners = Listeners(logs=logs, on_progress=display.on_progress, on_trial=display.on_trial)
         return select_features(source, folder, order, listeners, inspected)
 
 
 class ScreeningDisplay:
     """Shows the stages of a screening and the trainings of its trials."""
 
-    def __init__(self, shown: Progress, steps: Steps) -> None:
+    def __init__(self, shown: Bars, steps: Steps) -> None:
         self.shown, self.steps = shown, steps
         self.bars: dict[str, Any] = {}
         self.began: dict[str, tuple[float, float]] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -209,24 +209,25 @@ class DataSource:
         _check_listed(recordings, self.path)
         return recordings
 
-    def inspect(self, on_log: Callable[[Path, int, int], None] | None = None) -> DataQuality:
+    def inspect(self, progress: Progress = SILENT) -> DataQuality:
         """What is in each log, what is wrong with it, and which repeat each other; nothing is repaired or refused.
 
         Args:
-            on_log: called with the path of each log before it is read, its number from 1, and how many there are.
+            progress: receiver of the progress; its units are logs.
 
         Raises:
             DataError: none of the files can be read at all; where some can, each of the others has an error.
         """
         if self.stored:
-            return self._inspect_store(on_log)
+            return self._inspect_store(progress)
         self._refuse_bucket_and_sample()
         logs = self.logs()
         reports, sketches, sketched = [], Sketches(), []
         broken: list[DataError] = []
+        reading = progress.stage("log", len(logs))
         for i, log in enumerate(logs):
-            if on_log is not None:
-                on_log(log.path, i + 1, len(logs))
+            reading.step(i)
+            reading.note(log.path.name)
             try:
                 report, one = look_into(log.path, log.signal_map, log.name, log.rows, log.repair)
             except DataError as error:
@@ -266,12 +267,13 @@ class DataSource:
         ]
         return build_store(stored, folder, workers, progress)
 
-    def _inspect_store(self, on_log: Callable[[Path, int, int], None] | None) -> DataQuality:
+    def _inspect_store(self, progress: Progress) -> DataQuality:
         recordings = self.read()
         reports, sketches = [], Sketches()
+        reading = progress.stage("recording", len(recordings))
         for i, recording in enumerate(recordings):
-            if on_log is not None:
-                on_log(self.path / recording.name, i + 1, len(recordings))
+            reading.step(i)
+            reading.note(recording.name)
             reports.append(inspect(recording))
             sketches.add(sketch(recording))
         return compare(reports, sketches, self.drawn_findings(recordings))

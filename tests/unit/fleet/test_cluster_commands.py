@@ -107,14 +107,14 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     plug.mend()
 
     stored = DataSource.of(one / "store")
-    assert inspect_with(there, stored, None, plug.pull).quality == stored.inspect()
+    assert inspect_with(there, stored, None, PullingProgress(plug)).quality == stored.inspect()
     plug.mend()
 
     looked = []
 
-    def inspected(data, on_log):
+    def inspected(data, progress):
         looked.append(data)
-        return inspect_with(there, data, None, plug.pull).quality
+        return inspect_with(there, data, None, PullingProgress(plug)).quality
 
     order = SelectionOrder(pictures=False)
     apart = select_features(stored, tmp_path / "screen", order, inspected=inspected)

@@ -144,14 +144,14 @@ def test_an_inspection_in_units_is_that_of_one_process(small_logs, here, tmp_pat
     if stored:
         source.store(tmp_path / "store", 1)
         source = DataSource.of(tmp_path / "store")
-    told = []
-    found = inspect_with(here, source, CoverageOrder(), lambda path, number, count: told.append((number, count)))
+    told = NotedProgress()
+    found = inspect_with(here, source, CoverageOrder(), told)
     usual = source.inspect()
     assert found.quality.reports == usual.reports
     assert found.quality == usual
     assert isinstance(found.coverage, Coverage)
     assert json.dumps(found.coverage.to_json()) == json.dumps(coverage(source).to_json())
-    assert told[-1][0] == told[-1][1]
+    assert told.stages == [("part", told.steps[-1])]
 
 
 def test_a_coverage_that_cannot_be_told_says_why(small_logs, here):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -11,6 +11,7 @@ import numpy as np
 
 from edp.errors import DataError
 from edp.logs.proposal.columns import LogLook, look_at_log, names_in_log
+from edp.progress import SILENT, Progress
 
 _One = TypeVar("_One")
 MOST_LOGS = 12
@@ -44,14 +45,12 @@ class LogGroup:
         return frozenset.intersection(*(frozenset(look.names) for look in self.looks), *self.names)
 
 
-def group_logs(
-    paths: Sequence[Path], on_log: Callable[[Path, int, int], None] | None = None
-) -> tuple[list[LogGroup], dict[Path, str]]:
+def group_logs(paths: Sequence[Path], progress: Progress = SILENT) -> tuple[list[LogGroup], dict[Path, str]]:
     """Look at logs and sort them by their columns, the most rows first.
 
     Args:
         paths: of the logs.
-        on_log: called with the path of each log before it is looked at, its number from 1, and how many there are.
+        progress: receiver of the progress; its units are logs.
 
     Returns:
         the groups, and what is wrong with the logs that cannot be read.
@@ -62,9 +61,10 @@ def group_logs(
     chosen = some_of(paths)
     groups: list[list[LogLook]] = []
     broken: dict[Path, str] = {}
+    looking = progress.stage("log", len(chosen))
     for i, path in enumerate(chosen):
-        if on_log is not None:
-            on_log(path, i + 1, len(chosen))
+        looking.step(i)
+        looking.note(path.name)
         try:
             look = look_at_log(path)
         except DataError as error:

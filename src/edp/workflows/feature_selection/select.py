@@ -18,6 +18,7 @@ from edp.logs import DataQuality, Repair, common_channels, open_log
 from edp.logs.formats.base import is_truth
 from edp.logs.resolve import resolve
 from edp.logs.source import DataSource
+from edp.progress import SILENT, Progress
 from edp.recording import MOST_ROWS, Recording
 from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
@@ -59,12 +60,12 @@ class Listeners:
     """Who hears of the progress.
 
     Attributes:
-        on_log: a log is read: path, number from 1, how many.
+        logs: progress of the inspection; its units are logs.
         on_progress: a stage of the screening, and the share of it all that is done.
         on_trial: a training: see `edp.workflows.feature_selection.trials`.
     """
 
-    on_log: Callable[[Path, int, int], None] | None = None
+    logs: Progress = SILENT
     on_progress: OnProgress | None = None
     on_trial: OnTrial | None = None
 
@@ -101,7 +102,7 @@ def select_features(
     out: str | Path,
     order: SelectionOrder | None = None,
     listeners: Listeners | None = None,
-    inspected: Callable[[DataSource, Callable[[Path, int, int], None] | None], DataQuality] | None = None,
+    inspected: Callable[[DataSource, Progress], DataQuality] | None = None,
 ) -> Selection:
     """Screen a data set and write what it proposes.
 
@@ -119,7 +120,7 @@ def select_features(
     folder = check_writable(out)
     # Without a map all channels are read under the names of the files: a screening may judge each of them.
     mapped = source if source.signal_map is not None or _lists_maps(source) else _taken_whole(source)
-    quality = (inspected or DataSource.inspect)(mapped, listeners.on_log)
+    quality = (inspected or DataSource.inspect)(mapped, listeners.logs)
     recordings, notes = _read(mapped, quality)
     spec, more = _candidates(recordings[0], order)
     screening = screen(recordings, spec, listeners.on_progress)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +20,7 @@ from edp.logs.quality.sketches import Sketches
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource
 from edp.logs.store import read_index
+from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.settings.tree import build, plain_tree
 from edp.signals import SignalMap
@@ -32,7 +33,6 @@ STORED_UNITS = 64
 """Units that the recordings of a store are divided into, about: opening a store takes longer the more it holds."""
 UNIT_BYTES = 4 * 2**20
 """Of the logs of a unit, about a second of work: a unit takes hundredths of one to hand out and to take back."""
-OnLog = Callable[[Path, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Inspection:
 
 
 def inspect_with(
-    workforce: Workforce, source: DataSource, covers: CoverageOrder | None = None, on_log: OnLog | None = None
+    workforce: Workforce, source: DataSource, covers: CoverageOrder | None = None, progress: Progress = SILENT
 ) -> Inspection:
     """As `DataSource.inspect`, and `edp.workflows.covering.coverage`, by a workforce.
 
@@ -75,7 +75,7 @@ def inspect_with(
         workforce: who looks; nodes see the logs under the same paths.
         source: where the recordings are.
         covers: the coverage that is wanted, too.
-        on_log: called with a path, how many units are done and how many there are.
+        progress: receiver of the progress; its units are parts of the logs.
 
     Raises:
         DataError: no log can be read at all.
@@ -87,9 +87,11 @@ def inspect_with(
         # First: it takes longest.
         units.insert(0, _coverage_unit(source, covers))
 
+    looking = progress.stage("part", len(units))
+
     def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-        if on_log is not None:
-            on_log(Path(unit.label), done, len(units))
+        looking.note(Path(unit.label).name)
+        looking.step(done)
 
     results = run_units(units, workforce, on_done=note)
     covered, why = None, ""

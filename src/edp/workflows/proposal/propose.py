@@ -7,7 +7,7 @@ import json
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from edp.logs.proposal.shapes import beside_notes, pace_notes, shape_notes
 from edp.logs.proposal.timing import Timing, repair_table, timing_of
 from edp.logs.read import find_recordings
 from edp.logs.source import DataSource
+from edp.progress import SILENT, Progress
 from edp.signals import Kind
 from edp.storage import make_folder, write_bytes
 from edp.storage.folders import check_kind
@@ -125,14 +126,12 @@ def _quoted(path: Path) -> str:
     return shlex.quote(str(path))
 
 
-def propose(
-    path: str | Path | Sequence[str | Path], on_log: Callable[[Path, int, int], None] | None = None
-) -> LogsProposal:
+def propose(path: str | Path | Sequence[str | Path], progress: Progress = SILENT) -> LogsProposal:
     """Look at logs and propose a map and settings; nothing is written.
 
     Args:
         path: a log or a folder of logs, or several of them.
-        on_log: called with the path of each log before it is looked at, its number from 1, and how many there are.
+        progress: receiver of the progress; its units are logs.
 
     Raises:
         DataError: no log there can be read, or nothing in it can be predicted.
@@ -142,7 +141,7 @@ def propose(
         if one.suffix.lower() == ".toml":
             raise ConfigError(f"'{one}' is a data-set file; give the log or the folder of logs that it is to describe")
     paths, copies = _without_copies(list(dict.fromkeys(file for one in source.paths for file in find_recordings(one))))
-    groups, broken = group_logs(paths, on_log)
+    groups, broken = group_logs(paths, progress)
     experiments, others = part_experiments(groups[0]), tuple(groups[1:])
     group = groups[0] if experiments is None else experiments.group
     refuse_frames(group.looks[0])
