@@ -65,7 +65,7 @@ def figure(value: float | None, digits: int = MAX_DIGITS) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
-def typed(value: float | None, digits: int = 6) -> str:
+def typed(value: float | None, digits: int = MAX_DIGITS) -> str:
     """Return a number as a user can type it back into a setting or an option: ASCII, without thousands separators.
 
     Messages of errors use it: what they advise is copied. Tables, pages and first lines use `figure`.
