@@ -101,14 +101,14 @@ def _words(names: Iterable[str]) -> str:
 def _kinds() -> Iterable[list[str]]:
     for kind, facts in KINDS.items():
         low, high = facts.plausible
-        limits = "any" if kind is Kind.GENERIC else f"{typed(low)} to {typed(high)}"
+        limits = "any" if kind is Kind.GENERIC else f"{typed(low, 6)} to {typed(high, 6)}"
         yield [f"`{kind}`", f"`{facts.si_unit}`", f"`{facts.report_unit}`", limits, _MEANING[kind]]
 
 
 def _units() -> Iterable[list[str]]:
     for name, unit in UNITS.items():
         spelt = [alias for alias, usual in ALIASES.items() if usual == name]
-        offset = typed(unit.offset) if unit.offset else ""
+        offset = typed(unit.offset, 6) if unit.offset else ""
         yield [f"`{name}`", _words(unit.kinds), f"{unit.factor:.10g}", offset, _words(spelt)]
 
 
