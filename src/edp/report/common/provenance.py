@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.errors import count_of
-from edp.wording import count_text, duration, figure, moment, number
+from edp.wording import count_text, duration, figure, moment
 
 _TEXTS = (
     ("Machine", "machine"), ("Plant", "plant"), ("Twin of the controller", "twin"),
@@ -33,10 +33,14 @@ def provenance_rows(provenance: Mapping[str, Any] | None) -> list[tuple[str, str
     for part in ("train", "validation", "test"):
         facts = _table(data.get(part))
         if facts:
-            hours = f", {number(facts['hours'], 2)} h" if facts.get("hours") is not None else ""
-            rows.append((part.capitalize(), f"{count_of(facts.get('recordings'), 'recording')}{hours}"))
+            length = "" if facts.get("hours") is None else f", {_length_text(facts['hours'])}"
+            rows.append((part.capitalize(), f"{count_of(facts.get('recordings'), 'recording')}{length}"))
     rows += [(key.replace("_", " ").capitalize(), value) for key, value in _table(source.get("environment")).items()]
     return [(label, str(value)) for label, value in rows if value is not None and value != ""]
+
+
+def _length_text(hours: float) -> str:
+    return f"{figure(hours, 3)} h" if hours >= 0.1 else f"{figure(60 * hours, 3)} min"
 
 
 def _table(value: Any) -> Mapping[str, Any]:

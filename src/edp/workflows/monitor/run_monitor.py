@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -155,7 +156,8 @@ def run_monitor(
 
 
 def _detectors(monitor: Monitor) -> list[str]:
-    return [type(watch.detector).__name__.removesuffix("Spec").lower() for watch in monitor.chain.watches]
+    names = (type(watch.detector).__name__.removesuffix("Spec") for watch in monitor.chain.watches)
+    return [re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower() for name in names]
 
 
 def groups_of(monitor: Monitor) -> dict[str, list[int]]:

@@ -223,7 +223,9 @@ def valve_numbers(
         for label, column, area in fed:
             places[column + d] = first + len(numbers)
             numbers += [
-                GreyNumber(name, f"{label}_{way}_{typed(100 * knots[k + 1], 6)}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0)
+                GreyNumber(
+                    name, f"{label}_{way}_{typed(100 * knots[k + 1], 6)}", "m^3/s/Pa^0.5", 1e-3, area * step, 1.0
+                )
                 for k, step in enumerate(curve)
             ]
         if meter_out and regeneration:
