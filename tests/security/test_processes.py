@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from edp.cli import ending
+from edp.cli import process
 from edp.cli.console import run_app
 from edp.errors import LostError
 from edp.sandbox.helpers import Helpers
@@ -39,12 +39,12 @@ def forever(job):
 
 if __name__ == "__main__":
     sys.argv = ["x", "FOLDER"]
-    from edp.cli import ending
-    ending.stop_on_request()
+    from edp.cli import process
+    process.stop_on_request()
     try:
         list(ordered(forever, [Job("a"), Job("b"), Job("c")], 2))
     except KeyboardInterrupt:
-        sys.exit(ending.stopped_code(130))
+        sys.exit(process.stopped_code(130))
 """
 
 
@@ -124,9 +124,9 @@ def test_without_the_systems_help_a_helper_looks(monkeypatch):
 
 def test_a_request_to_end_is_one_message_and_its_code(capsys, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(ending, "_stopped_by", [])
+    monkeypatch.setattr(process, "_stopped_by", [])
     try:
-        ending.stop_on_request()
+        process.stop_on_request()
 
         def app(standalone_mode):
             os.kill(os.getpid(), signal.SIGTERM)

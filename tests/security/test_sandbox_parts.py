@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.cli import slow
+from edp.cli import notices
 from edp.errors import DataError
 from edp.logs import FORMATS, WriteOptions, read_recording, write_recording
 from edp.logs.sandboxed import plain_map
@@ -32,14 +32,14 @@ def recording(samples):
 def test_the_command_line_says_what_takes_long(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["edp", "inspect", "a.csv"])
     try:
-        slow.tell_of_slow_logs()
+        notices.tell_of_slow_logs()
         heard = sandbox._watcher
         for seconds in (5.1, 6.0, 9.0, 10.5, 15.0, 21.2):
             heard(Path("day/a[/b]\x1b.mf4"), seconds, 1_200_000_000)
         heard(Path("b.mf4"), 5.0, 3_000_000)
         watch(None)
         monkeypatch.setattr(sys, "argv", ["edp", "inspect", "a.csv", "--json"])
-        slow.tell_of_slow_logs()
+        notices.tell_of_slow_logs()
         assert sandbox._watcher is None
     finally:
         watch(None)

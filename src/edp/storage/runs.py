@@ -98,7 +98,7 @@ class Run:
             try:
                 yield run
             except EdpError:
-                if is_new:
+                if is_new and run.status().get("status") not in ENDED:
                     run.release()
                 raise
             if run is not path:
