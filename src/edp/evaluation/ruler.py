@@ -188,11 +188,15 @@ class Ruler:
         return predicted[scored], truth[scored]
 
     def _of_recording(self, predicted: NDArray[Any], truth: NDArray[Any]) -> dict[str, Any]:
-        """All scores of the mean over outputs; of each output the error alone: runs have hundreds of recordings."""
+        """Return all scores of the mean over outputs; of each output errors alone, since runs have many recordings."""
         scores = named_scores(
             self.task.targets, [score(predicted[:, i], truth[:, i]) for i in range(len(self.task.targets))]
         )
-        return {name: values if name == "mean" else {"mae": values["mae"]} for name, values in scores.items()}
+        measures = ("mae", "rmse")
+        return {
+            name: values if name == "mean" else {key: values[key] for key in measures}
+            for name, values in scores.items()
+        }
 
     def _integrated(self, target: str, predicted: NDArray[Any], truth: NDArray[Any]) -> Values:
         """Ticks, and sum of the squared error of the running integral, in report unit times seconds."""

@@ -392,9 +392,10 @@ def verdict_lines(facts: Facts) -> list[str]:
     if baselines and facts.averaged:
         best = baselines[0]
         lower = best["change"] < 0
+        # The headline compares each output by itself, this line all outputs together.
         lines.append(
-            f"That is {percent(abs(best['change']))} {'lower' if lower else 'higher'} than the best baseline, "
-            f"{best['label']}{'' if lower else ': the network does not pay for itself here'}."
+            f"Over all outputs together its RMSE is {percent(abs(best['change']))} {'lower' if lower else 'higher'} "
+            f"than the best baseline, {best['label']}{'' if lower else ': the network does not pay for itself here'}."
         )
         won, both = recordings_won(facts, best["model"])
         if both:
