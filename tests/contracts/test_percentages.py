@@ -15,7 +15,6 @@ ROOMS = ("cli", "evaluation", "report", "stats", "workflows")
 FORMATTED = re.compile(r"\{[^{}]*:[^{}]*(?:%\}|[0-9]f\} ?%)")
 """A number that an f-string formats as a percentage by itself."""
 SETTINGS = {
-    "workflows/identify/identify.py": "shares that are settings of the fit, in notes of the machine file",
     "report/run/charts.py": "labels of axes and of coverages that are settings",
     "report/coverage/charts.py": "labels of cells under the pointer, most of which hold less than 0.1 %",
 }

@@ -62,7 +62,7 @@ def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
     options = ["--horizon", "5", "--set", "screen.trusted=['lever']", "--no-pictures"]
     ended = edp("screen", logs, "--out", out, *options, *QUICK)
     assert ended.code == 0, ended.err
-    assert "read: drive_0.csv" in ended.err
+    assert "read: log 1 of 4, drive_0.csv" in ended.err
     assert "screen: " in ended.err
     assert "Only some recordings hold extra: left out." in ended.out
     assert "leak of the future" in ended.out

@@ -92,7 +92,7 @@ def test_oil_that_was_not_learned_silences_them_and_is_said(source):
     rows = residuals_of(source, [hot])[0]
     assert np.isfinite(rows[:200]).all()
     assert np.isnan(rows[200:]).all()
-    assert "67%" in source.unlearned(hot)
+    assert "67 %" in source.unlearned(hot)
     assert "OilTemperature" in source.unlearned(hot)
     assert source.unlearned(recording) == ""
     # A thermometer that fails is no reason to be blind.
