@@ -1,4 +1,4 @@
-"""Options that commands share, their validation, and the settings that replaced former options."""
+"""Shared options of commands: declarations, validation, and former options with the settings that replace them."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[
 
 
 def workforce_of(workers: int, cluster: str, open_cluster: bool, usual: int = 1) -> Workforce:
-    """Return the workers that the options ask for.
+    """Return the workforce for the options of workers and cluster.
 
     Args:
         workers: as given.

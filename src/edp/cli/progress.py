@@ -113,7 +113,7 @@ class StageDisplay:
         self.display.show(self._path(), self._share() if counts else None, left, force=force)
 
     def _estimated(self) -> str:
-        """Return the time left, if the units so far tell it."""
+        """Return the time left, estimated from the complete units; an empty text before the first one."""
         if not self.display.counted or not self.done or self.total is None:
             return ""
         return left_text((time.monotonic() - self.began) / self.done * (self.total - self.done))
@@ -126,7 +126,11 @@ class StageDisplay:
             outer = outer.outer
 
     def _share(self, inner: float = 0.0) -> float:
-        """Return the completed fraction of the command; `inner` is that of the unit at work."""
+        """Return the completed fraction of the command.
+
+        Args:
+            inner: completed fraction of the current unit.
+        """
         share = inner if self.total is None else self.share + inner / max(1, self.total)
         return share if self.outer is None else self.outer._share(share)
 

@@ -73,7 +73,7 @@ def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str
 
 
 def with_budget(experiment: TwinExperiment, minutes: float) -> TwinExperiment:
-    """Return the settings with a bound on the processor time of a choice; unchanged where nothing is chosen.
+    """Return the settings with a bound on the processor time of an automatic choice; return other settings unchanged.
 
     Raises:
         ConfigError: the bound is out of range.

@@ -308,7 +308,7 @@ def _errors(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
 
 
 def _summary(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
-    """Return the errors over whole runs, those of the strokes at some times within them, and at their end."""
+    """Return errors over whole runs, and stroke errors at the given times and at the end of the runs."""
     end = runs.truth.shape[1] / runs.channels.rate_hz
     return {"runs": len(runs.names), **_errors(runs, (*(at for at in at_s if at < end), end))}
 

@@ -156,11 +156,11 @@ BEFORE_TUNING = ErrorVerdict(
 
 @dataclass(frozen=True)
 class ErrorRatios:
-    """Logarithms of the error of what is judged over that of one reference.
+    """Logarithms of error ratios between the evaluated model and one reference.
 
     Attributes:
-        label: how tables call the reference.
-        by_output: over all recordings, of each output: a value for each horizon or time that both have.
+        label: name of the reference in tables.
+        by_output: values over all recordings, one per horizon or time that both models have, for each output.
         by_recording: mean over outputs and times of each recording; see `by_recording`.
     """
 
@@ -170,7 +170,7 @@ class ErrorRatios:
 
 
 def by_recording(logs: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """Return the mean of each recording from the logarithms of its stretches.
+    """Return the mean logarithm of the error ratio of each recording.
 
     Args:
         logs: by recording, or by stretch of one, such as ``name[100:200]``; stretches share the day, the driver and
@@ -409,7 +409,7 @@ def free_run_error(scores: Mapping[str, Any], reference: Mapping[str, Any]) -> f
 
 
 def _free_run_errors(scores: Mapping[str, Any]) -> dict[str, dict[float, float]]:
-    """Of each actuator the error of its velocity (time 0), and of its stroke by time."""
+    """Return errors by actuator and time (s): the velocity error at time 0, stroke errors at later times."""
     rows = [(0.0, scores["velocity_mae"]), *((row["at_s"], row) for row in scores["stroke_error"])]
     columns = zip(*(row["by_channel"].values() for _, row in rows), strict=True)
     times = [at for at, _ in rows]

@@ -1,6 +1,6 @@
-"""Who does the work: this process, processes of this machine, or a Ray cluster; an executor a file.
+"""Executors of jobs, one per file: this process, a pool of local processes, or a Ray cluster.
 
-`edp search` gives them trainings, the commands of a fleet units of work (`edp.jobs.units`).
+`edp search` submits trainings, commands over a fleet submit units of work (`edp.jobs.units`).
 """
 
 from edp.jobs.base import EXECUTORS as EXECUTORS

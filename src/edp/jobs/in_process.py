@@ -10,7 +10,7 @@ from edp.storage.ledger import Record
 
 
 class InProcess(ClosedAtExit):
-    """Does a job when its end is asked for; see `edp.jobs.base.Executor`.
+    """Executor that runs a job in this process when its result is requested; see `edp.jobs.base.Executor`.
 
     Caps on time and memory, which only a second process could hold a job to, are those of the pools.
     """

@@ -15,7 +15,9 @@ from edp.errors import ConfigError
 from edp.progress import SILENT, Progress
 from edp.settings.bounds import check_bounds, integer
 from edp.storage import read_object, write_bytes, write_json
+from edp.storage.arrays import numbers_in
 from edp.storage.paths import is_file_at
+from edp.storage.reading import object_with
 from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.search.space import Real
@@ -100,8 +102,11 @@ def tune_gains(
     key = run_key(CONTROL_SETTINGS.plain(experiment) | sources | {"tuning": asdict(chosen)}, "")
     with Run.create(out, "tuning", key, control_toml(experiment)) as run:
         if run.is_finished:
-            content = read_object(run.file(RESULTS), ("gains", "controller"))
-            return Tuning(with_gains(experiment.controller, content["gains"]), content)
+            content = read_object(run.file(RESULTS), ("gains", "controller", "trials", "judged_mm"))
+            where = f"'{run.file(RESULTS)}', gains,"
+            gains = object_with(content["gains"], space, where)
+            values = {name: float(numbers_in(gains[name], where, ())) for name in space}
+            return Tuning(with_gains(experiment.controller, values), content)
         study = Study(
             {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
         )
@@ -141,7 +146,10 @@ def tune_gains(
 def _earlier_costs(run: Run) -> list[float]:
     """Return the costs (mm) of the trials that a stopped tuning made; its trials are the same in each call."""
     file = run.file(TRIALS)
-    return [float(cost) for cost in read_object(file, ("costs_mm",))["costs_mm"]] if is_file_at(file) else []
+    if not is_file_at(file):
+        return []
+    costs = numbers_in(read_object(file, ("costs_mm",))["costs_mm"], f"'{file}', costs_mm,")
+    return [float(cost) for cost in costs.ravel()]
 
 
 def with_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec:

@@ -30,6 +30,7 @@ from edp.signals import Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine, parse_machine
 from edp.storage import check_writable, read_object, write_bytes, write_json
+from edp.storage.arrays import numbers_in
 from edp.storage.headers import model_digest
 from edp.storage.paths import is_there
 from edp.storage.provenance import PROVENANCE
@@ -59,6 +60,7 @@ from edp.workflows.twin.prepare_twin import prepared_twin
 
 Doubles = NDArray[np.float64]
 KIND, RUN, RESULT, GREY_FOLDER = "identification", ".run", "identification.json", "grey"
+GREY_STAGE = "grey_box"
 OIL = "OilTemperature"
 FREEZING = 273.15
 LAST_STAGES = 2
@@ -171,6 +173,7 @@ def identify(
         spread = _stage(
             opened,
             "covariance",
+            {"covariance": (len(fit.theta), len(fit.theta))},
             lambda: {"covariance": covariance(fit.twin, fit.tie, fit.theta, data.train, settings.training.seed)},
         )["covariance"]
         machine_found, rows, doubts = _machine(fit, spread, data)
@@ -196,13 +199,32 @@ def identify(
     return Identified(written, rows, scores, notes)
 
 
-def _stage(run: Run, name: str, compute: Callable[[], Mapping[str, Doubles]]) -> dict[str, Doubles]:
-    """Return the arrays of a stage of the fit, which are computed once for a run."""
-    file = run.file(f"{name}.json")
-    if not is_there(file):
-        write_json(file, {key: np.asarray(values).tolist() for key, values in compute().items()})
+def _stage(
+    run: Run, name: str, shapes: Mapping[str, tuple[int, ...]], compute: Callable[[], Mapping[str, Doubles]]
+) -> dict[str, Doubles]:
+    """Return the arrays of a stage of the fit; compute them at the first call for a run.
+
+    Raises:
+        StorageError: the file of the stage is damaged.
+    """
+    if not is_there(_stage_file(run, name)):
+        _write_stage(run, name, compute())
     # Read back after the first computation, too, so that a continued run has the same bits.
-    return {key: np.array(values) for key, values in read_object(file).items()}
+    return _read_stage(run, name, shapes)
+
+
+def _stage_file(run: Run, name: str) -> Path:
+    return run.file(f"{name}.json")
+
+
+def _write_stage(run: Run, name: str, arrays: Mapping[str, Doubles]) -> None:
+    write_json(_stage_file(run, name), {key: np.asarray(values).tolist() for key, values in arrays.items()})
+
+
+def _read_stage(run: Run, name: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Doubles]:
+    file = _stage_file(run, name)
+    content = read_object(file, shapes)
+    return {key: numbers_in(content[key], f"'{file}', {key},", shape) for key, shape in shapes.items()}
 
 
 def _new_file(out: str | Path) -> Path:
@@ -272,17 +294,16 @@ def _fitted(
     begun = spec.start(channels, fit_scales(channels, data.train), data.train, seed)
     twin = GreyTwin(channels, begun.scales, spec, (begun.table, begun.wiring), begun.numbers, full)
 
-    def fit() -> dict[str, Doubles]:
+    if not is_there(_stage_file(run, GREY_STAGE)):
         progress.note("fitting a grey box to free runs")
         fitted = fit_grey_box(twin, data.train, data.validation, seed, free_run_steps(progress))
         save_twin(TwinBundle(fitted.twin.spec, fitted.twin), run.file(GREY_FOLDER))
-        return {"information": fitted.information}
-
-    information = _stage(run, "grey_box", fit)["information"]
+        _write_stage(run, GREY_STAGE, {"information": fitted.information})
     grey = load_twin(run.file(GREY_FOLDER)).twin
     if not isinstance(grey, GreyTwin):
         raise StorageError(f"'{run.file(GREY_FOLDER)}' holds no grey box; remove '{run.path}' and start again")
-    return _Fitted(grey, elements, information)
+    count = len(grey.numbers)
+    return _Fitted(grey, elements, _read_stage(run, GREY_STAGE, {"information": (count, count)})["information"])
 
 
 def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
@@ -320,7 +341,8 @@ def _refined(
         )
         return {"theta": result.theta, "information": result.information}
 
-    stage = _stage(run, "machine", refine)
+    count = len(tie.begin)
+    stage = _stage(run, "machine", {"theta": (count,), "information": (count, count)}, refine)
     every = replace(twin.spec, fit=fit)
     end = GreyTwin(twin.channels, twin.scales, every, (twin.table, twin.wiring), tie.numbers(stage["theta"]), twin.full)
     return _Tied(end, tie, stage["theta"], stage["information"])

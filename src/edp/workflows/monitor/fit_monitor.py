@@ -34,6 +34,7 @@ from edp.storage import write_json
 from edp.storage.headers import model_digest
 from edp.storage.paths import is_there
 from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.reading import object_with
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
 from edp.training.bundle import Bundle, load_bundle
@@ -128,7 +129,7 @@ def fit_monitor(
 def _read_fitted(folder: Path, experiment: MonitorExperiment) -> FittedMonitor:
     """Return the monitor of a finished run."""
     monitor = load_monitor(folder)
-    provenance = monitor.provenance
+    provenance = object_with(monitor.provenance, ("doubtful", "seconds"), f"monitor '{folder}', its provenance,")
     alone = _fits_one_machine(experiment, monitor.sources)
     doubtful, seconds = tuple(provenance["doubtful"]), provenance["seconds"]
     return FittedMonitor(monitor, doubtful, seconds, folder, one_machine=alone, is_read=True)
