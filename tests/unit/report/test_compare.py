@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from browser import check_page, page_faults
+from page_text import check_text
 from safetensors.numpy import load_file, save_file
 from typer.testing import CliRunner
 
@@ -251,6 +252,10 @@ def test_costs_of_all_runs_are_listed(pair):
     sheet = model_sheet(compare_runs(pair))
     assert [column.heading for column in sheet.columns][:3] == ["Run", "Model", "Parameters"]
     assert sheet.texts()[0][2] == "41,283"
+
+
+def test_the_text_of_the_page(pair):
+    check_text(render(compare_runs(pair)), "compare")
 
 
 @pytest.mark.processes

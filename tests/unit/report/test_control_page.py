@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.recording import Recording
 from edp.report.animation.page import scene_of
@@ -93,6 +94,10 @@ def test_names_stay_text(facts):
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert 'id="front"' in page
     assert "http://" not in page.split("<script>")[0]
+
+
+def test_the_text_of_the_page(facts):
+    check_text(render(facts), "control")
 
 
 @pytest.mark.processes

@@ -2,9 +2,10 @@
 
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.report.fleet.facts import fleet_facts
-from edp.report.fleet.page import write_fleet_page
+from edp.report.fleet.page import render, write_fleet_page
 
 NAMES = [f"machine_of_the_customer_with_a_long_name_{number:02d}" for number in range(12)]
 
@@ -26,6 +27,10 @@ def content() -> dict[str, object]:
         "horizon": 10, "rate_hz": 100.0, "store": "fleet", "deltas": None, "monitor": None, "edp": "1",
         "network": {"label": "a network", "path": "runs/a", "weights": "0123"},
     }  # fmt: skip
+
+
+def test_the_text_of_the_page():
+    check_text(render(fleet_facts(content(), "rigs")), "fleet")
 
 
 @pytest.mark.processes

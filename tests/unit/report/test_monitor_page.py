@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.monitor.diagnosis.causes import Cause
 from edp.monitor.diagnosis.structure import Confusion
@@ -124,6 +125,10 @@ def test_times_of_day_are_shown_where_the_start_is_known(facts):
     monday = timeline(facts.traces.recordings[0], facts)
     assert any(label.text == "13:58:10" for label in monday.labels)
     assert any(label.text == "0:00:00" for label in overview(facts).labels)
+
+
+def test_the_text_of_the_page(facts):
+    check_text(render(facts), "monitor")
 
 
 @pytest.mark.processes

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.data.coverage import cover
 from edp.data.splits import ByTime
@@ -92,6 +93,11 @@ def test_the_sentence_says_what_there_is():
     assert any("cells were visited" in line for line in verdict(found))
     bare = cover([machine_like(names=("CylVels_1",), samples=50)])
     assert headline(bare).endswith("of the stroke.")
+
+
+def test_the_text_of_the_page():
+    recording = machine_like()
+    check_text(render_coverage(cover([recording], split=ByTime().split([recording], 10)), "data"), "coverage")
 
 
 @pytest.mark.processes

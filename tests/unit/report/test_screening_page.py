@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.data.screening import (
     ChannelVerdict,
@@ -199,6 +200,10 @@ def test_nothing_but_a_proposal_is_a_page_too():
     text = render_screening(bare, "bare")
     assert 'id="flags"' not in text
     assert 'id="clusters"' not in text
+
+
+def test_the_text_of_the_page():
+    check_text(render_screening(screening(), "data", None, TRIALS, ["A note."]), "screening")
 
 
 @pytest.mark.processes

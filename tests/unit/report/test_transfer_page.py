@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 from safetensors.numpy import save_file
 
 from edp.errors import StorageError
@@ -155,6 +156,11 @@ def test_what_cannot_be_read_is_refused(folder, spoil, reason):
     spoil(place)
     with pytest.raises(StorageError, match=reason):
         read_transfer(place)
+
+
+def test_the_text_of_the_page(folder):
+    page = write_transfer_page(folder(content()), pictures=False)
+    check_text(page.read_text(encoding="utf-8").replace(page.parent.name, "logs"), "transfer")
 
 
 @pytest.mark.processes

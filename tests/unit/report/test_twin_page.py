@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 from safetensors.numpy import save
 
 from edp.data.twin_channels import TwinChannels
@@ -182,6 +183,10 @@ def test_damaged_runs_are_refused(folder):
     (folder / "free_runs.safetensors").write_bytes(save({"seconds": np.zeros(1, np.float32)}))
     with pytest.raises(StorageError, match="does not fit its scores: 'seconds'"):
         read_free_runs(folder)
+
+
+def test_the_text_of_the_page():
+    check_text(render(facts_of(), "m22"), "twin")
 
 
 @pytest.mark.processes

@@ -7,6 +7,7 @@ import random
 
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.errors import EdpError, StorageError
 from edp.report import write_study_page
@@ -302,6 +303,15 @@ def damage(value, rng):
         else:
             value[key] = rng.choice([None, "odd", -1, [], {}, 1e300, True])
         return
+
+
+@pytest.mark.parametrize("mode", ["sound", "thesis"])
+def test_the_text_of_the_page(request, mode):
+    check_text(page_of(request.getfixturevalue(mode)), f"study_{mode}")
+
+
+def test_the_text_of_the_page_of_an_unfinished_study(sound, unfinished):
+    check_text(page_of(unfinished(sound, "screening")), "study_unfinished")
 
 
 @pytest.mark.processes
