@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edp.report.common.picture import NOT_XML, write_drawings
-from edp.report.common.sheets import Column, Sheet
 from edp.report.common.templates import template
 from edp.report.run.page import script_json
+from edp.table import Column, Table
 from edp.wording import in_cell, in_markdown, printable
 
 HOSTILE = [
@@ -39,7 +39,7 @@ HOSTILE = [
 
 def sheet(name):
     columns = (Column(name), Column("value", "mm/s"))
-    return Sheet("table", name, columns, ((name, 1.5), (name, -2.5), (None, None)), frozenset({0}))
+    return Table(name, columns, ((name, 1.5), (name, -2.5), (None, None)), frozenset({0}), name="table")
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -131,7 +131,7 @@ def test_unknown_keys_are_ignored_and_unscored_metrics_are_dashes(run_folder):
     scores["models"]["persistence"]["overall"]["10"]["mean"]["r2"] = None
     write_json(run_folder / "scores.json", scores)
     table = context(read_facts(run_folder))["comparisons"][0]
-    r2 = [heading for heading, _ in table.columns].index("R²")
+    r2 = [column.heading for column in table.columns].index("R²")
     assert next(row for row in table.rows if row[0] == "Persistence")[r2] == "–"
 
 

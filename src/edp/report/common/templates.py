@@ -8,6 +8,7 @@ from importlib import resources
 from typing import TYPE_CHECKING
 
 from edp.errors import count_of
+from edp.wording import unit_text
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
@@ -49,5 +50,6 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["themed"] = themed
+    environment.filters["unit_text"] = unit_text
     environment.globals["count_of"] = count_of
     return environment

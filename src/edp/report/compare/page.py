@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from edp.report.common.sheets import Column, Sheet, Value, chance, figures
 from edp.report.common.templates import template
 from edp.report.compare.charts import compare_charts
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import Measure
 from edp.report.run.page import shown
 from edp.storage import write_bytes
+from edp.table import Column, Table, Value, chance, figures
 from edp.wording import count_text, number, percent, unbroken
 
 
@@ -39,14 +39,14 @@ def render(comparison: Comparison, title: str = "") -> str:
         headline=unbroken(comparison.headline()),
         remarks=comparison.remarks,
         tiles=tiles,
-        tables=[error_sheet(comparison, one).table() for one in comparison.measures],
-        recordings=recording_sheet(comparison, measure).table(),
-        models=model_sheet(comparison).table(),
+        tables=[error_sheet(comparison, one) for one in comparison.measures],
+        recordings=recording_sheet(comparison, measure),
+        models=model_sheet(comparison),
         **shown(compare_charts(comparison)),
     )
 
 
-def error_sheet(comparison: Comparison, measure: Measure) -> Sheet:
+def error_sheet(comparison: Comparison, measure: Measure) -> Table:
     """Each run's error and its paired difference from the first run."""
     differences = comparison.differences(measure)
     rows: list[tuple[Value, ...]] = []
@@ -68,10 +68,10 @@ def error_sheet(comparison: Comparison, measure: Measure) -> Sheet:
         Column("p", "Holm", chance),
         Column("Better on"),
     )
-    return Sheet("errors", measure.text(), columns, tuple(rows))
+    return Table(measure.text(), columns, tuple(rows), name="errors")
 
 
-def recording_sheet(comparison: Comparison, measure: Measure) -> Sheet:
+def recording_sheet(comparison: Comparison, measure: Measure) -> Table:
     """Each run's error on each common recording."""
     errors = {run.name: comparison.errors(run, measure).tolist() for run in comparison.runs}
     rows = tuple(
@@ -79,14 +79,14 @@ def recording_sheet(comparison: Comparison, measure: Measure) -> Sheet:
     )
     show = figures(value for values in errors.values() for value in values)
     columns = (Column("Recording"), *(Column(run.name, measure.unit, show) for run in comparison.runs))
-    return Sheet("recordings", measure.text(), columns, rows)
+    return Table(measure.text(), columns, rows, name="recordings")
 
 
-def model_sheet(comparison: Comparison) -> Sheet:
+def model_sheet(comparison: Comparison) -> Table:
     """What each run is, and what it takes."""
     costs = list(dict.fromkeys(cost for run in comparison.runs for cost in run.costs))
     rows = tuple(
         (run.name, run.label, *(count_text(run.costs[cost]) if cost in run.costs else None for cost in costs))
         for run in comparison.runs
     )
-    return Sheet("models", "Models", (Column("Run"), Column("Model"), *map(Column, costs)), rows)
+    return Table("Models", (Column("Run"), Column("Model"), *map(Column, costs)), rows, name="models")

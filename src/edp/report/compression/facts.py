@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError, count_of
-from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.storage import read_json
 from edp.storage.paths import is_file_at
+from edp.table import Column, Table, Value, figures
 from edp.wording import listed, number, percent
 
 RESULT, SCHEMA = "compression.json", 2
@@ -89,7 +89,7 @@ def read_compression(folder: str | Path) -> CompressionFacts:
     return CompressionFacts(content, Path(folder))
 
 
-def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
+def table_sheet(facts: CompressionFacts, horizon: str) -> Table:
     """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
     teacher = facts.mae(facts.content["teacher"], horizon)
     rows: list[tuple[Value, ...]] = []
@@ -125,10 +125,10 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
         Column("Budget"),
     )
     caption = f"{facts.ahead(horizon)}, validation part"
-    return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(facts.content["front"]))
+    return Table(caption, columns, tuple(rows), frozenset(facts.content["front"]), name=f"k{horizon}")
 
 
-def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
+def held_out_sheet(facts: CompressionFacts) -> Table | None:
     """Teacher and chosen on the sealed test set."""
     scores = facts.content["held_out_test"].get("scores")
     if not scores:
@@ -148,7 +148,7 @@ def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
         Column("Composite, teacher", unit, figures([row[4] for row in rows])),
         Column("Composite, chosen", unit, figures([row[5] for row in rows])),
     )
-    return Sheet("held_out_test", "On recordings that took part in no choice", columns, tuple(rows))
+    return Table("On recordings that took part in no choice", columns, tuple(rows), name="held_out_test")
 
 
 def headline(facts: CompressionFacts) -> str:

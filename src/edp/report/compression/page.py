@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.report.common.picture import write_pictures
-from edp.report.common.sheets import Sheet, write_sheets
+from edp.report.common.tables import write_tables
 from edp.report.common.templates import template
 from edp.report.compression import facts as words
 from edp.report.compression.charts import compression_charts
@@ -14,6 +14,7 @@ from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.run.page import shown
 from edp.storage import write_bytes
 from edp.storage.paths import full_path
+from edp.table import Table
 from edp.wording import unbroken
 
 
@@ -30,13 +31,13 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
     tables = sheets(facts)
     page = facts.folder / "report.html"
     write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
-    write_sheets(facts.folder / "tables", tables)
+    write_tables(facts.folder / "tables", tables)
     if pictures:
         write_pictures(facts.folder / "pictures", compression_charts(facts))
     return page
 
 
-def sheets(facts: CompressionFacts) -> list[Sheet]:
+def sheets(facts: CompressionFacts) -> list[Table]:
     """A table a horizon, longest first, and that of the sealed test set."""
     held_out = words.held_out_sheet(facts)
     return [
@@ -45,7 +46,7 @@ def sheets(facts: CompressionFacts) -> list[Sheet]:
     ]
 
 
-def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
+def render(facts: CompressionFacts, tables: list[Table]) -> str:
     """The page's text."""
     context: dict[str, Any] = {
         "title": full_path(facts.folder).name,
@@ -53,8 +54,8 @@ def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
         "verdict": words.verdict(facts),
         "tiles": words.tiles(facts),
         "caveats": words.caveats(facts),
-        "tables": [sheet.table() for sheet in tables if sheet.name != "held_out_test"],
-        "held_out": next((sheet.table() for sheet in tables if sheet.name == "held_out_test"), None),
+        "tables": [sheet for sheet in tables if sheet.name != "held_out_test"],
+        "held_out": next((sheet for sheet in tables if sheet.name == "held_out_test"), None),
         "opened": facts.content["held_out_test"].get("opened", ""),
         "budget": facts.content["budget"],
         **shown(compression_charts(facts)),

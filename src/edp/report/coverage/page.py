@@ -10,12 +10,12 @@ from edp.data.coverage_targets import BEYOND, OCCUPANCY, wanted
 from edp.data.spectrum import FLAT_DB
 from edp.errors import count_of
 from edp.logs import DataQuality
-from edp.report.common.tables import TextTable
 from edp.report.common.templates import template
 from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
 from edp.storage import write_bytes
+from edp.table import Column, Table
 from edp.wording import MISSING, count_text, figure, listed, number, percent, unbroken
 
 
@@ -117,7 +117,7 @@ def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def wanted_table(coverage: Coverage) -> TextTable | None:
+def wanted_table(coverage: Coverage) -> Table | None:
     """Figures beside what is wanted of them."""
     rows = tuple(
         (
@@ -128,49 +128,54 @@ def wanted_table(coverage: Coverage) -> TextTable | None:
         )
         for w in wanted(coverage)
     )
-    columns = (("Figure", ""), ("Here", ""), ("Wanted", ""), ("Verdict", ""))
-    return TextTable("Wanted of data to learn a machine from", columns, rows) if rows else None
+    columns = (Column("Figure"), Column("Here"), Column("Wanted"), Column("Verdict"))
+    return Table("Wanted of data to learn a machine from", columns, rows) if rows else None
 
 
-def activity_table(coverage: Coverage) -> TextTable | None:
+def activity_table(coverage: Coverage) -> Table | None:
     """Commands by axis."""
     rows = tuple(
         (axis.axis, count_text(axis.reversals), count_text(axis.crossings), percent(axis.active))
         for axis in coverage.activity
         if axis.reversals is not None
     )
-    columns = (("Axis", ""), ("Reversals", ""), ("Left the dead band", "times"), ("Commanded", "of the time"))
-    return TextTable("Commands", columns, rows) if rows else None
+    columns = (
+        Column("Axis"),
+        Column("Reversals"),
+        Column("Left the dead band", "times"),
+        Column("Commanded", "of the time"),
+    )
+    return Table("Commands", columns, rows) if rows else None
 
 
-def together_table(coverage: Coverage) -> TextTable | None:
+def together_table(coverage: Coverage) -> Table | None:
     """Axes in use at once."""
     rows = tuple((_first_up(name), percent(share)) for name, share in coverage.together.items())
-    return TextTable("In use at once", (("Commanded", ""), ("Share", "of the time")), rows) if rows else None
+    return Table("In use at once", (Column("Commanded"), Column("Share", "of the time")), rows) if rows else None
 
 
-def events_table(coverage: Coverage) -> TextTable | None:
+def events_table(coverage: Coverage) -> Table | None:
     """Return the events in the recordings; None if the channels cannot show events."""
     rows = tuple(
         (_first_up(event.name), count_text(event.count), percent(event.share), event.note or "recorded")
         for event in coverage.events
         if event.count is not None
     )
-    columns = (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", ""))
-    return TextTable("How often", columns, rows) if rows else None
+    columns = (Column("Event"), Column("Count"), Column("Share", "of the time"), Column("Source"))
+    return Table("How often", columns, rows) if rows else None
 
 
-def joints_table(coverage: Coverage) -> TextTable | None:
+def joints_table(coverage: Coverage) -> Table | None:
     """Joint histograms in figures."""
     rows = tuple(
         (f"{j.x} and {j.y}", percent(j.filled), number(j.correlation, 2), number(j.information, 2))
         for j in coverage.joints
     )
-    columns = (("Signals", ""), ("Bins filled", ""), ("Correlation", ""), ("Mutual information", "nat"))
-    return TextTable("Joint histograms in figures", columns, rows) if rows else None
+    columns = (Column("Signals"), Column("Bins filled"), Column("Correlation"), Column("Mutual information", "nat"))
+    return Table("Joint histograms in figures", columns, rows) if rows else None
 
 
-def distance_table(coverage: Coverage) -> TextTable | None:
+def distance_table(coverage: Coverage) -> Table | None:
     """Distance from tests to training beside that within training."""
     far = coverage.distance
     if far is None:
@@ -179,8 +184,13 @@ def distance_table(coverage: Coverage) -> TextTable | None:
         ("From test to training", number(far.test[0], 2), number(far.test[1], 2), percent(far.beyond)),
         ("Within training", number(far.train[0], 2), number(far.train[1], 2), percent(0.05)),
     )
-    columns = (("Nearest neighbour", ""), ("Median", ""), ("95 % quantile", ""), ("Beyond 95 % of training", ""))
-    return TextTable(f"Distance in deviations of {far.signals} signals", columns, rows)
+    columns = (
+        Column("Nearest neighbour"),
+        Column("Median"),
+        Column("95 % quantile"),
+        Column("Beyond 95 % of training"),
+    )
+    return Table(f"Distance in deviations of {far.signals} signals", columns, rows)
 
 
 def _first_up(text: str) -> str:

@@ -35,9 +35,9 @@ def render(facts: FleetFacts) -> str:
         headline=unbroken(headline(facts)),
         verdict=verdict(facts),
         tiles=tiles(facts),
-        worst=worst_sheet(facts).table() if facts.rows else None,
-        machines=machine_sheet(facts).table() if facts.rows else None,
-        failed=failed_sheet(facts).table() if facts.failed else None,
+        worst=worst_sheet(facts) if facts.rows else None,
+        machines=machine_sheet(facts) if facts.rows else None,
+        failed=failed_sheet(facts) if facts.failed else None,
         provenance=[
             ("Network", f"{network['path']} ({network['weights']})"),
             ("Store", facts.content["store"]),

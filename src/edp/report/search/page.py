@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from edp.report.common.picture import write_pictures
-from edp.report.common.sheets import Sheet
 from edp.report.common.templates import template
 from edp.report.run.page import shown
 from edp.report.search import words as words
@@ -16,6 +15,7 @@ from edp.report.search.charts import study_charts
 from edp.report.search.facts import StudyFacts, facts_of, reading
 from edp.report.search.tables import sheets
 from edp.storage import make_folder, write_bytes
+from edp.table import Table
 from edp.wording import in_markdown, number, unbroken
 
 SCORE = "The composite score is 0.40 MAE + 0.15 RMSE + 0.25 P95 + 0.20 P99, mean over sessions and outputs."
@@ -65,12 +65,12 @@ def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool =
     return StudyReport(target, document, tuple(table_files), tuple(drawn))
 
 
-def _contents(facts: StudyFacts) -> tuple[str, str, dict[str, Sheet]]:
+def _contents(facts: StudyFacts) -> tuple[str, str, dict[str, Table]]:
     tables = sheets(facts)
     return render_study(facts, tables), study_text(facts, tables), tables
 
 
-def render_study(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
+def render_study(study: StudyFacts, tables: Mapping[str, Table]) -> str:
     """The page's text."""
     context: dict[str, Any] = {
         "title": study.title,
@@ -84,7 +84,7 @@ def render_study(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
         "study": study,
         "score": SCORE,
         **shown(study_charts(study)),
-        "tables": {name: sheet.table() for name, sheet in tables.items()},
+        "tables": tables,
         "settings": words.settings(study),
     }
     return template("study.html.jinja").render(**context)
@@ -95,7 +95,7 @@ def _about(study: StudyFacts) -> str:
     return f"{study.mode} mode · preset {study.preset} · {study.data['sessions']} sessions, {hours} h · {study.state}"
 
 
-def study_text(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
+def study_text(study: StudyFacts, tables: Mapping[str, Table]) -> str:
     """The report as Markdown: what came out, what was decided and why, what it can show, and the tables."""
     lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_about(study))}.", ""]
     lines += [in_markdown(words.headline(study)), "", in_markdown(" ".join(words.verdict(study))), ""]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from edp.report.common.sheets import Column, Sheet, figures
 from edp.report.search.facts import StudyFacts, of_phase, real
+from edp.table import Column, Table, figures
 from edp.wording import number, percent
 
 
 @of_phase("compression", None)
-def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Every network in every number format: what it takes, its error, and whether it fits; the front is marked."""
     rows = tuple(
         (
@@ -42,7 +42,7 @@ def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
         Column("Budget"),
     )
     caption = "Smaller networks of the teacher on development sessions that do not train; marked: the front"
-    return Sheet("compression", caption, columns, rows, frozenset(map(int, facts.get("front", ()))))
+    return Table(caption, columns, rows, frozenset(map(int, facts.get("front", ()))), name="compression")
 
 
 def _mean(scores: Mapping[str, Mapping[str, Any]], name: str) -> float:

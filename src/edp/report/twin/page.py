@@ -51,7 +51,7 @@ def render(facts: FreeRunFacts, title: str | None = None) -> str:
         "headline": unbroken(words.headline(facts)),
         "verdict": words.verdict(facts),
         "tiles": words.tiles(facts),
-        "sheets": {name: sheet.table() for name, sheet in words.sheets_of(facts).items()},
+        "sheets": words.sheets_of(facts),
         "moments": facts.steps.get("moments", 0),
         "provenance": provenance_rows(facts.provenance),
         "parts": [part for part in words.PARTS if f"runs_{part}" in figures["plots"]],

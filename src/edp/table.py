@@ -1,4 +1,4 @@
-"""Tables that keep their values: as text on a page, as Markdown for documents, as CSV for other programs."""
+"""Tables of results: one class that pages, notebooks, documents, CSV files and the terminal show."""
 
 from __future__ import annotations
 
@@ -6,12 +6,8 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
-from edp.report.common.chart import with_unit
-from edp.report.common.tables import TextTable
-from edp.storage import make_folder, write_bytes
 from edp.wording import MISSING, decimals_for, in_cell, in_markdown, number, unit_text
 
 Value = float | int | str | None
@@ -19,12 +15,18 @@ Show = Callable[[Value], str]
 
 
 def plainly(value: Value) -> str:
-    """Text as it is, a dash where there is none."""
+    """Return a value as text, a dash for None and for empty text."""
     return MISSING if value is None or value == "" else str(value)
 
 
 def figures(values: Iterable[Value], signed: bool = False, decimals: int | None = None) -> Show:
-    """Numbers of one column with one precision."""
+    """Return a function that shows the numbers of one column with one precision.
+
+    Args:
+        values: the column, whose smallest number sets the decimals.
+        signed: whether positive numbers have a sign.
+        decimals: fixed decimals instead.
+    """
     numbers = [value for value in values if isinstance(value, int | float)]
     places = decimals_for(numbers) if decimals is None else decimals
 
@@ -35,7 +37,7 @@ def figures(values: Iterable[Value], signed: bool = False, decimals: int | None 
 
 
 def chance(value: Value) -> str:
-    """A p-value: three decimals, and what is smaller as a bound."""
+    """Return a p-value with three decimals; values close to zero or one are shown as a bound."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         return plainly(value if isinstance(value, str) else None)
     # A p-value of zero or one would claim certainty that no test has.
@@ -50,66 +52,65 @@ class Column:
     unit: str = ""
     show: Show = plainly
 
+    def head(self) -> str:
+        """Return the heading with its unit in brackets."""
+        unit = unit_text(self.unit)
+        return f"{self.heading} [{unit}]" if unit else self.heading
+
 
 @dataclass(frozen=True)
-class Sheet:
-    """A table.
+class Table:
+    """Rows of values under columns; the first column is the name of the row.
 
     Attributes:
-        name: of its file.
-        caption: above it.
-        columns: of each row.
+        caption: above the table.
+        columns: one for each value of a row.
         rows: values; None where there is none.
         marked: places of rows that stand out.
+        name: of the table's files.
+        is_text: whether cells are sentences, which are aligned left and wrapped, and not figures.
     """
 
-    name: str
     caption: str
     columns: tuple[Column, ...]
     rows: tuple[tuple[Value, ...], ...]
     marked: frozenset[int] = frozenset()
-
-    def texts(self) -> tuple[tuple[str, ...], ...]:
-        """Cells as a reader sees them."""
-        return tuple(tuple(column.show(value) for column, value in zip(self.columns, row)) for row in self.rows)
-
-    def table(self) -> TextTable:
-        """For a page."""
-        columns = tuple((column.heading, unit_text(column.unit)) for column in self.columns)
-        return TextTable(self.caption, columns, self.texts(), self.marked)
+    name: str = ""
+    is_text: bool = False
 
     def heads(self) -> list[str]:
-        """Headings, each with its unit."""
-        return [with_unit(c.heading, c.unit) for c in self.columns]
+        """Return the headings, each with its unit."""
+        return [column.head() for column in self.columns]
+
+    def texts(self) -> tuple[tuple[str, ...], ...]:
+        """Return the cells as a reader sees them."""
+        return tuple(tuple(column.show(value) for column, value in zip(self.columns, row)) for row in self.rows)
+
+    def without_empty_columns(self) -> Table:
+        """Return the table without columns that are empty in every row, such as pressures of a machine without them."""
+        texts = self.texts()
+        filled = [i for i in range(len(self.columns)) if not i or any(row[i] != MISSING for row in texts)]
+        if not self.rows or len(filled) == len(self.columns):
+            return self
+        rows = tuple(tuple(row[i] for i in filled) for row in self.rows)
+        return replace(self, columns=tuple(self.columns[i] for i in filled), rows=rows)
 
     def markdown(self) -> str:
-        """For a document: the caption and a table; what stands out is bold."""
-        heads = [_piped(head) for head in self.heads()]
-        lines = [f"**{_piped(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
+        """Return the caption and the table as Markdown; marked rows are bold."""
+        heads = [_in_row(head) for head in self.heads()]
+        lines = [f"**{_in_row(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
         for row, cells in enumerate(self.texts()):
             bold = row in self.marked
-            lines.append(_row([f"**{_piped(c)}**" if bold and c != MISSING else _piped(c) for c in cells]))
+            lines.append(_row([f"**{_in_row(c)}**" if bold and c != MISSING else _in_row(c) for c in cells]))
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
-        """For other programs: full precision, empty where there is no value; text is text to a spreadsheet, too."""
+        """Return the table as CSV with full precision; cells without a value are empty, and text is no formula."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(map(in_cell, self.heads()))
         writer.writerows([_cell(value) for value in row] for row in self.rows)
         return stream.getvalue()
-
-
-def write_sheets(folder: Path, sheets: Iterable[Sheet]) -> None:
-    """Write each table as ``<name>.csv`` and ``<name>.md``.
-
-    Raises:
-        StorageError: a file cannot be written.
-    """
-    for sheet in sheets:
-        stem = make_folder(folder) / sheet.name
-        write_bytes(stem.with_suffix(".csv"), sheet.csv().encode("utf-8", "replace"))
-        write_bytes(stem.with_suffix(".md"), sheet.markdown().encode("utf-8", "replace"))
 
 
 def _cell(value: Value) -> Value:
@@ -120,7 +121,7 @@ def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _piped(text: str) -> str:
-    """Text that ends no cell, starts no element and stays on its line."""
+def _in_row(text: str) -> str:
+    """Return a text that ends no cell, starts no element and stays on its line."""
     flat = text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
     return in_markdown(flat)

@@ -1,0 +1,226 @@
+"""Tables and key figures of a run's page; the network's row is marked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from edp.errors import count_of
+from edp.evaluation.guard import MEASURE, MEASURE_NAME
+from edp.report.run.facts import NETWORK, Facts, budget_rows, comparison_rows, horizon_text, label_of, main_horizon
+from edp.report.run.figures import recording_errors
+from edp.table import Column, Table
+from edp.wording import MISSING, count_text, decimals_for, duration, number, percent, unit_text
+
+_TILES = 3
+"""Outputs that have a tile of their own where they have no common unit."""
+
+
+def comparison_tables(facts: Facts) -> list[Table]:
+    """Metrics of every model, one table per horizon, the headline's horizon first.
+
+    Means over outputs where they have one unit, else the error of each output.
+    """
+    order = sorted(facts.horizons, key=lambda k: (k != main_horizon(facts), k))
+    if not facts.averaged:
+        return [table for horizon in order if (table := _by_output(facts, horizon)) is not None]
+    return [table for table in (_comparison(facts, horizon) for horizon in order) if table.rows]
+
+
+def _comparison(facts: Facts, horizon: int) -> Table:
+    rows = comparison_rows(facts, horizon)
+    unit = facts.unit
+    shown = [metric for metric in ("rmse", "mae", "p95", "p99", "composite") if _any(rows, metric)]
+    places = {metric: decimals_for(row[metric] for row in rows) for metric in shown}
+    names = {"mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99", "composite": "Composite"}
+    with_bias, with_r2, with_time = _any(rows, "bias"), _any(rows, "r2"), _any(rows, "seconds")
+    columns = [Column("Model"), *(Column(names[metric], unit) for metric in shown)]
+    columns += [Column("Bias", unit)] * with_bias + [Column("R²")] * with_r2
+    columns += [Column("Network relative to it", MEASURE_NAME)] + [Column("Fitted in")] * with_time
+    lines = []
+    for row in rows:
+        cells = [row["label"], *(number(row[metric], places[metric]) for metric in shown)]
+        cells += [number(row["bias"], places["mae"], signed=True)] * with_bias
+        cells += [number(row["r2"], 4)] * with_r2
+        cells += [percent(row["change"], signed=True)]
+        cells += [duration(row["seconds"])] * with_time
+        lines.append(tuple(cells))
+    marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
+    return Table(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
+
+
+def _any(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
+    return any(row[key] is not None for row in rows)
+
+
+def output_table(facts: Facts) -> Table | None:
+    """Error by output at the longest horizon; None where `comparison_tables` shows it already."""
+    return _by_output(facts, main_horizon(facts)) if facts.averaged else None
+
+
+def _by_output(facts: Facts, horizon: int | None) -> Table | None:
+    rows = comparison_rows(facts, horizon)
+    if horizon is None or not rows or len(facts.targets) < 2:
+        return None
+    names = [target.name for target in facts.targets]
+    places = {name: decimals_for(row["outputs"][name] for row in rows) for name in names}
+    lines = tuple((row["label"], *(number(row["outputs"][name], places[name]) for name in names)) for row in rows)
+    units = [unit_text(target.unit) for target in facts.targets]
+    columns = (Column("Model"), *(Column(target.description, unit) for target, unit in zip(facts.targets, units)))
+    marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
+    return Table(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
+
+
+def interval_table(facts: Facts) -> Table | None:
+    """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
+    intervals = facts.models.get(NETWORK, {}).get("intervals", {})
+    rows = [(k, row) for k in facts.horizons for row in intervals.get(str(k), ())]
+    if not rows:
+        return None
+    places = decimals_for(row["width"]["mean"] for _, row in rows)
+    lines = tuple(
+        (
+            f"{horizon_text(facts, k)} ahead",
+            percent(row["coverage"]),
+            percent(row["covered"]["mean"]),
+            number(row["width"]["mean"], places),
+        )
+        for k, row in rows
+    )
+    columns = (Column("Interval"), Column("Meant to hold"), Column("Holds"), Column("Mean width", facts.unit))
+    caption = "The network's intervals: share of the truth inside, mean over outputs"
+    scores = facts.models[NETWORK].get("weighted_interval_score", {})
+    if scores:
+        listed = ", ".join(
+            f"{number(scores[str(k)]['mean'], places)} {facts.unit} {horizon_text(facts, k)} ahead".replace("  ", " ")
+            for k in facts.horizons
+            if str(k) in scores
+        )
+        caption += f"; weighted interval score (a point's is its MAE) {listed}"
+    return Table(caption, columns, lines)
+
+
+def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
+    """The recordings on which the network does worst, worst first."""
+    horizon = main_horizon(facts)
+    if horizon is None or NETWORK not in facts.models:
+        return None
+    order, errors = recording_errors(facts, horizon)
+    if not order:
+        return None
+    models = [name for name in facts.models if name in errors]
+    places = decimals_for(errors[NETWORK]) if NETWORK in errors else 2
+    picked = list(range(len(order)))[::-1][:most]
+    lines = tuple((order[i], *(number(errors[name][i], places) for name in models)) for i in picked)
+    columns = (Column("Recording"), *(Column(label_of(facts, name), facts.unit) for name in models))
+    return Table(
+        f"The {count_of(len(picked), 'hardest recording')}, {horizon_text(facts, horizon)} ahead", columns, lines
+    )
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the budget: how much of it is used."""
+
+    what: str
+    value: str
+    limit: str
+    unit: str
+    share: float | None
+    fits: bool
+    note: str
+
+    @property
+    def share_text(self) -> str:
+        """The share used, as a percentage."""
+        return percent(self.share)
+
+
+def budget_checks(facts: Facts) -> list[Check]:
+    """The footprint against each limit of the budget."""
+    checks = []
+    for row in budget_rows(facts.footprint):
+        value, limit = row.get("value"), row.get("limit")
+        # No share of a limit that is zero or unknown.
+        share = value / limit if value is not None and limit else None
+        checks.append(
+            Check(
+                str(row["what"]),
+                _amount(value),
+                _amount(limit),
+                str(row.get("unit") or ""),
+                share,
+                bool(row["fits"]),
+                str(row.get("note") or ""),
+            )
+        )
+    return checks
+
+
+def _amount(value: float | None) -> str:
+    return count_text(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
+
+
+def parts_table(facts: Facts) -> Table | None:
+    """Parameters and multiply-accumulates of each part of the network."""
+    rows = (facts.footprint or {}).get("rows", [])
+    if not rows:
+        return None
+    keys = [key for key in ("parameters", "macs_tick", "macs_window") if any(row.get(key) is not None for row in rows)]
+    names = {
+        "parameters": Column("Parameters"),
+        "macs_tick": Column("Per tick", "MAC"),
+        "macs_window": Column("Per window", "MAC"),
+    }
+    lines = tuple((str(row["part"]), *(count_text(row.get(key)) for key in keys)) for row in rows)
+    return Table("By part", (Column("Part"), *(names[key] for key in keys)), lines)
+
+
+def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
+    """The network's size and cost, name and worded figure."""
+    names = {
+        "parameters": ("Parameters", ""),
+        "parameters_folded": ("Parameters after folding", ""),
+        "macs_tick": ("Work per tick, streaming", "MAC"),
+        "macs_window": ("Work per window, from scratch", "MAC"),
+        "float32": ("Constants on a controller, FP32", "B"),
+        "w8a16": ("Constants on a controller, W8A16", "B"),
+        "peak_activation_bytes": ("Peak activations, streaming", "B"),
+        "peak_activation_bytes_window": ("Peak activations, window", "B"),
+        "state_bytes": ("State carried between ticks", "B"),
+        "window": ("Window", "samples"),
+    }
+    values = dict(facts.footprint or {})
+    values |= {row["number_format"]: row["parameter_bytes"] for row in values.get("estimates", [])}
+    figures = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
+    return [(label, f"{count_text(value)} {unit}".rstrip()) for label, value, unit in figures if value is not None]
+
+
+def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
+    """The tiles under the headline: (figure, unit, what it is)."""
+    rows = comparison_rows(facts)
+    tiles: list[tuple[str, str, str]] = []
+    ours = next((row for row in rows if row["is_network"]), None)
+    if not facts.averaged and ours:
+        for target in facts.targets[:_TILES]:
+            tiles.append(
+                (number(ours["outputs"][target.name]), unit_text(target.unit), f"{MEASURE_NAME}, {target.name}")
+            )
+        ours = None
+    if ours:
+        tiles.append((number(ours[MEASURE]), facts.unit, f"{MEASURE_NAME} (root mean square of errors)"))
+        if ours["p95"] is not None:
+            tiles.append((number(ours["p95"]), facts.unit, "95 % of errors are below"))
+    best = next((row for row in rows if row["change"] is not None), None)
+    if best and facts.averaged:
+        tiles.append((percent(best["change"], signed=True), "", f"error against {best['label']}, the best baseline"))
+    elif ours and ours["r2"] is not None:
+        tiles.append((number(ours["r2"], 4), "", "R²"))
+    checks = budget_checks(facts)
+    if checks:
+        fitting = sum(check.fits for check in checks)
+        tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
+    elif (facts.provenance or {}).get("parameters") is not None:
+        tiles.append((count_text((facts.provenance or {})["parameters"]), "", "parameters"))
+    return [tile for tile in tiles if tile[0] != MISSING]
