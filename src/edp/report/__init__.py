@@ -1,6 +1,6 @@
 """The report of a run: `facts` reads, `figures` computes, `charts` describes, `page` writes one offline HTML file."""
 
-from edp.report.compare.page import write_compare_page
+from edp.report.compare.page import compare_page
 from edp.report.compare.paired import Comparison, compare_runs
 from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.compression.page import write_compression_page
@@ -29,6 +29,7 @@ __all__ = [
     "build_report",
     "build_screening_page",
     "build_twin_report",
+    "compare_page",
     "compare_runs",
     "comparison_rows",
     "headline",
@@ -36,7 +37,6 @@ __all__ = [
     "read_compression",
     "read_facts",
     "read_transfer",
-    "write_compare_page",
     "write_compression_page",
     "write_control_page",
     "write_rollout_plots",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 from markupsafe import Markup
 
 from edp.report.common.chart import Chart
+from edp.report.common.page import DRAWING
 from edp.report.common.provenance import provenance_rows
-from edp.report.common.templates import asset, stylesheet, template
+from edp.report.common.templates import asset, json_text, stylesheet, template
 from edp.report.run import facts as run
 from edp.report.run import tables
 from edp.report.run.charts import DOTS_AT_MOST, run_charts, signal_chart, signals_of
@@ -22,9 +22,6 @@ from edp.storage import write_bytes
 from edp.storage.paths import full_path
 from edp.table import Table
 from edp.wording import moment, unbroken
-
-DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
-"""Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""
 
 
 def build_report(
@@ -56,7 +53,7 @@ def build_report(
 
 def render(facts: run.Facts, title: str | None = None) -> str:
     """The page's text."""
-    return template("page.html.jinja").render(**context(facts, title))
+    return template("run.html.jinja").render(**context(facts, title))
 
 
 def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
@@ -133,14 +130,8 @@ def shown(charts: Iterable[Chart]) -> dict[str, Any]:
     drawn = plots(charts)
     return {
         "plots": drawn,
-        "specs": script_json([plot.spec() for plot in drawn.values()]),
+        "specs": json_text([plot.spec() for plot in drawn.values()]),
         "style": Markup(stylesheet("page.css")),
         "script": Markup(asset("page.js")),
         "drawing": Markup("\n".join(asset(name) for name in DRAWING)),
     }
-
-
-def script_json(value: Any) -> Markup:
-    """JSON that cannot end its script element, whatever names it holds."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
