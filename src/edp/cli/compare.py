@@ -24,11 +24,11 @@ def compare(
 
     Example: `edp compare runs/first runs/second`
     """
-    from edp.report import compare_page, compare_runs
+    from edp.report import build_compare_page, compare_runs
     from edp.report.compare.page import error_table
 
     comparison = compare_runs(runs)
-    page = compare_page(comparison, title).write(output)
+    page = build_compare_page(comparison, title).write(output)
 
     def show() -> None:
         out.print(comparison.headline())

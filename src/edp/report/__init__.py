@@ -1,6 +1,6 @@
 """The report of a run: `facts` reads, `figures` computes, `charts` describes, `page` writes one offline HTML file."""
 
-from edp.report.compare.page import compare_page
+from edp.report.compare.page import build_compare_page
 from edp.report.compare.paired import Comparison, compare_runs
 from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.compression.page import write_compression_page
@@ -25,11 +25,11 @@ __all__ = [
     "FreeRunFacts",
     "StudyReport",
     "Transfer",
+    "build_compare_page",
     "build_coverage_page",
     "build_report",
     "build_screening_page",
     "build_twin_report",
-    "compare_page",
     "compare_runs",
     "comparison_rows",
     "headline",

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import edp
 from edp.cli import app
 from edp.errors import ConfigError, DataError, EdpError, StorageError
-from edp.report import compare_page, compare_runs
+from edp.report import build_compare_page, compare_runs
 from edp.report.compare.page import error_table, model_table
 from edp.report.compare.runs import MEAN
 from edp.storage import write_json
@@ -219,7 +219,7 @@ def test_names_stay_text(pair):
             recordings[HOSTILE] = recordings.pop("trench_06")
 
         rewritten(run, renamed)
-    page = compare_page(compare_runs([pair[0], other])).html()
+    page = build_compare_page(compare_runs([pair[0], other])).html()
     assert HOSTILE not in page
     assert "<b>&" not in page
     assert page.count("<script>") == 2
@@ -255,17 +255,17 @@ def test_costs_of_all_runs_are_listed(pair):
 
 
 def test_the_text_of_the_page(pair):
-    check_text(compare_page(compare_runs(pair)).html(), "compare")
+    check_text(build_compare_page(compare_runs(pair)).html(), "compare")
 
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, pair, tmp_path):
-    check_page(browser, compare_page(compare_runs(pair)).write(tmp_path / "compare.html"), "comparison")
+    check_page(browser, build_compare_page(compare_runs(pair)).write(tmp_path / "compare.html"), "comparison")
 
 
 @pytest.mark.processes
 def test_numbers_of_an_axis_are_never_cut_short(browser, make_run, tmp_path):
     first, second = make_run("first"), make_run("second")
-    browser.open(compare_page(compare_runs([first, second])).write(tmp_path / "compare.html"))
+    browser.open(build_compare_page(compare_runs([first, second])).write(tmp_path / "compare.html"))
     browser.run("window.dispatchEvent(new Event('beforeprint'))")
     assert [fault for fault in page_faults(browser) if "number cut short" in fault] == []

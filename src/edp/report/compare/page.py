@@ -14,7 +14,7 @@ SHOWN_ERRORS = 4
 """Tables of errors that are shown from the beginning."""
 
 
-def compare_page(comparison: Comparison, title: str = "") -> Page:
+def build_compare_page(comparison: Comparison, title: str = "") -> Page:
     """Return the page of a comparison; its title is the names of the first two runs if none is given."""
     measure, first = comparison.measures[0], comparison.runs[0].name
     charts = {chart.name: chart for chart in compare_charts(comparison)}

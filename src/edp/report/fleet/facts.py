@@ -197,17 +197,17 @@ def tiles(facts: FleetFacts) -> list[tuple[str, str, str]]:
     ]
 
 
-def worst_sheet(facts: FleetFacts) -> Table:
+def worst_table(facts: FleetFacts) -> Table:
     """The worst machines, and why."""
     rows: list[tuple[Value, ...]] = [
         (row.name, row.mae, "; ".join(row.why) or "nothing stands out: the network is less exact here")
         for row in facts.rows[:WORST]
     ]
     columns = (Column("Machine"), Column("Error", facts.unit, figures(row[1] for row in rows)), Column("Why"))
-    return Table(f"The {len(rows)} machines with the largest error", columns, tuple(rows), name="worst")
+    return Table(f"The {len(rows)} machines with the largest error", columns, tuple(rows), name="worst", is_text=True)
 
 
-def machine_sheet(facts: FleetFacts) -> Table:
+def machine_table(facts: FleetFacts) -> Table:
     """Every machine."""
     rows: list[tuple[Value, ...]] = [
         (row.name, row.minutes, row.mae, percent(row.skill), row.drift, "yes" if row.drifts else "", row.changes)
@@ -226,6 +226,6 @@ def machine_sheet(facts: FleetFacts) -> Table:
     return Table("All machines, the largest error first", columns, tuple(rows), marked, name="machines")
 
 
-def failed_sheet(facts: FleetFacts) -> Table:
+def failed_table(facts: FleetFacts) -> Table:
     """Machines that could not be judged."""
-    return Table("Machines that could not be judged", (Column("Machine"), Column("Why")), facts.failed, name="failed")
+    return Table("Machines that could not be judged", (Column("Machine"), Column("Why")), facts.failed, is_text=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from edp.report.compare.page import compare_page, error_table
+from edp.report.compare.page import build_compare_page, error_table
 from edp.report.compare.paired import Comparison, compare_runs
 from edp.report.notebook import html_of, text_of
 from edp.table import Table
@@ -40,7 +40,7 @@ class ComparedRuns(OneFrame):
         Raises:
             StorageError: it cannot be written.
         """
-        return compare_page(self._comparison, title).write(target)
+        return build_compare_page(self._comparison, title).write(target)
 
     def _columns(self) -> dict[str, list[Any]]:
         of = self._comparison
