@@ -89,7 +89,7 @@ def read_compression(folder: str | Path) -> CompressionFacts:
     return CompressionFacts(content, Path(folder))
 
 
-def table_sheet(facts: CompressionFacts, horizon: str) -> Table:
+def front_table(facts: CompressionFacts, horizon: str) -> Table:
     """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
     teacher = facts.mae(facts.content["teacher"], horizon)
     rows: list[tuple[Value, ...]] = []
@@ -128,7 +128,7 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Table:
     return Table(caption, columns, tuple(rows), frozenset(facts.content["front"]), name=f"k{horizon}")
 
 
-def held_out_sheet(facts: CompressionFacts) -> Table | None:
+def held_out_table(facts: CompressionFacts) -> Table | None:
     """Teacher and chosen on the sealed test set."""
     scores = facts.content["held_out_test"].get("scores")
     if not scores:

@@ -118,12 +118,12 @@ def read_transfer(folder: str | Path) -> Transfer:
     return Transfer(content, shown, Path(folder))
 
 
-def sheets_of(facts: Transfer, horizon: str) -> list[Table]:
+def transfer_tables(facts: Transfer, horizon: str) -> list[Table]:
     """The two tables of a horizon."""
-    return [pair_sheet(facts, horizon), method_sheet(facts, horizon)]
+    return [pair_table(facts, horizon), method_table(facts, horizon)]
 
 
-def pair_sheet(facts: Transfer, horizon: str) -> Table:
+def pair_table(facts: Transfer, horizon: str) -> Table:
     """A table in the form of Table 4.10: before and after, by target, with bias and skew."""
     rows: list[tuple[Value, ...]] = []
     for method in facts.pair:
@@ -147,7 +147,7 @@ def pair_sheet(facts: Transfer, horizon: str) -> Table:
     return Table(f"{facts.ahead(horizon)}, test part of the logs", columns, tuple(rows), after, name=f"pair_k{horizon}")
 
 
-def method_sheet(facts: Transfer, horizon: str) -> Table:
+def method_table(facts: Transfer, horizon: str) -> Table:
     """All methods on the same ticks, least error first, in both domains where both were judged."""
     direct = float(facts.score(facts.content["before"], horizon)["mae"])
     both = SOURCE in facts.domains
