@@ -5,7 +5,7 @@ from edp.report.compare.paired import Comparison, compare_runs
 from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.compression.page import write_compression_page
 from edp.report.control.facts import ControlFacts
-from edp.report.control.page import write_control_page
+from edp.report.control.page import build_control_page
 from edp.report.coverage.page import build_coverage_page
 from edp.report.run.facts import Facts, comparison_rows, headline, read_facts
 from edp.report.run.page import build_report
@@ -26,6 +26,7 @@ __all__ = [
     "StudyReport",
     "Transfer",
     "build_compare_page",
+    "build_control_page",
     "build_coverage_page",
     "build_report",
     "build_screening_page",
@@ -38,7 +39,6 @@ __all__ = [
     "read_facts",
     "read_transfer",
     "write_compression_page",
-    "write_control_page",
     "write_rollout_plots",
     "write_screening_pictures",
     "write_study_page",

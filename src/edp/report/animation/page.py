@@ -249,7 +249,7 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
         name=scene.name,
         machine=f"{scene.machine.name}, {scene.machine.description}",
         stretch=f"{figure(scene.start_s)} to {figure(scene.start_s + seconds)} s",
-        style=Markup(stylesheet("animation.css")),
+        style=Markup(stylesheet("side_view.css", "animation.css")),
         **animation_parts(scene),
     )
     target = Path(output)
@@ -258,8 +258,13 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
 
 
 def animation_parts(scene: Scene) -> dict[str, Markup]:
-    """Script and data of a scene for a page with the elements of ``animation.html.jinja``."""
+    """Return script and data of a scene for the macros of ``side_view.jinja``."""
     return {"script": Markup(asset("side_view.js") + asset("animation.js")), "data": json_text(_plain(scene))}
+
+
+def side_view(scene: Scene) -> Markup:
+    """Return the side view of a scene as a part of a page with the style ``side_view.css``."""
+    return Markup(template("side_view.jinja").module.side_view(**animation_parts(scene)))  # type: ignore[attr-defined]
 
 
 def _plain(scene: Scene) -> dict[str, Any]:

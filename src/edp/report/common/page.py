@@ -114,6 +114,7 @@ class Page:
         sections: in order; those without content are left out.
         provenance: label and text of each line of the last section; none without lines.
         footer: a sentence at the end.
+        styles: files with its style.
     """
 
     title: str
@@ -125,6 +126,7 @@ class Page:
     tiles: Sequence[tuple[str, str, str]] = ()
     provenance: Sequence[tuple[str, str]] = ()
     footer: str = ""
+    styles: tuple[str, ...] = ("page.css",)
 
     def html(self) -> str:
         """Return the text of the page, with style and scripts, and without anything to load."""
@@ -144,7 +146,7 @@ class Page:
             sections=sections,
             plots=drawn,
             specs=json_text([plot.spec() for plot in drawn.values()]),
-            style=Markup(stylesheet("page.css")),
+            style=Markup(stylesheet(*self.styles)),
             drawing=Markup("\n".join(asset(name) for name in DRAWING)),
             script=Markup(asset("page.js")),
         )

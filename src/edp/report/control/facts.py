@@ -75,7 +75,7 @@ def tiles(facts: ControlFacts) -> list[tuple[str, str, str]]:
     return rows
 
 
-def loop_sheet(facts: ControlFacts) -> Table:
+def loop_table(facts: ControlFacts) -> Table:
     """A row of figures a loop."""
     heads = (
         ("Position rms", "mm", "position_rms_mm"),
@@ -97,7 +97,7 @@ def loop_sheet(facts: ControlFacts) -> Table:
     return Table("Loops", (Column("Loop"), *shown, Column("Violated, ticks")), tuple(rows), name="loops")
 
 
-def event_sheet(facts: ControlFacts) -> Table:
+def event_table(facts: ControlFacts) -> Table:
     """What controllers logged."""
     rows: list[tuple[Value, ...]] = [
         (loop["name"], event["tick"], event["ticks"], event["text"]) for loop in facts.loops for event in loop["events"]
@@ -107,7 +107,7 @@ def event_sheet(facts: ControlFacts) -> Table:
     return Table("Safe commands", heads, tuple(rows), name="events")
 
 
-def solver_sheet(facts: ControlFacts) -> Table:
+def solver_table(facts: ControlFacts) -> Table:
     """Times of a step of the controller."""
     rows: list[tuple[Value, ...]] = [
         (loop["name"], *(loop["solve_us"][key] for key in ("median", "p99", "max"))) for loop in facts.loops
