@@ -172,7 +172,7 @@ def tiles(facts: MonitorFacts) -> list[tuple[str, str, str]]:
 SEVERITIES = (("stop", "reasons to stop"), ("warning", "warnings"), ("note", "notes"))
 
 
-def alarm_sheet(facts: MonitorFacts) -> Table:
+def alarm_table(facts: MonitorFacts) -> Table:
     """A row an alarm."""
     rows: list[tuple[Value, ...]] = []
     labels = label_by_name(alarm.recording for alarm in facts.alarms)
@@ -192,7 +192,7 @@ def alarm_sheet(facts: MonitorFacts) -> Table:
     return Table("Alarms in the order in which they were raised", heads, tuple(rows), name="alarms")
 
 
-def cause_sheet(alarm: AlarmFacts) -> Table | None:
+def cause_table(alarm: AlarmFacts) -> Table | None:
     """What an alarm could be, the most likely cause first; None without a dictionary."""
     rows: list[tuple[Value, ...]] = [
         (
@@ -229,7 +229,7 @@ def confusions_of(facts: MonitorFacts, alarm: AlarmFacts) -> list[str]:
     return lines
 
 
-def confusion_sheet(facts: MonitorFacts) -> Table:
+def confusion_table(facts: MonitorFacts) -> Table:
     """Faults that cannot be told apart, the worst pairs first."""
     rows: list[tuple[Value, ...]] = [
         (pair.first, pair.second, pair.error, pair.sensor or MISSING, pair.sensor_error) for pair in facts.confusions
