@@ -140,7 +140,7 @@ def _each(share: Shares, ticks: int) -> tuple[Sequence[Tensor | float], Sequence
 
 
 def _derivatives(gates: Tensor, squashed: Tensor, cs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return derivatives of c~ by i, f, g pre-activations ``(time, batch, 3, units)``, of h~ by o's and tanh's input."""
+    """Return derivatives of c~ by i, f, g pre-activations ``(time, batch, 3, units)``, of h~ by o's and tanh's."""
     o, i, f, g = gates.chunk(4, dim=2)
     # Derivatives of all ticks at once; only the product with the incoming gradient remains in the loop.
     by_c = torch.stack([g * i * (1 - i), cs[:-1] * f * (1 - f), i * (1 - g.square())], dim=2)
