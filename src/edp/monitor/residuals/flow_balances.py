@@ -41,6 +41,7 @@ from edp.monitor.residuals.flow_curves import (
 from edp.monitor.residuals.flow_fit import fit_chambers, fit_oil_range
 from edp.recording import Recording
 from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
+from edp.signals import KINDS, Kind
 from edp.wording import figure, percent
 
 PREFIX = "flow:"
@@ -148,9 +149,10 @@ class FlowBalances(ResidualSource):
         share = float(self.oil.beyond(recording.column(name)).mean())
         if not share:
             return ""
+        low, high = (KINDS[Kind.TEMPERATURE].to_report(limit) for limit in (self.oil.low, self.oil.high))
         return (
-            f"balances of flow are silent in {percent(share)} of it: '{name}' is outside {figure(self.oil.low)} to "
-            f"{figure(self.oil.high)} K, which healthy logs cover"
+            f"balances of flow are silent in {percent(share)} of it: '{name}' is outside {figure(low)} to "
+            f"{figure(high)} degC, which healthy logs cover"
         )
 
     def _read(self, spots: ChamberPlaces) -> tuple[str, ...]:
