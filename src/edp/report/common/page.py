@@ -90,7 +90,8 @@ class Section:
     Attributes:
         name: its address on the page.
         title: its heading.
-        parts: one below the other. None, and a section, fold or group with nothing but explaining text, is left out.
+        parts: one below the other. None, tables and lists without rows, and sections, folds and groups with nothing but
+            explaining text are left out.
         link: short title in the navigation; the title if empty.
     """
 
@@ -130,7 +131,7 @@ class Page:
 
     def html(self) -> str:
         """Return the text of the page, with style and scripts, and without anything to load."""
-        provenance = Section("provenance", "Provenance", [Terms(self.provenance) if self.provenance else None])
+        provenance = Section("provenance", "Provenance", [Terms(self.provenance)])
         sections = [section for section in (*self.sections, provenance) if has_content(section)]
         charts = [part for section in sections for part in _parts_within(section) if isinstance(part, Chart)]
         drawn = {}
@@ -165,11 +166,15 @@ def has_content(part: Part | Section | None) -> bool:
     """Return whether a part of a page shows more than an explanation of what follows."""
     if isinstance(part, Section | Fold | Group):
         return any(map(has_content, part.parts))
+    if isinstance(part, Table | Terms):
+        return bool(part.rows)
+    if isinstance(part, Points):
+        return bool(part.lines)
     return part is not None and type(part) is not str and not (isinstance(part, Paragraph) and part.kind == "aid")
 
 
 def _shown(parts: Sequence[Part | None]) -> list[Part]:
-    return [part for part in parts if part is not None and (not isinstance(part, Fold | Group) or has_content(part))]
+    return [part for part in parts if part is not None and (isinstance(part, str | Paragraph) or has_content(part))]
 
 
 def _parts_within(part: Section | Fold | Group) -> Iterator[Part]:

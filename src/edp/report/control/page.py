@@ -11,7 +11,6 @@ from edp.report.control.facts import ControlFacts, event_table, loop_table, solv
 def build_control_page(facts: ControlFacts) -> Page:
     """Return the page of loops."""
     charts = {chart.name: chart for chart in control_charts(facts)}
-    events = event_table(facts)
     return Page(
         title=facts.title,
         kind="closed loops",
@@ -39,7 +38,7 @@ def build_control_page(facts: ControlFacts) -> Page:
             ),
             Section("side", "Side view", [f"Loop {facts.loops[0]['name']}.", side_view(facts.scene)]),
             Section("lever", "Levers", [charts["levers"]]),
-            Section("loops", "Loops", [loop_table(facts), events if events.rows else None]),
+            Section("loops", "Loops", [loop_table(facts), event_table(facts)]),
             Section(
                 "steps",
                 "Solver",

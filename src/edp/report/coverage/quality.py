@@ -6,6 +6,7 @@ import math
 
 from edp.errors import count_of
 from edp.logs import DataQuality, Finding, QualityReport
+from edp.report.common.page import Fold, Section
 from edp.table import Column, Table
 from edp.wording import MISSING, count_text, figure, number, percent
 
@@ -13,14 +14,20 @@ SHOWN_CHANNELS = 400
 """Rows of the table of channels; the rest is in the JSON."""
 
 
-def quality_tables(quality: DataQuality) -> dict[str, Table]:
-    """Recordings, channels that are not good, and findings, by name; a table without rows is left out."""
-    tables = {
-        "recordings": recordings_table(quality),
-        "channels": channels_table(quality),
-        "findings": findings_table(quality),
-    }
-    return {name: table for name, table in tables.items() if table.rows}
+def quality_section(quality: DataQuality) -> Section:
+    """Return the section on the quality of recordings: recordings, channels that are not good, and findings."""
+    return Section(
+        "quality",
+        "Quality of the recordings",
+        [
+            "What the sensors and the logger did to the signals: steps of the numbers, noise at rest, how often a new "
+            "value comes, how long one value stands, and the share of the time at an end of the range.",
+            recordings_table(quality),
+            Fold("Channel by channel", [channels_table(quality)]),
+            findings_table(quality),
+        ],
+        "Quality",
+    )
 
 
 def recordings_table(quality: DataQuality) -> Table:
@@ -103,7 +110,7 @@ def findings_table(quality: DataQuality) -> Table:
         for (severity, channel, what, advice), names in sorted(grouped.items(), key=lambda item: item[0][0])
     )
     columns = (Column("Channel"), Column(""), Column("Finding"), Column("Where"), Column("What to do"))
-    return Table("Findings", columns, rows)
+    return Table("Findings", columns, rows, is_text=True)
 
 
 def _key(finding: Finding) -> tuple[str, str, str, str]:

@@ -28,7 +28,7 @@ def build_fleet_page(facts: FleetFacts) -> Page:
                 [
                     "What departs from the other machines of the fleet. A reason is a pointer, not a proof: look at "
                     "the machine's own report, and at its monitor, before anything is repaired.",
-                    worst_table(facts) if facts.rows else None,
+                    worst_table(facts),
                 ],
                 "The worst",
             ),
@@ -56,10 +56,10 @@ def build_fleet_page(facts: FleetFacts) -> Page:
                 "All machines",
                 [
                     "Bold: machines that drift, or of which the monitor told a change.",
-                    machine_table(facts) if facts.rows else None,
+                    machine_table(facts),
                 ],
             ),
-            Section("failed", "Not judged", [failed_table(facts) if facts.failed else None]),
+            Section("failed", "Not judged", [failed_table(facts)]),
         ],
         provenance=[
             ("Network", f"{network['path']} ({network['weights']})"),

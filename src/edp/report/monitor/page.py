@@ -45,7 +45,7 @@ def build_monitor_page(facts: MonitorFacts) -> Page:
                 ],
             ),
             Section("time", "Time line", _time_lines(facts)),
-            Section("log", "Log", [words.alarm_table(facts) if facts.alarms else None]),
+            Section("log", "Log", [words.alarm_table(facts)]),
             Section("apart", "What cannot be told apart", _confusions(facts), "Not told apart"),
         ],
         provenance=facts.provenance,

@@ -49,7 +49,7 @@ def _choices(screening: ScreeningResult, caption: str, keep: bool) -> Table:
         Column("Best lag", "samples"),
         Column("Why"),
     )
-    return Table(caption, columns, rows)
+    return Table(caption, columns, rows, is_text=True)
 
 
 def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
@@ -77,7 +77,7 @@ def flags_table(screening: ScreeningResult) -> Table:
         for flag in ranked
     )
     columns = (Column("Channel"), Column("What"), Column("Of"), Column("Lag", "samples"), Column("Evidence"))
-    return Table("Flags", columns, rows)
+    return Table("Flags", columns, rows, is_text=True)
 
 
 def _place(order: list[str], flag: Flag) -> int:
@@ -131,7 +131,7 @@ def clusters_table(screening: ScreeningResult) -> Table:
         (cluster.representative, number(cluster.least, 2), ", ".join(cluster.members)) for cluster in screening.clusters
     )
     columns = (Column("Speaks for all"), Column("Least rank correlation", "of two members"), Column("Members"))
-    return Table("Channels that go together", columns, rows)
+    return Table("Channels that go together", columns, rows, is_text=True)
 
 
 def trials_table(trials: Mapping[str, Any]) -> Table:
