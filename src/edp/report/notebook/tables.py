@@ -9,7 +9,7 @@ from edp.report.run.facts import Facts
 from edp.report.run.tables import comparison_tables
 from edp.report.search import words
 from edp.report.search.facts import StudyFacts
-from edp.report.search.tables import phases_sheet
+from edp.report.search.tables import phases_table
 from edp.table import Table
 from edp.wording import printable
 
@@ -86,8 +86,8 @@ def score_tables(facts: Facts) -> list[Table]:
 def study_html(study: StudyFacts) -> str:
     """What a search came to, and how far its phases are."""
     sentences = " ".join([words.headline(study), *words.verdict(study)])
-    sheet = phases_sheet(study)
-    return f"<div><p>{_safe(sentences)}</p>{html_of([sheet] if sheet is not None else [])}</div>"
+    phases = phases_table(study)
+    return f"<div><p>{_safe(sentences)}</p>{html_of([phases] if phases is not None else [])}</div>"
 
 
 def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:

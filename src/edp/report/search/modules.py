@@ -21,7 +21,7 @@ GROUPS = {
 OTHER = "Other"
 
 
-def modules_sheets(study: StudyFacts) -> tuple[Table, ...]:
+def modules_tables(study: StudyFacts) -> tuple[Table, ...]:
     """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
     if "screening" not in study.facts:
         return ()

@@ -11,7 +11,7 @@ from edp.wording import number, percent
 
 
 @of_phase("compression", None)
-def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+def smaller_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Every network in every number format: what it takes, its error, and whether it fits; the front is marked."""
     rows = tuple(
         (

@@ -10,31 +10,31 @@ import numpy as np
 from edp.errors import count_of
 from edp.report.common.chart import with_unit
 from edp.report.search.facts import StudyFacts, known, of_phase, real
-from edp.report.search.modules import modules_sheets, ordered, span
-from edp.report.search.smaller import smaller_sheet
+from edp.report.search.modules import modules_tables, ordered, span
+from edp.report.search.smaller import smaller_table
 from edp.report.search.views import arm_views, titled
 from edp.table import Column, Table, Value, chance, figures, plainly
 from edp.wording import count_text, duration, moment, number, percent
 
 
-def sheets(study: StudyFacts) -> dict[str, Table]:
+def study_tables(study: StudyFacts) -> dict[str, Table]:
     """Every table that there are facts for, by name."""
     sheets = (
-        variance_sheet(study),
-        features_sheet(study),
-        calibration_sheet(study),
-        *modules_sheets(study),
-        selection_sheet(study),
-        identifiers_sheet(study),
-        holdout_sheet(study),
-        smaller_sheet(study),
-        openings_sheet(study),
-        phases_sheet(study),
+        variance_table(study),
+        features_table(study),
+        calibration_table(study),
+        *modules_tables(study),
+        selection_table(study),
+        identifiers_table(study),
+        holdout_table(study),
+        smaller_table(study),
+        openings_table(study),
+        phases_table(study),
     )
     return {sheet.name: sheet for sheet in sheets if sheet is not None and sheet.rows}
 
 
-def variance_sheet(study: StudyFacts) -> Table | None:
+def variance_table(study: StudyFacts) -> Table | None:
     """Table 4.3: mean error and its standard deviations, of MAE and of the composite score."""
     rows = []
     for arm in arm_views(study):
@@ -57,7 +57,7 @@ def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) 
 
 
 @of_phase("isolation", None)
-def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+def features_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """The chosen feature set against the next best, by backbone; the best backbone with it against the others."""
     rows: tuple[tuple[Value, ...], ...] = tuple(
         (
@@ -91,7 +91,7 @@ def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
 
 
 @of_phase("calibration", None)
-def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+def calibration_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Table 4.4: scores of all questions of each architecture, and what the efficiency rule takes."""
     rows = []
     final = facts["final"]["scores"] if "final" in facts else {}
@@ -137,7 +137,7 @@ def _count(value: Value) -> str:
     return count_text(value) if isinstance(value, int | float) else plainly(value)
 
 
-def selection_sheet(study: StudyFacts) -> Table | None:
+def selection_table(study: StudyFacts) -> Table | None:
     """Table 4.6: how often each module was on among the questions of phases 4 and 5."""
     on = {name: study.facts[name]["on"] for name in ("synthesis", "exploration") if name in study.facts}
     names = list(dict.fromkeys(name for counts in on.values() for name in counts))
@@ -161,15 +161,19 @@ def identifiers(study: StudyFacts) -> dict[str, str]:
     return {name: f"M{number}" for number, (_, name) in enumerate(ordered(list(study.modules)), 1)}
 
 
-def identifiers_sheet(study: StudyFacts) -> Table | None:
+def identifiers_table(study: StudyFacts) -> Table | None:
     """Table 4.7."""
     rows = tuple((short, study.module(name), name) for name, short in identifiers(study).items())
     columns = (Column("ID"), Column("Module"), Column("Name in settings"))
-    return Table("Module identifiers", columns, rows, name="identifiers") if "synthesis" in study.facts else None
+    return (
+        Table("Module identifiers", columns, rows, name="identifiers", is_text=True)
+        if "synthesis" in study.facts
+        else None
+    )
 
 
 @of_phase("synthesis", None)
-def holdout_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
+def holdout_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Table 4.8: baseline and winners; in brackets the change against the baseline."""
     calibrated = study.facts["calibration"]
     base = calibrated["backbones"][calibrated["backbone"]]
@@ -198,7 +202,9 @@ def holdout_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     names = ("Baseline", "Winner of phase 4", "Winner of phase 5")[: len(arms)]
     seeds = study.spec.get("run_seeds", "–")
     caption = f"Baseline and winners; test scores are means of {seeds} seeds, in brackets the change to the baseline"
-    return Table(caption, (Column("Metric"), *(Column(name) for name in names)), tuple(rows), name="holdout")
+    return Table(
+        caption, (Column("Metric"), *(Column(name) for name in names)), tuple(rows), name="holdout", is_text=True
+    )
 
 
 def _against(value: float, reference: float | None, show: Any) -> str:
@@ -208,7 +214,7 @@ def _against(value: float, reference: float | None, show: Any) -> str:
     return f"{show(value)} ({percent(value / reference - 1, signed=True)})"
 
 
-def openings_sheet(study: StudyFacts) -> Table | None:
+def openings_table(study: StudyFacts) -> Table | None:
     """Every opening of the sealed test sets."""
     rows = tuple(
         (
@@ -220,10 +226,10 @@ def openings_sheet(study: StudyFacts) -> Table | None:
         for opening in study.openings
     )
     columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Test set"))
-    return Table("Openings of the sealed test sets", columns, rows, name="openings")
+    return Table("Openings of the sealed test sets", columns, rows, name="openings", is_text=True)
 
 
-def phases_sheet(study: StudyFacts) -> Table | None:
+def phases_table(study: StudyFacts) -> Table | None:
     """Trainings and time of each phase, and their sums."""
     rows: list[tuple[Value, ...]] = [
         (p.heading, p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s, _status(study, p.name))
