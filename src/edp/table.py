@@ -46,11 +46,19 @@ def chance(value: Value) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """Heading, unit and how a value is shown."""
+    """Column of a table.
+
+    Attributes:
+        heading: without the unit.
+        unit: of all values.
+        show: returns a value as text.
+        is_text: whether values are words, which are aligned left and wrapped, and not figures.
+    """
 
     heading: str
     unit: str = ""
     show: Show = plainly
+    is_text: bool = False
 
     def head(self) -> str:
         """Return the heading with its unit in brackets."""
@@ -68,7 +76,6 @@ class Table:
         rows: values; None where there is none.
         marked: places of rows that stand out.
         name: of the table's files.
-        is_text: whether cells are sentences, which are aligned left and wrapped, and not figures.
     """
 
     caption: str
@@ -76,7 +83,6 @@ class Table:
     rows: tuple[tuple[Value, ...], ...]
     marked: frozenset[int] = frozenset()
     name: str = ""
-    is_text: bool = False
 
     def heads(self) -> list[str]:
         """Return the headings, each with its unit."""

@@ -113,16 +113,16 @@ def front_table(facts: CompressionFacts, horizon: str) -> Table:
     unit = facts.content["unit"]
     columns = (
         Column("Variant"),
-        Column("Made"),
+        Column("Made", is_text=True),
         Column("MAE", unit, figures([row[2] for row in rows])),
         Column("Δ MAE", "%", figures([row[3] for row in rows], signed=True, decimals=2)),
         Column("Parameters", "", figures([], decimals=0)),
         Column("Size", "MB", figures([], decimals=4)),
-        Column("Numbers"),
+        Column("Numbers", is_text=True),
         Column("MACs per window", "M", figures([], decimals=3)),
         Column("MACs per tick", "", figures([], decimals=0)),
         Column("Cycles, high", "", figures([], decimals=0)),
-        Column("Budget"),
+        Column("Budget", is_text=True),
     )
     caption = f"{facts.ahead(horizon)}, validation part"
     return Table(caption, columns, tuple(rows), frozenset(facts.content["front"]), name=f"k{horizon}")

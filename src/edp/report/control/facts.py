@@ -94,7 +94,7 @@ def loop_table(facts: ControlFacts) -> Table:
         violated = ", ".join(f"{name} {ticks}" for name, ticks in score["violations"].items() if ticks) or MISSING
         rows.append((loop["name"], *(score[key] for _, _, key in heads), violated))
     shown = [Column(title, unit, figures(row[1 + n] for row in rows)) for n, (title, unit, _) in enumerate(heads)]
-    return Table("Loops", (Column("Loop"), *shown, Column("Violated, ticks")), tuple(rows), name="loops")
+    return Table("Loops", (Column("Loop"), *shown, Column("Violated, ticks", is_text=True)), tuple(rows), name="loops")
 
 
 def event_table(facts: ControlFacts) -> Table:
@@ -103,7 +103,7 @@ def event_table(facts: ControlFacts) -> Table:
         (loop["name"], event["tick"], event["ticks"], event["text"]) for loop in facts.loops for event in loop["events"]
     ]
     whole = figures([], decimals=0)
-    heads = (Column("Loop"), Column("From tick", "", whole), Column("Ticks", "", whole), Column("Event"))
+    heads = (Column("Loop"), Column("From tick", "", whole), Column("Ticks", "", whole), Column("Event", is_text=True))
     return Table("Safe commands", heads, tuple(rows), name="events")
 
 

@@ -109,8 +109,8 @@ def findings_table(quality: DataQuality) -> Table:
         (channel or ("Whole log" if names else "Data set"), severity, what, _where(names), advice)
         for (severity, channel, what, advice), names in sorted(grouped.items(), key=lambda item: item[0][0])
     )
-    columns = (Column("Channel"), Column(""), Column("Finding"), Column("Where"), Column("What to do"))
-    return Table("Findings", columns, rows, is_text=True)
+    columns = tuple(Column(head, is_text=True) for head in ("Channel", "", "Finding", "Where", "What to do"))
+    return Table("Findings", columns, rows)
 
 
 def _key(finding: Finding) -> tuple[str, str, str, str]:

@@ -203,8 +203,12 @@ def worst_table(facts: FleetFacts) -> Table:
         (row.name, row.mae, "; ".join(row.why) or "nothing stands out: the network is less exact here")
         for row in facts.rows[:WORST]
     ]
-    columns = (Column("Machine"), Column("Error", facts.unit, figures(row[1] for row in rows)), Column("Why"))
-    return Table(f"The {len(rows)} machines with the largest error", columns, tuple(rows), name="worst", is_text=True)
+    columns = (
+        Column("Machine"),
+        Column("Error", facts.unit, figures(row[1] for row in rows)),
+        Column("Why", is_text=True),
+    )
+    return Table(f"The {len(rows)} machines with the largest error", columns, tuple(rows), name="worst")
 
 
 def machine_table(facts: FleetFacts) -> Table:
@@ -228,4 +232,4 @@ def machine_table(facts: FleetFacts) -> Table:
 
 def failed_table(facts: FleetFacts) -> Table:
     """Machines that could not be judged."""
-    return Table("Machines that could not be judged", (Column("Machine"), Column("Why")), facts.failed, is_text=True)
+    return Table("Machines that could not be judged", (Column("Machine"), Column("Why", is_text=True)), facts.failed)

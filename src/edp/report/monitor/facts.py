@@ -186,9 +186,14 @@ def alarm_table(facts: MonitorFacts) -> Table:
         ))  # fmt: skip
     share = figures([], decimals=2)
     heads = (
-        Column("Recording"), Column("Since"), Column("Raised"), Column("Severity"), Column("Most likely"),
-        Column("Probability", "", share), Column("Over limit", "", share),
-    )  # fmt: skip
+        Column("Recording"),
+        Column("Since"),
+        Column("Raised"),
+        Column("Severity", is_text=True),
+        Column("Most likely", is_text=True),
+        Column("Probability", "", share),
+        Column("Over limit", "", share),
+    )
     return Table("Alarms in the order in which they were raised", heads, tuple(rows), name="alarms")
 
 
@@ -207,8 +212,8 @@ def cause_table(alarm: AlarmFacts) -> Table | None:
         return None
     heads = (
         Column("What it could be"),
-        Column("Part"),
-        Column("Where"),
+        Column("Part", is_text=True),
+        Column("Where", is_text=True),
         Column("Probability", "", figures([], False, 2)),
     )
     return Table("Causes", heads, tuple(rows), frozenset({0}), name="causes")
@@ -236,7 +241,10 @@ def confusion_table(facts: MonitorFacts) -> Table:
     ]
     share = figures([], decimals=2)
     heads = (
-        Column("Fault"), Column("Not told apart from"), Column("Error between the two", "", share),
-        Column("Further sensor that separates them"), Column("Error with it", "", share),
-    )  # fmt: skip
+        Column("Fault"),
+        Column("Not told apart from", is_text=True),
+        Column("Error between the two", "", share),
+        Column("Further sensor that separates them", is_text=True),
+        Column("Error with it", "", share),
+    )
     return Table("Faults that cannot be told apart with the present sensors", heads, tuple(rows), name="confusions")

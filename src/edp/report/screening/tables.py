@@ -44,12 +44,12 @@ def _choices(screening: ScreeningResult, caption: str, keep: bool) -> Table:
     )
     columns = (
         Column("Channel"),
-        Column("Kind of signal"),
+        Column("Kind of signal", is_text=True),
         Column("Score", "0 to 1"),
         Column("Best lag", "samples"),
-        Column("Why"),
+        Column("Why", is_text=True),
     )
-    return Table(caption, columns, rows, is_text=True)
+    return Table(caption, columns, rows)
 
 
 def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
@@ -76,8 +76,14 @@ def flags_table(screening: ScreeningResult) -> Table:
         )
         for flag in ranked
     )
-    columns = (Column("Channel"), Column("What"), Column("Of"), Column("Lag", "samples"), Column("Evidence"))
-    return Table("Flags", columns, rows, is_text=True)
+    columns = (
+        Column("Channel"),
+        Column("What", is_text=True),
+        Column("Of", is_text=True),
+        Column("Lag", "samples"),
+        Column("Evidence", is_text=True),
+    )
+    return Table("Flags", columns, rows)
 
 
 def _place(order: list[str], flag: Flag) -> int:
@@ -130,8 +136,12 @@ def clusters_table(screening: ScreeningResult) -> Table:
     rows = tuple(
         (cluster.representative, number(cluster.least, 2), ", ".join(cluster.members)) for cluster in screening.clusters
     )
-    columns = (Column("Speaks for all"), Column("Least rank correlation", "of two members"), Column("Members"))
-    return Table("Channels that go together", columns, rows, is_text=True)
+    columns = (
+        Column("Speaks for all"),
+        Column("Least rank correlation", "of two members"),
+        Column("Members", is_text=True),
+    )
+    return Table("Channels that go together", columns, rows)
 
 
 def trials_table(trials: Mapping[str, Any]) -> Table:

@@ -63,14 +63,14 @@ def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table |
             marked.add(len(rows) - 1)
     columns = (
         Column("Module"),
-        Column("Group"),
+        Column("Group", is_text=True),
         Column("Phase 2", "change, %", figures([], signed=True, decimals=2)),
         Column("Phase 3", "change, %", figures([], signed=True, decimals=2)),
         Column("95 % interval", "%"),
         Column("p", "one-sided", chance),
         Column("p", "adjusted", chance),
         Column("d_z", "Cohen", figures([], signed=True, decimals=2)),
-        Column("Verdict"),
+        Column("Verdict", is_text=True),
     )
     caption = (
         f"Modules in phases 2 and 3; below zero is better, p is adjusted over all {len(facts['registered'])} modules"
@@ -92,7 +92,7 @@ def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
         Column("Change", "%", figures([], signed=True, decimals=2)),
         Column("p", "one-sided", chance),
         Column("Importance", "% of what is explained", figures([], decimals=0)),
-        Column("Verdict"),
+        Column("Verdict", is_text=True),
     )
     caption = "Phase 2: main effects of the two-level design, on average over all other modules"
     return Table(caption, columns, tuple(rows), name="effects")
@@ -172,7 +172,7 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table 
         Column("Runs won", "%", figures([], decimals=0)),
     )
     gain = Column("Δp₂", study.unit, figures([row[2] for row in rows], signed=True))
-    first = (Column("Module"), Column("Group"), gain, *tests_columns, Column("Verdict"))
+    first = (Column("Module"), Column("Group", is_text=True), gain, *tests_columns, Column("Verdict", is_text=True))
     shown = f"; tests on {metrics[0].upper()}, a module is confirmed on any metric" if metrics else ""
     caption = f"Modules in phases 2 and 3, the thesis's procedure: better is Δp₂ > 0 and d_z < 0{shown}"
     second = (

@@ -31,7 +31,7 @@ def smaller_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     count = figures([], decimals=0)
     columns = (
         Column("Network"),
-        Column("Made by"),
+        Column("Made by", is_text=True),
         Column("Parameters", "", count),
         Column("Parameters", "bytes", count),
         Column("Cycles", "per tick, high", count),
@@ -39,7 +39,7 @@ def smaller_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
         Column("MAE", study.unit, figures([row[6] for row in rows])),
         Column("Composite", study.unit, figures([row[7] for row in rows])),
         Column("Change", "% of the teacher's MAE", figures([], signed=True, decimals=1)),
-        Column("Budget"),
+        Column("Budget", is_text=True),
     )
     caption = "Smaller networks of the teacher on development sessions that do not train; marked: the front"
     return Table(caption, columns, rows, frozenset(map(int, facts.get("front", ()))), name="compression")

@@ -164,12 +164,8 @@ def identifiers(study: StudyFacts) -> dict[str, str]:
 def identifiers_table(study: StudyFacts) -> Table | None:
     """Table 4.7."""
     rows = tuple((short, study.module(name), name) for name, short in identifiers(study).items())
-    columns = (Column("ID"), Column("Module"), Column("Name in settings"))
-    return (
-        Table("Module identifiers", columns, rows, name="identifiers", is_text=True)
-        if "synthesis" in study.facts
-        else None
-    )
+    columns = (Column("ID"), Column("Module", is_text=True), Column("Name in settings", is_text=True))
+    return Table("Module identifiers", columns, rows, name="identifiers") if "synthesis" in study.facts else None
 
 
 @of_phase("synthesis", None)
@@ -203,7 +199,7 @@ def holdout_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     seeds = study.spec.get("run_seeds", "–")
     caption = f"Baseline and winners; test scores are means of {seeds} seeds, in brackets the change to the baseline"
     return Table(
-        caption, (Column("Metric"), *(Column(name) for name in names)), tuple(rows), name="holdout", is_text=True
+        caption, (Column("Metric"), *(Column(name, is_text=True) for name in names)), tuple(rows), name="holdout"
     )
 
 
@@ -225,8 +221,8 @@ def openings_table(study: StudyFacts) -> Table | None:
         )
         for opening in study.openings
     )
-    columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Test set"))
-    return Table("Openings of the sealed test sets", columns, rows, name="openings", is_text=True)
+    columns = (Column("When"), Column("Why", is_text=True), Column("Trainings"), Column("Test set", is_text=True))
+    return Table("Openings of the sealed test sets", columns, rows, name="openings")
 
 
 def phases_table(study: StudyFacts) -> Table | None:

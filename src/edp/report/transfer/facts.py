@@ -140,7 +140,7 @@ def pair_table(facts: Transfer, horizon: str) -> Table:
         shows[column] = figures([], signed=True, decimals=2)
     columns = (
         Column("Model variant"),
-        Column("Target"),
+        Column("Target", is_text=True),
         *(Column(head, of, show) for (head, of), show in zip(heads, shows, strict=True)),
     )
     after = frozenset(range(len(facts.targets), 2 * len(facts.targets)))
