@@ -15,7 +15,7 @@ from edp.report.transfer.facts import Transfer, read_transfer
 from edp.report.transfer.page import write_transfer_page
 from edp.report.twin.charts import write_rollout_plots
 from edp.report.twin.facts import FreeRunFacts, holds_free_runs
-from edp.report.twin.page import build_twin_report, write_twin_page
+from edp.report.twin.page import build_twin_page, build_twin_report
 
 __all__ = [
     "Comparison",
@@ -30,6 +30,7 @@ __all__ = [
     "build_coverage_page",
     "build_report",
     "build_screening_page",
+    "build_twin_page",
     "build_twin_report",
     "compare_runs",
     "comparison_rows",
@@ -43,5 +44,4 @@ __all__ = [
     "write_screening_pictures",
     "write_study_page",
     "write_transfer_page",
-    "write_twin_page",
 ]

@@ -332,7 +332,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     return rows
 
 
-def sheets_of(facts: FreeRunFacts) -> dict[str, Table]:
+def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
     """Every table by name; those of which nothing is known are left out."""
     twin = facts.twin
     sheets = [
