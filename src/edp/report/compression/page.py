@@ -27,7 +27,7 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
     page = Page(
         title=full_path(facts.folder).name,
         kind="compression",
-        about=["compression", facts.content["budget"]["name"]],
+        about=["compression", facts.result.budget.name],
         headline=words.headline(facts),
         verdict=words.verdict(facts),
         tiles=words.tiles(facts),
@@ -64,8 +64,7 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
                 [Paragraph("Not opened: no network fits the budget.", "missing")]
                 if held_out is None
                 else [
-                    f"Opened on {facts.content['held_out_test'].get('opened', '')}, for the chosen network and the "
-                    "teacher.",
+                    f"Opened on {facts.result.held_out_test.opened}, for the chosen network and the teacher.",
                     held_out,
                 ],
             ),
