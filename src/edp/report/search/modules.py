@@ -63,7 +63,7 @@ def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table |
             marked.add(len(rows) - 1)
     columns = (
         Column("Module"),
-        Column("Block", is_text=True),
+        Column("Group", is_text=True),
         Column("Phase 2", "change, %", figures([], signed=True, decimals=2)),
         Column("Phase 3", "change, %", figures([], signed=True, decimals=2)),
         Column("95 % interval", "%"),
@@ -172,7 +172,7 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table 
         Column("Runs won", "%", figures([], decimals=0)),
     )
     gain = Column("Δp₂", study.unit, figures([row[2] for row in rows], signed=True))
-    first = (Column("Module"), Column("Block", is_text=True), gain, *tests_columns, Column("Verdict", is_text=True))
+    first = (Column("Module"), Column("Group", is_text=True), gain, *tests_columns, Column("Verdict", is_text=True))
     shown = f"; tests on {metrics[0].upper()}, a module is confirmed on any metric" if metrics else ""
     caption = f"Modules in phases 2 and 3, the thesis's procedure: better is Δp₂ > 0 and d_z < 0{shown}"
     second = (
