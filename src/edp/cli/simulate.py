@@ -70,7 +70,7 @@ def simulate(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Simulate recordings of an excavator: M22 in free air, or what a scenario file describes.
+    """Simulate recordings of an excavator: M22 in free air by default, or as a scenario file describes.
 
     Example: `edp simulate data/m22 --minutes 90 --recordings 30 --seed 1`
 
@@ -158,7 +158,7 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Wo
 
 
 def limit_table(limit: dict[str, Any]) -> None:
-    """Print the limit beside persistence."""
+    """Print the limit together with persistence."""
     names = [
         target.replace("CylVels_1", "boom").replace("CylVels_2", "arm").replace("CylVels_3", "bucket")
         for target in limit["targets"]

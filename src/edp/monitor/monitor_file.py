@@ -1,4 +1,4 @@
-"""Monitors on disk: JSON and safetensors, as bundles of networks are; loading one executes nothing."""
+"""Monitors on disk as JSON and safetensors, like network bundles; loading does not execute code."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
 
 
 def _remove_old(path: Path, arrays: str, networks: set[str]) -> None:
-    """Remove what an earlier monitor left; a kill before that leaves spare files, not a broken monitor."""
+    """Remove the files of an earlier monitor. A kill before that leaves extra files but a valid monitor."""
     for old in entries_of(path, "monitor-*.safetensors"):
         if old.name != arrays:
             old.unlink(missing_ok=True)
@@ -179,7 +179,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
 
 
 def _scatter(values: Any, chain: MonitorChain) -> NDArray[np.float64] | None:
-    """Of means of healthy sessions; earlier versions wrote none."""
+    """Read the scatter of healthy session means; files of earlier versions have none."""
     if values is None:
         return None
     scatter = np.asarray(values, np.float64)

@@ -1,4 +1,4 @@
-"""Processes that help another one: none of them outlives it, however it ends."""
+"""Helper processes that end with their parent, in whatever way it ends."""
 
 from __future__ import annotations
 

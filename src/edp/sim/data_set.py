@@ -1,4 +1,4 @@
-"""Simulated data sets on disk: what is asked for, room for it, and writing it so that it can go on."""
+"""Simulated data sets on disk: settings, disk space check, and resumable writing."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class SimulationOrder(DataSetSpec):
         overrides: Sequence[str] = (),
         **changes: Any,
     ) -> SimulationOrder:
-        """The order of a scenario file, or the default one; overrides and `changes` replace its values.
+        """Create the order of a scenario file, or the default one; overrides and `changes` replace its values.
 
         Overrides are ``key.path=value`` in the keys of the file; `changes` that are not None go before them.
 
@@ -101,7 +101,7 @@ class SimulationOrder(DataSetSpec):
         return order
 
     def files(self) -> WriteOptions:
-        """How the logs are written.
+        """Return the write options of the logs.
 
         Raises:
             EdpError: an ending without a format, an unknown layout, or one of another format.
@@ -124,7 +124,7 @@ def _flat(values: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
 
 
 def _leave_out(values: dict[str, Any], changes: dict[str, Any]) -> Iterator[str]:
-    """Take out of a file's `values` what those given make void; says what, and why."""
+    """Remove values of a file that the given ones make invalid; yields a message for each."""
     suffix = changes.get("suffix", ".mat")
     if suffix != ".mat" and values.get("layout") and "layout" not in changes:
         yield f"layout '{values.pop('layout')}' is one of MAT files, and format {suffix[1:]} was asked for"
@@ -146,7 +146,7 @@ def simulate_data_set(
     workers: Workers = ONE_PER_CORE,
     on_done: Callable[[Scenario, bool], None] | None = None,
 ) -> list[Path]:
-    """Simulate a data set into a folder, a log each; logs already there from the same order are kept.
+    """Simulate a data set into a folder, one log per recording. Existing logs of the same order are kept.
 
     Logs do not depend on who writes them: each scenario carries its own seed.
 
@@ -216,7 +216,7 @@ def write_log(identity: TrainingIdentity, where: Mapping[str, str]) -> dict[str,
 
 
 def _bound(folder: Path, identity: dict[str, Any]) -> bool:
-    """Whether a folder is bound to an order; False where it is bound to none."""
+    """Return whether a folder belongs to this order; False if it belongs to none."""
     manifest = folder / MANIFEST
     if not is_entry_at(manifest):
         return False
@@ -252,7 +252,7 @@ def find_data_set_limit(
     workers: Workers = ONE_PER_CORE,
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """The limit of predictability of a simulated data set, written beside its logs as ``limit.json``.
+    """Estimate the predictability limit of a simulated data set, and write it to ``limit.json`` next to its logs.
 
     A limit that is there already from the same order and settings is kept.
 
@@ -288,7 +288,7 @@ def _digest(value: Any) -> str:
 
 
 def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, Any]:
-    """What makes two simulated data sets the same, as JSON gives it back."""
+    """Return the identity of a simulated data set in JSON types."""
     identity: dict[str, Any] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
     # Only what departs from the usual: folders without these options keep their identity.
     if files != WriteOptions():

@@ -54,7 +54,7 @@ AIR = "air"
 
 @dataclass(frozen=True, kw_only=True)
 class DataSetSpec:
-    """A data set to simulate: the same one gives the same bits, whatever the number of workers.
+    """Data set to simulate; equal settings give equal bits, for any number of workers.
 
     Attributes:
         machine: name of a machine, or path of a machine file.
@@ -147,7 +147,7 @@ class DataSetSpec:
         return over_family(plan, self.family, self.seed, self.masses, self.scatter) if self.family else plan
 
     def _soils(self, excitations: Sequence[str]) -> list[str]:
-        """The material of each recording; empty for free air. Each family gets all of them in turn."""
+        """Return the material of each recording; empty for free air. Each family gets all materials in turn."""
         soils = [""] * len(excitations)
         places = [i for i in _by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
         if self.materials:
@@ -157,7 +157,7 @@ class DataSetSpec:
 
 
 def _by_family(excitations: Sequence[str]) -> list[int]:
-    """Places of the recordings, those of one family after another."""
+    """Return the recording indices sorted by family."""
     return sorted(range(len(excitations)), key=lambda i: excitations[i])
 
 
@@ -177,7 +177,7 @@ def plan_data_set(
     mix: Mapping[str, float] | None = None,
     materials: Mapping[str, float] | None = None,
 ) -> tuple[Scenario, ...]:
-    """The scenarios of a `DataSetSpec`.
+    """Return the scenarios of a `DataSetSpec`.
 
     Raises:
         ConfigError: a count or length is not positive, or mix or materials name what is unknown.
@@ -196,7 +196,7 @@ def over_family(
     masses: tuple[float, float] = MASSES_T,
     scatter: float = 1.0,
 ) -> tuple[Scenario, ...]:
-    """The same scenarios on `count` machines of other sizes, which take turns in each excitation; see `machine_family`.
+    """Distribute the scenarios over `count` machines of other sizes, in turn per excitation; see `machine_family`.
 
     Raises:
         ConfigError: the count is not positive.
@@ -216,7 +216,7 @@ def _named(name: str, machine: str) -> str:
 
 
 def hand_out(shares: Mapping[str, float], count: int) -> list[str]:
-    """`count` names in proportion to `shares`, mixed so that the first ones of them are in proportion as well.
+    """Return `count` names in proportion to `shares`, mixed so that any leading part is in proportion, too.
 
     Each has its turn once, the largest share first, and then the one that is farthest behind, by Webster's method.
     """
