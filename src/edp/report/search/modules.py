@@ -30,7 +30,7 @@ def modules_tables(study: StudyFacts) -> tuple[Table, ...]:
 
 
 def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Block and module in the thesis's order, unknown ones behind."""
+    """Group and module in the thesis's order, unknown ones behind."""
     present = set(names)
     known_ones = [(group, name) for group, own in GROUPS.items() for name in own if name in present]
     listed = {name for _, name in known_ones}
@@ -172,7 +172,13 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table 
         Column("Runs won", "%", figures([], decimals=0)),
     )
     gain = Column("Δp₂", study.unit, figures([row[2] for row in rows], signed=True))
-    first = (Column("Module"), Column("Group", is_text=True), gain, *tests_columns, Column("Verdict", is_text=True))
+    first = (
+        Column("Module"),
+        Column("Group", is_text=True),
+        gain,
+        *tests_columns,
+        Column("Verdict", is_text=True),
+    )
     shown = f"; tests on {metrics[0].upper()}, a module is confirmed on any metric" if metrics else ""
     caption = f"Modules in phases 2 and 3, the thesis's procedure: better is Δp₂ > 0 and d_z < 0{shown}"
     second = (
