@@ -75,8 +75,8 @@ def pretrain(
 
 def _tables(result: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
-    from edp.report.run.sheets import contexts_sheet, parts_sheet
+    from edp.report.run.sheets import contexts_table, parts_table
 
-    for sheet in (parts_sheet(result), contexts_sheet(result)):
+    for sheet in (parts_table(result), contexts_table(result)):
         table(sheet.caption, sheet.heads(), sheet.texts())
         out.print()
