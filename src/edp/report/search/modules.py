@@ -30,7 +30,7 @@ def modules_tables(study: StudyFacts) -> tuple[Table, ...]:
 
 
 def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Block and module in the thesis's order, unknown ones behind."""
+    """Group and module in the thesis's order, unknown ones behind."""
     present = set(names)
     known_ones = [(group, name) for group, own in GROUPS.items() for name in own if name in present]
     listed = {name for _, name in known_ones}
