@@ -5,10 +5,10 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
+from edp.evaluation.study import StudyFile
 from edp.report.common.tables import TextTable, comparison_tables
 from edp.report.run.facts import Facts
 from edp.report.search import words
-from edp.report.search.facts import StudyFacts
 from edp.report.search.tables import phases_sheet
 from edp.wording import printable
 
@@ -81,7 +81,7 @@ def score_tables(facts: Facts) -> list[TextTable]:
     return comparison_tables(facts)
 
 
-def study_html(study: StudyFacts) -> str:
+def study_html(study: StudyFile) -> str:
     """What a search came to, and how far its phases are."""
     sentences = " ".join([words.headline(study), *words.verdict(study)])
     sheet = phases_sheet(study)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from edp.evaluation.study import StudyFile
 from edp.report.common.chart import (
     BLUE,
     DROPPED,
@@ -29,7 +30,6 @@ from edp.report.common.chart import (
     with_unit,
 )
 from edp.report.common.sheets import chance
-from edp.report.search.facts import StudyFacts
 from edp.report.search.views import (
     COSTS,
     ArmView,
@@ -47,7 +47,7 @@ from edp.report.search.views import (
 from edp.wording import decimals_for, number
 
 
-def study_charts(study: StudyFacts) -> list[Chart]:
+def study_charts(study: StudyFile) -> list[Chart]:
     """Every figure that there are facts for."""
     views = forests(study)
     charts = [

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from edp.evaluation.study import StudyFile
 from edp.report.common.picture import write_pictures
 from edp.report.common.sheets import Sheet
 from edp.report.common.templates import template
 from edp.report.run.page import shown
 from edp.report.search import words as words
 from edp.report.search.charts import study_charts
-from edp.report.search.facts import StudyFacts, facts_of, reading
+from edp.report.search.facts import reading
 from edp.report.search.tables import sheets
 from edp.storage import make_folder, write_bytes
 from edp.wording import in_markdown, number, unbroken
@@ -38,21 +39,20 @@ class StudyReport:
     pictures: tuple[Path, ...]
 
 
-def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool = True) -> StudyReport:
+def write_study_page(study: StudyFile, out: str | Path, pictures: bool = True) -> StudyReport:
     """Write the report of a study: ``report.html``, ``report.md``, ``tables/*.csv`` and ``pictures/*``.
 
     A study that is not finished gets a report of what is decided and how far the rest is.
 
     Args:
-        study: content of ``study.json`` (`edp.storage.study_file.read_study`).
+        study: content of ``study.json`` (`edp.evaluation.study.read_study`).
         out: folder; it is made.
         pictures: whether to write them, which takes most of the time.
 
     Raises:
-        StorageError: the study is of another schema or damaged, or a file cannot be written.
+        StorageError: parts of the study contradict one another, or a file cannot be written.
     """
-    facts = facts_of(study)
-    page, text, tables = reading("study.json", lambda: _contents(facts))
+    page, text, tables = reading("study.json", lambda: _contents(study))
     folder = make_folder(out)
     target, document = folder / "report.html", folder / "report.md"
     write_bytes(target, page.encode("utf-8", "replace"))
@@ -61,16 +61,16 @@ def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool =
     for name, sheet in tables.items():
         table_files.append(make_folder(folder / "tables") / f"{name}.csv")
         write_bytes(table_files[-1], sheet.csv().encode("utf-8", "replace"))
-    drawn = reading("study.json", lambda: write_pictures(folder / "pictures", study_charts(facts))) if pictures else []
+    drawn = reading("study.json", lambda: write_pictures(folder / "pictures", study_charts(study))) if pictures else []
     return StudyReport(target, document, tuple(table_files), tuple(drawn))
 
 
-def _contents(facts: StudyFacts) -> tuple[str, str, dict[str, Sheet]]:
-    tables = sheets(facts)
-    return render_study(facts, tables), study_text(facts, tables), tables
+def _contents(study: StudyFile) -> tuple[str, str, dict[str, Sheet]]:
+    tables = sheets(study)
+    return render_study(study, tables), study_text(study, tables), tables
 
 
-def render_study(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
+def render_study(study: StudyFile, tables: Mapping[str, Sheet]) -> str:
     """The page's text."""
     context: dict[str, Any] = {
         "title": study.title,
@@ -90,12 +90,12 @@ def render_study(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
     return template("study.html.jinja").render(**context)
 
 
-def _about(study: StudyFacts) -> str:
-    hours = number(study.data["hours"], 1)
-    return f"{study.mode} mode · preset {study.preset} · {study.data['sessions']} sessions, {hours} h · {study.state}"
+def _about(study: StudyFile) -> str:
+    hours = number(study.data.hours, 1)
+    return f"{study.mode} mode · preset {study.preset} · {study.data.sessions} sessions, {hours} h · {study.state}"
 
 
-def study_text(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
+def study_text(study: StudyFile, tables: Mapping[str, Sheet]) -> str:
     """The report as Markdown: what came out, what was decided and why, what it can show, and the tables."""
     lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_about(study))}.", ""]
     lines += [in_markdown(words.headline(study)), "", in_markdown(" ".join(words.verdict(study))), ""]

@@ -10,6 +10,8 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
 from edp.config.experiment import Experiment, Table, build, plain_tree
 from edp.data.prepared import Prepared, prepare
 from edp.data.splits import ByRecording, Split, Stretch
@@ -22,6 +24,7 @@ from edp.networks.predictor import build_model
 from edp.networks.running import window_predictions
 from edp.recording import Recording
 from edp.settings.bounds import MOST_EPOCHS, MOST_UPDATES, SEED, check_bounds, integer
+from edp.storage.ledger import Record
 from edp.training.bundle import blank_scaler
 from edp.training.parts import fit_part
 
@@ -138,6 +141,38 @@ class TrainingRequest:
             tuple(plain.get("validation", ())),
             plain.get("recipe"),
         )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an order.
+
+    Attributes:
+        order: what was to be trained.
+        status: ``done``, or how it ended.
+        result: of `edp.workflows.search.trainings.train_order`, where it is done.
+        message: what went wrong.
+    """
+
+    order: TrainingRequest
+    status: str
+    result: Mapping[str, Any] | None = None
+    message: str = ""
+
+    @staticmethod
+    def of(order: TrainingRequest, record: Record) -> Outcome:
+        """The outcome of an order, from the ledger's record of it."""
+        return Outcome(order, str(record.status), record.result, record.message)
+
+    def score(self, session: str, horizon: int, name: str = "composite") -> float:
+        """A score on one session; NaN where the training did not end well, which counts as the worst."""
+        if self.result is None:
+            return float("nan")
+        return float(self.result["sessions"][session][str(horizon)][name])
+
+    def mean(self, horizon: int, name: str = "composite") -> float:
+        """A score, mean over the judging sessions; NaN where the training did not end well."""
+        return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
 
 
 def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
