@@ -29,7 +29,7 @@ class _RunByDefault(TyperGroup):
     """`edp search DATA ...` is `edp search run DATA ...`."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that is named, or `run`."""
+        """Return the named command, or `run`."""
         if args and args[0] not in self.commands:
             args = [DEFAULT, *args]
         return super().resolve_command(ctx, args)
@@ -121,7 +121,7 @@ def run(
 
 @app.command("status")
 def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
-    """How far a study is: phases, trainings done, running and left, what was decided. Changes nothing.
+    """Show the progress of a study: phases, trainings done, running and left, decisions. Nothing is changed.
 
     Example: `edp search status studies/first`
     """
@@ -154,7 +154,7 @@ def export(
     output: Annotated[Path | None, typer.Option("--out", help="The journal; default: optuna.journal in DIR.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Copy the questions of phases 1, 4 and 5 into a journal for optuna-dashboard; the study itself stays as it is.
+    """Export the trials of phases 1, 4 and 5 as a journal for optuna-dashboard. The study is unchanged.
 
     Example: `edp search export studies/first && optuna-dashboard studies/first/optuna.journal`
     """
@@ -209,7 +209,7 @@ def _show(result: SearchResult, page: Path) -> None:
 
 
 def _deploying(result: SearchResult) -> str:
-    """The command that goes on with the network that phase 6 chose."""
+    """Return the command that deploys the network chosen by phase 6."""
     from edp.evaluation.study_facts import SmallerFacts
 
     facts = result.context.facts(SmallerFacts)
