@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -144,7 +144,8 @@ class Study:
         self._study = optuna.create_study(
             directions=["minimize"] * self.objectives,
             sampler=optuna.samplers.RandomSampler(seed=0),
-            pruner=PRUNERS[self.pruner](),
+            # Optuna's defaults: after five whole trials; the first rung is the warm-up.
+            pruner=optuna.pruners.MedianPruner() if self.pruner == "median" else optuna.pruners.NopPruner(),
         )
         self._distributions = {name: _distribution(self.space[name]) for name in names(self.space)} | {
             name: _distribution(Choice((0, 1))) for name in self.flags
@@ -278,66 +279,28 @@ class Study:
 
     def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
         seed = int.from_bytes(hashlib.blake2b(f"{self.root} {number}".encode(), digest_size=4).digest(), "big")
-        kind = self.sampler.kind
+        kind, startup = self.sampler.kind, self.sampler.startup
         # A Gaussian process does not learn from trials that were refused for their costs.
         if kind == "gp" and (number >= GP_TRIALS or self.bounds):
             kind = "tpe"
-        sampler: optuna.samplers.BaseSampler = SAMPLERS[kind](seed, self.sampler.startup)
-        return sampler
+        from optuna.samplers import GPSampler, RandomSampler, TPESampler
+
+        if kind == "random":
+            return RandomSampler(seed=seed)
+        if kind == "thesis_tpe":
+            return TPESampler(seed=seed, n_startup_trials=startup, multivariate=False, constant_liar=False)
+        if kind == "tpe":
+            return TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
+        return GPSampler(
+            seed=seed,
+            n_startup_trials=startup,
+            independent_sampler=TPESampler(seed=seed, n_startup_trials=startup),
+            warn_independent_sampling=False,
+        )
 
 
-def _gp(seed: int, startup: int) -> Any:
-    from optuna.samplers import GPSampler, TPESampler
-
-    fallback = TPESampler(seed=seed, n_startup_trials=startup)
-    return GPSampler(
-        seed=seed,
-        n_startup_trials=startup,
-        independent_sampler=fallback,
-        warn_independent_sampling=False,
-    )
-
-
-def _tpe(seed: int, startup: int) -> Any:
-    from optuna.samplers import TPESampler
-
-    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
-
-
-def _thesis_tpe(seed: int, startup: int) -> Any:
-    from optuna.samplers import TPESampler
-
-    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=False, constant_liar=False)
-
-
-def _random(seed: int, startup: int) -> Any:
-    from optuna.samplers import RandomSampler
-
-    return RandomSampler(seed=seed)
-
-
-SAMPLERS: dict[str, Callable[[int, int], Any]] = {
-    "gp": _gp,
-    "tpe": _tpe,
-    "thesis_tpe": _thesis_tpe,
-    "random": _random,
-}
-
-
-def _no_pruner() -> Any:
-    from optuna.pruners import NopPruner
-
-    return NopPruner()
-
-
-def _median() -> Any:
-    """Optuna's defaults: after five whole trials; the first rung is the warm-up."""
-    from optuna.pruners import MedianPruner
-
-    return MedianPruner()
-
-
-PRUNERS: dict[str, Callable[[], Any]] = {"none": _no_pruner, "median": _median}
+SAMPLERS = ("gp", "tpe", "thesis_tpe", "random")
+PRUNERS = ("none", "median")
 
 
 def _distribution(dimension: Range) -> Any:
