@@ -29,7 +29,6 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )
-from edp.report.common.sheets import chance
 from edp.report.search.views import (
     COSTS,
     ArmView,
@@ -44,6 +43,7 @@ from edp.report.search.views import (
     top_of,
     tracks,
 )
+from edp.table import chance
 from edp.wording import decimals_for, number
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from edp.errors import count_of
 from edp.evaluation.study import StudyFile
 from edp.evaluation.study_facts import SoundConfirmation, SoundScreening, ThesisConfirmation, ThesisScreening
-from edp.report.common.sheets import Column, Sheet, chance, figures
 from edp.report.search.facts import finite, of_phase
 from edp.stats.confirm import ModuleEvidence
 from edp.stats.thesis_confirm import ThesisEvidence
+from edp.table import Column, Table, chance, figures
 from edp.wording import interval
 
 GROUPS = {
@@ -24,7 +24,7 @@ GROUPS = {
 OTHER = "Other"
 
 
-def modules_sheets(study: StudyFile) -> tuple[Sheet, ...]:
+def modules_tables(study: StudyFile) -> tuple[Table, ...]:
     """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
     sheets = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
     return tuple(sheet for sheet in sheets if sheet is not None)
@@ -39,7 +39,7 @@ def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 @of_phase(SoundScreening, ())
-def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Sheet | None, ...]:
+def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Table | None, ...]:
     confirmation = study.facts(SoundConfirmation)
     evidence = {} if confirmation is None else confirmation.by_module()
     rows, marked = [], set()
@@ -64,21 +64,21 @@ def _modules_sound(study: StudyFile, facts: SoundScreening) -> tuple[Sheet | Non
             marked.add(len(rows) - 1)
     columns = (
         Column("Module"),
-        Column("Group"),
+        Column("Group", is_text=True),
         Column("Phase 2", "change, %", figures([], signed=True, decimals=2)),
         Column("Phase 3", "change, %", figures([], signed=True, decimals=2)),
         Column("95 % interval", "%"),
         Column("p", "one-sided", chance),
         Column("p", "adjusted", chance),
         Column("d_z", "Cohen", figures([], signed=True, decimals=2)),
-        Column("Verdict"),
+        Column("Verdict", is_text=True),
     )
     caption = f"Modules in phases 2 and 3; below zero is better, p is adjusted over all {len(facts.registered)} modules"
-    return Sheet("modules", caption, columns, tuple(rows), frozenset(marked)), _tests(study), _effects(study)
+    return Table(caption, columns, tuple(rows), frozenset(marked), name="modules"), _tests(study), _effects(study)
 
 
 @of_phase(SoundScreening, None)
-def _effects(study: StudyFile, facts: SoundScreening) -> Sheet | None:
+def _effects(study: StudyFile, facts: SoundScreening) -> Table | None:
     """Main effects of the two-level design."""
     rows = []
     for _, name in ordered(facts.registered):
@@ -90,10 +90,10 @@ def _effects(study: StudyFile, facts: SoundScreening) -> Sheet | None:
         Column("Change", "%", figures([], signed=True, decimals=2)),
         Column("p", "one-sided", chance),
         Column("Importance", "% of what is explained", figures([], decimals=0)),
-        Column("Verdict"),
+        Column("Verdict", is_text=True),
     )
     caption = "Phase 2: main effects of the two-level design, on average over all other modules"
-    return Sheet("effects", caption, columns, tuple(rows))
+    return Table(caption, columns, tuple(rows), name="effects")
 
 
 def _verdict(study: StudyFile, entry: ModuleEvidence | None, passed: bool) -> str:
@@ -107,7 +107,7 @@ def _verdict(study: StudyFile, entry: ModuleEvidence | None, passed: bool) -> st
 
 
 @of_phase(SoundConfirmation, None)
-def _tests(study: StudyFile, facts: SoundConfirmation) -> Sheet | None:
+def _tests(study: StudyFile, facts: SoundConfirmation) -> Table | None:
     """What other tests say of the modules that phase 3 tested."""
     rows = []
     for entry in facts.evidence:
@@ -133,11 +133,11 @@ def _tests(study: StudyFile, facts: SoundConfirmation) -> Sheet | None:
         Column("d_z", "95 % interval"),
         Column("Runs won", "%", figures([], decimals=0)),
     )
-    return Sheet("tests", "Other tests on the same trainings; all one-sided, not adjusted", columns, tuple(rows))
+    return Table("Other tests on the same trainings; all one-sided, not adjusted", columns, tuple(rows), name="tests")
 
 
 @of_phase(ThesisScreening, ())
-def _modules_thesis(study: StudyFile, facts: ThesisScreening) -> tuple[Sheet | None, ...]:
+def _modules_thesis(study: StudyFile, facts: ThesisScreening) -> tuple[Table | None, ...]:
     confirmation = study.facts(ThesisConfirmation) or ThesisConfirmation(confirmed=(), evidence=())
     metrics = list(dict.fromkeys(entry.metric for entry in confirmation.evidence))
     by_cell = {(entry.module, entry.metric): entry for entry in confirmation.evidence}
@@ -165,7 +165,13 @@ def _modules_thesis(study: StudyFile, facts: ThesisScreening) -> tuple[Sheet | N
         Column("Runs won", "%", figures([], decimals=0)),
     )
     gain = Column("Δp₂", study.unit, figures([row[2] for row in rows], signed=True))
-    first = (Column("Module"), Column("Group"), gain, *tests_columns, Column("Verdict"))
+    first = (
+        Column("Module"),
+        Column("Group", is_text=True),
+        gain,
+        *tests_columns,
+        Column("Verdict", is_text=True),
+    )
     shown = f"; tests on {metrics[0].upper()}, a module is confirmed on any metric" if metrics else ""
     caption = f"Modules in phases 2 and 3, the thesis's procedure: better is Δp₂ > 0 and d_z < 0{shown}"
     second = (
@@ -177,8 +183,8 @@ def _modules_thesis(study: StudyFile, facts: ThesisScreening) -> tuple[Sheet | N
         *(*tests_columns, Column("Gates")),
     )
     return (
-        Sheet("modules", caption, first, tuple(rows), frozenset(marked)),
-        Sheet("tests", "The thesis's gates on every metric", second, tuple(every)),
+        Table(caption, first, tuple(rows), frozenset(marked), name="modules"),
+        Table("The thesis's gates on every metric", second, tuple(every), name="tests"),
     )
 
 

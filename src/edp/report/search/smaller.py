@@ -5,13 +5,13 @@ from __future__ import annotations
 from edp.evaluation.compression import Scores
 from edp.evaluation.study import StudyFile
 from edp.evaluation.study_facts import SmallerFacts
-from edp.report.common.sheets import Column, Sheet, figures
 from edp.report.search.facts import of_phase
+from edp.table import Column, Table, figures
 from edp.wording import number, percent
 
 
 @of_phase(SmallerFacts, None)
-def smaller_sheet(study: StudyFile, facts: SmallerFacts) -> Sheet | None:
+def smaller_table(study: StudyFile, facts: SmallerFacts) -> Table | None:
     """Every network in every number format: what it takes, its error, and whether it fits; the front is marked."""
     rows = tuple(
         (
@@ -39,10 +39,10 @@ def smaller_sheet(study: StudyFile, facts: SmallerFacts) -> Sheet | None:
         Column("MAE", study.unit, figures([row[6] for row in rows])),
         Column("Composite", study.unit, figures([row[7] for row in rows])),
         Column("Change", "% of the teacher's MAE", figures([], signed=True, decimals=1)),
-        Column("Budget"),
+        Column("Budget", is_text=True),
     )
     caption = "Smaller networks of the teacher on development sessions that do not train; marked: the front"
-    return Sheet("compression", caption, columns, rows, frozenset(facts.front))
+    return Table(caption, columns, rows, frozenset(facts.front), name="compression")
 
 
 def _mean(scores: Scores, name: str) -> float:

@@ -8,10 +8,10 @@ from typing import Any
 
 from edp.evaluation.study import StudyFile, read_study
 from edp.report import Facts, headline
-from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, score_figure, score_tables, study_figure, study_html, text_of
 from edp.report.run.facts import comparison_rows, score
 from edp.report.search import words
+from edp.table import Table
 from edp.workflows.api.frames import OneFrame
 
 
@@ -22,7 +22,7 @@ class ShownTable:
         tables: one below the other.
     """
 
-    def __init__(self, tables: list[TextTable]) -> None:
+    def __init__(self, tables: list[Table]) -> None:
         self._tables = tables
 
     def __repr__(self) -> str:
