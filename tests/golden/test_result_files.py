@@ -47,9 +47,6 @@ def write_runs(folder):
     source = write_logs(folder / "logs")
     train(source, load_experiment(preset="quick", overrides=NETWORK), folder / "network")
     evaluate(folder / "network")
-    evaluate(folder / "network", at_most_h=0.002)
-    (folder / "network" / "scores.json").rename(folder / "network" / "drawn.json")
-    evaluate(folder / "network")
     train_twin(source, load_twin_experiment(None, TWIN), folder / "twin")
     return folder
 

@@ -12,6 +12,7 @@ from noted_progress import NotedProgress
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
+from edp.evaluation.scores_file import ScoresFile
 from edp.report import build_report
 from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
@@ -208,10 +209,10 @@ def test_page_and_file_show_every_model_on_left_out_data_and_on_the_test_part(re
     assert set(results) == {"network", "persistence", "ridge_arx"}
     assert "validation" not in results["network"]  # it trained on that part; its promise is from rows left out
     facts = read_facts(copied)
-    models = facts.scores["models"]
+    models = facts.scores.models
     for name in ("persistence", "ridge_arx"):
-        assert results[name]["test"]["4"]["y"] == models[name]["overall"]["4"]["y"]["rmse"]
-        assert results[name]["validation"]["4"]["y"] == models[name]["validation"]["4"]["y"]["rmse"]
+        assert results[name]["test"]["4"]["y"] == models[name].overall["4"]["y"]["rmse"]
+        assert results[name]["validation"]["4"]["y"] == models[name].validation["4"]["y"]["rmse"]
         assert results[name]["validation"] != results[name]["test"]
     (table,) = model_tables(facts, read_choice(copied))
     rows = {cells[0]: cells[1:] for cells in table.rows}
@@ -384,11 +385,12 @@ def scores(network, **others):
     def model(errors):
         return {"overall": {"1": {name: {"rmse": value} for name, value in errors.items()}}, "label": "x"}
 
-    return {
+    table = {
         "task": {"horizons": [1]},
         "targets": [{"name": "a"}, {"name": "b"}],
         "models": {"network": model(network), **{name: model(errors) for name, errors in others.items()}},
     }
+    return ScoresFile.from_table(table, "scores")
 
 
 def test_the_guard_names_the_baseline_that_wins_and_where():

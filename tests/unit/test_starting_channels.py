@@ -151,6 +151,6 @@ def test_a_network_learns_to_start_from_a_measured_state(free, tiny_model, tiny_
     def error(data):
         fitted = fit(data, tiny_model, spec)
         scores = judge(fitted.predictor, data, JudgeSpec(baselines=(), skip=TICKS), "").scores
-        return scores["models"]["network"]["overall"]["0"]["mean"]["mae"]
+        return scores.models["network"].overall["0"]["mean"]["mae"]
 
     assert error(free) < 0.7 * error(blind)

@@ -6,6 +6,7 @@ registries by the names of these fields; `build` and `plain_tree` are those of a
 
 from __future__ import annotations
 
+import types
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
@@ -235,8 +236,9 @@ class SettingsTree:
             return None
 
     def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
-        if value is None and type(None) in _leaves(hint):
+        if value is None and _allows_none(hint):
             return None  # JSON has a word for it; TOML leaves the key out
+        hint = _stated(hint)
         form = _form(hint)
         if name in self.parts:
             if form.sequence:
@@ -330,10 +332,25 @@ class _Form(typing.NamedTuple):
 def _form(hint: Any) -> _Form:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     sequence = origin is tuple
-    table: Any = hint if is_dataclass(hint) else next((c for c in (() if sequence else inner) if is_dataclass(c)), None)
+    choices = () if origin in (tuple, Mapping) else inner
+    table: Any = hint if is_dataclass(hint) else next((c for c in choices if is_dataclass(c)), None)
     item: Any = inner[0] if sequence and inner and is_dataclass(inner[0]) else None
     values = inner[1] if origin is Mapping and inner else None
     return _Form(sequence, Ellipsis in inner, table, item, values)
+
+
+@cache
+def _allows_none(hint: Any) -> bool:
+    is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return hint is type(None) or (is_union and type(None) in typing.get_args(hint))
+
+
+@cache
+def _stated(hint: Any) -> Any:
+    """Return the list or mapping in a hint that also allows None; other hints as they are."""
+    inner = [one for one in typing.get_args(hint) if one is not type(None)]
+    is_list = len(inner) == 1 and typing.get_origin(inner[0]) in (tuple, Mapping)
+    return inner[0] if is_list and _allows_none(hint) else hint
 
 
 @cache

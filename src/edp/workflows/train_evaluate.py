@@ -27,7 +27,7 @@ from edp.evaluation.judge import (
     judge,
     score_network,
 )
-from edp.evaluation.scores_file import earlier_scores
+from edp.evaluation.scores_file import PREDICTIONS, DrawnSample, ModelScores, ScoresFile, earlier_scores
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
@@ -36,7 +36,7 @@ from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
 from edp.storage import check_writable, make_folder, write_bytes, write_json
-from edp.storage.headers import FILES, digests_of
+from edp.storage.headers import digests_of
 from edp.storage.paths import is_folder_at, is_there
 from edp.storage.provenance import read_provenance
 from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
@@ -255,13 +255,17 @@ def evaluate(
             bench = ModelBench(bundle.predictor, data, chosen)
             evaluation = bench.together(judged_by(bench, " ".join(judged)))
         # Scores that lack a baseline are not kept for a call that asks for all.
-        sample = {} if drawn is None else {"drawn": {**asdict(drawn), "what": drawn.what}}
-        scores = evaluation.scores | sample | {"key": "" if "left_out" in evaluation.scores else key}
-        write_bytes(target / "predictions.safetensors", save(evaluation.tensors))
-        write_json(target / "scores.json", scores | {FILES: digests_of(target, "predictions.safetensors")})
+        write_bytes(target / PREDICTIONS, save(evaluation.tensors))
+        scores = replace(
+            evaluation.scores,
+            drawn=None if drawn is None else DrawnSample(**asdict(drawn), what=drawn.what),
+            key="" if evaluation.scores.left_out else key,
+            files=digests_of(target, PREDICTIONS),
+        )
+        scores.write(target)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
-        save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
+        save_bundle(replace(bundle, scores=scores.models["network"].overall), folder / "bundle")
     return target
 
 
@@ -329,12 +333,12 @@ def channel_importance(
     return importances, target / "channel_importance.json"
 
 
-def _floor_scores(folder: Path, data: Prepared, scores: Mapping[str, Any]) -> dict[str, Any] | None:
+def _floor_scores(folder: Path, data: Prepared, scores: ScoresFile) -> ModelScores | None:
     """Scores, on the same ticks, of what the preset auto tells its skill against; None where the run has none."""
     if not is_folder_at(folder / FLOOR):
         return None
     floor = load_bundle(folder / FLOOR).predictor
-    return score_network(floor, data, scores["task"]["skip"])
+    return score_network(floor, data, scores.task.skip)
 
 
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:

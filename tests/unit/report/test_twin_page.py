@@ -11,6 +11,7 @@ from safetensors.numpy import save
 from edp.data.twin_channels import TwinChannels
 from edp.errors import StorageError
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores
+from edp.evaluation.free_run_file import FreeRunFile
 from edp.networks.twin import calibrate
 from edp.report.common.interactive import plots
 from edp.report.twin.charts import twin_charts
@@ -18,7 +19,7 @@ from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets
 from edp.report.twin.page import render
 from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
-from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
+from edp.workflows.twin.judge_twin import reported_channels, shown_runs, write_scores
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), covered_at_s=(0.2, 1.0))
@@ -44,7 +45,7 @@ def judged(strokes=True, name="boom", swing=False, kind=Kind.VELOCITY):
 
 def facts_of(**options):
     scores, runs, intervals = judged(**options)
-    content = {"schema": 2, "channels": channel_facts(runs.channels), "models": json.loads(json.dumps(scores))}
+    content = FreeRunFile(channels=reported_channels(runs.channels), models=scores)
     return FreeRunFacts("m22", content, shown_runs(runs, intervals))
 
 
@@ -114,8 +115,8 @@ def test_tables_say_what_the_scores_hold():
     sheets = sheets_of(facts)
     assert list(sheets) == ["models", "recordings", "driving", "situations", "intervals"]
     assert [row[0] for row in sheets["driving"].rows] == ["dig", "grade"]
-    assert sheets["models"].rows[0][2] == facts.twin["velocity_mae"]["mean"]
-    assert sheets["intervals"].rows[1][2] == facts.twin["intervals"]["at"][1]["velocities"]["half_width"]["mean"]
+    assert sheets["models"].rows[0][2] == facts.twin.velocity_mae.mean
+    assert sheets["intervals"].rows[1][2] == facts.twin.intervals.at[1].velocities.half_width.mean
     worst = [max(row[3:5]) for row in sheets["recordings"].rows]
     assert len(worst) == 2
 
@@ -155,9 +156,12 @@ def test_what_was_written_is_read(folder):
     ("change", "message"),
     [
         (lambda content: content.update(schema=1), "of another version of EDP"),
-        (lambda content: content["models"].pop("twin"), "the key 'twin'"),
+        (lambda content: content["models"].pop("twin"), "'models.twin' is missing"),
         (lambda content: content["models"]["twin"]["velocity_mae"].update(mean="low"), "models.twin.velocity_mae.mean"),
-        (lambda content: content["models"]["twin"]["stroke_error"][0].pop("unit"), "the key 'unit'"),
+        (
+            lambda content: content["models"]["twin"]["stroke_error"][0].pop("unit"),
+            r"stroke_error\[0\]\.unit'",
+        ),
         (lambda content: content["channels"]["pressures"].append({"name": 3}), "channels.pressures"),
         (lambda content: content["channels"]["pressures"].clear(), "does not fit its scores"),
     ],

@@ -79,7 +79,7 @@ def test_all_models_are_scored_on_the_same_ticks(run):
     bench = judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=("ridge_arx",), history=30))
     assert bench.skip == 30
     models = [bench.network("", 0.0), bench.baseline("ridge_arx")]
-    counts = [[scores["mean"]["count"] for scores in model.entry["overall"].values()] for model in models]
+    counts = [[scores["mean"]["count"] for scores in model.entry.overall.values()] for model in models]
     assert counts[0] == counts[1]
     assert judge.ModelBench(bundle.predictor, data, judge.JudgeSpec(baselines=())).skip == 10
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError, count_of
+from edp.evaluation.scores_file import MEAN, ByHorizon, ModelScores, ScoredTarget, ScoresFile, error_at, metric
 from edp.report.common.tables import TextTable
-from edp.report.run.facts import NETWORK, Facts, Target, horizon_text, label_of, score
+from edp.report.run.facts import NETWORK, Facts, horizon_text, label_of, score
 from edp.report.run.figures import horizons_shown
 from edp.storage import read_object, write_json
 from edp.storage.paths import is_file_at
@@ -53,7 +54,7 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
     return content
 
 
-def note_test_result(folder: Path, scores: Mapping[str, Any], floor: Mapping[str, Any] | None = None) -> None:
+def note_test_result(folder: Path, scores: ScoresFile, floor: ModelScores | None = None) -> None:
     """Write what every model reached into ``auto.json``, where a run has one.
 
     Args:
@@ -68,14 +69,14 @@ def note_test_result(folder: Path, scores: Mapping[str, Any], floor: Mapping[str
     if content is None:
         return
     results = {
-        name: {"label": model["label"], "test": _errors(model["overall"])}
-        | ({"validation": _errors(model["validation"])} if "validation" in model else {})
-        for name, model in scores["models"].items()
+        name: {"label": model.label, "test": _errors(model.overall)}
+        | ({"validation": _errors(model.validation)} if model.validation else {})
+        for name, model in scores.models.items()
     }
-    against = scores["models"].get(PERSISTENCE) if floor is None else floor
+    against = scores.models.get(PERSISTENCE) if floor is None else floor
     skill = content.get("skill")
     if skill and against and (floor is not None) == (skill["against"] == FLOOR):
-        skill = {**skill, "test": _ratios(results[NETWORK]["test"], _errors(against["overall"]))}
+        skill = {**skill, "test": _ratios(_errors(scores.models[NETWORK].overall), _errors(against.overall))}
     write_json(folder / FILE, {**content, "results": results, **({"skill": skill} if skill else {})})
 
 
@@ -89,10 +90,10 @@ def _ratios(
     }
 
 
-def _errors(overall: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+def _errors(overall: ByHorizon) -> dict[str, dict[str, float]]:
     """Root-mean-square errors by horizon and target."""
     return {
-        k: {name: metrics["rmse"] for name, metrics in targets.items() if name != "mean"}
+        k: {name: metric(metrics, "rmse") for name, metrics in targets.items() if name != MEAN}
         for k, targets in overall.items()
     }
 
@@ -153,16 +154,15 @@ def model_tables(facts: Facts, content: Mapping[str, Any]) -> list[TextTable]:
     return [table for table in (_of_output(facts, content, target) for target in facts.targets) if table.rows]
 
 
-def _of_output(facts: Facts, content: Mapping[str, Any], target: Target) -> TextTable:
+def _of_output(facts: Facts, content: Mapping[str, Any], target: ScoredTarget) -> TextTable:
     horizons = horizons_shown(facts)
     chosen = content["chosen"]
 
     def tested(name: str, k: int) -> float | None:
-        return score(facts.models.get(name, {}), k, "rmse", target.name)
+        return score(facts.models.get(name), k, "rmse", target.name)
 
     def validated(name: str, k: int) -> float | None:
-        model = facts.models[name]
-        return score({"overall": model.get("validation", {})}, k, "rmse", target.name)
+        return error_at(facts.models[name].validation, k, target.name, "rmse")
 
     def row(label: str, pairs: list[tuple[float | None, float | None]]) -> tuple[str, list[float | None]]:
         return label, [value for pair in pairs for value in pair]
@@ -196,7 +196,7 @@ def promise_table(facts: Facts, content: Mapping[str, Any]) -> TextTable | None:
     for target in facts.targets:
         for k in facts.horizons:
             expected = _at(promised, k, target.name)
-            test = score(facts.models.get(NETWORK, {}), k, "rmse", target.name)
+            test = score(facts.models.get(NETWORK), k, "rmse", target.name)
             if expected is None or test is None:
                 continue
             bounds = [_at((interval or {}).get(side, {}), k, target.name) for side in ("low", "high")]

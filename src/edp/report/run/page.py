@@ -60,10 +60,9 @@ def render(facts: run.Facts, title: str | None = None) -> str:
 
 def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
     """Everything the template shows."""
-    task = (facts.scores or {}).get("task", {})
     network = run.label_of(facts, run.NETWORK) if run.NETWORK in facts.models else ""
     return {
-        "title": title or task.get("name") or full_path(facts.folder).name,
+        "title": title or (facts.scores.task.name if facts.scores else "") or full_path(facts.folder).name,
         "network": network,
         "run_name": full_path(facts.folder).name,
         "created": moment((facts.provenance or {}).get("created")),
@@ -74,7 +73,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "outputs": tables.output_table(facts),
         "intervals": tables.interval_table(facts),
         "spread": run.spread_text(facts),
-        "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
+        "ranked": bool(network) and len(facts.models[run.NETWORK].recordings) > DOTS_AT_MOST,
         "choice": choice_of(facts),
         "unseen": foundation_tables(facts),
         "situations": situations_of(facts),

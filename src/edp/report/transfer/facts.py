@@ -17,7 +17,7 @@ from edp.errors import StorageError, count_of
 from edp.evaluation.guard import ErrorRatios, ErrorVerdict, best_verdict, by_recording
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.storage import read_json
-from edp.storage.headers import check_files
+from edp.storage.headers import FILES, check_files
 from edp.storage.paths import is_file_at
 from edp.wording import listed, number, percent, quantity, unit_text
 
@@ -110,7 +110,7 @@ def read_transfer(folder: str | Path) -> Transfer:
     content = read_json(file)
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise StorageError(f"'{file}' is of another version of EDP; run edp finetune again")
-    check_files(content, folder, "run edp finetune again")
+    check_files(content.get(FILES, {}), folder, "run edp finetune again")
     try:
         shown = load_file(Path(folder) / SHOWN)
     except (OSError, SafetensorError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from edp.evaluation.free_run_file import PARTS
 from edp.report.common.provenance import provenance_rows
 from edp.report.common.templates import template
 from edp.report.run.page import shown
@@ -52,9 +53,9 @@ def render(facts: FreeRunFacts, title: str | None = None) -> str:
         "verdict": words.verdict(facts),
         "tiles": words.tiles(facts),
         "sheets": {name: sheet.table() for name, sheet in words.sheets_of(facts).items()},
-        "moments": facts.steps.get("moments", 0),
+        "moments": facts.steps.moments if facts.steps else 0,
         "provenance": provenance_rows(facts.provenance),
-        "parts": [part for part in words.PARTS if f"runs_{part}" in figures["plots"]],
+        "parts": [part for part in PARTS if f"runs_{part}" in figures["plots"]],
         **figures,
     }
     return template("twin.html.jinja").render(**context)

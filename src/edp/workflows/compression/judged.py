@@ -11,6 +11,7 @@ import numpy as np
 from edp.data.prepared import Prepared
 from edp.evaluation.controller import Budget
 from edp.evaluation.judge import score_predictions
+from edp.evaluation.scores_file import MEAN, metric
 from edp.stats.pareto import pareto
 from edp.workflows.compression.bench import CompressionRequest
 from edp.workflows.compression.formats.base import FORMATS, Deployed, ResourceUsage
@@ -81,9 +82,9 @@ class CompressionResult:
 
 def measure(deployed: Deployed, data: Prepared, skip: int) -> dict[str, dict[str, float]]:
     """Mean absolute error and composite score on ``data.test`` by horizon, the mean over outputs, report units."""
-    overall = score_predictions(deployed.predict(data.test), data, skip)["overall"]
+    overall = score_predictions(deployed.predict(data.test), data, skip).overall
     return {
-        horizon: {key: float(by_target["mean"][key]) for key in ("mae", "composite")}
+        horizon: {key: metric(by_target[MEAN], key) for key in ("mae", "composite")}
         for horizon, by_target in overall.items()
     }
 

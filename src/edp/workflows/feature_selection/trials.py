@@ -19,12 +19,13 @@ from edp.config.experiment import Experiment, FeatureSettings
 from edp.data.features import FEATURE_SETS, Derived
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, closest
+from edp.evaluation.scores_file import MEAN, ScoresFile, metric
 from edp.logs.source import DataSource
 from edp.networks.streaming import parameters_of
 from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, check_count, integer
 from edp.signals import Kind
-from edp.storage import make_folder, read_object, write_json
+from edp.storage import make_folder, write_json
 from edp.training import Bundle, TrainingProgress
 from edp.workflows.train_evaluate import evaluate, train
 
@@ -264,7 +265,7 @@ class _Finished:
     features: int
     parameters: int
     seconds: float
-    scores: dict[str, Any]
+    scores: ScoresFile
 
     @staticmethod
     def of(bundle: Bundle, run: Path) -> _Finished:
@@ -273,7 +274,7 @@ class _Finished:
             len(bundle.task.features.features),
             parameters_of(bundle.predictor),
             float(bundle.provenance["seconds"]),
-            read_object(run / "scores.json", ("models", "targets")),
+            ScoresFile.read(run),
         )
 
 
@@ -284,8 +285,8 @@ def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str],
     by_recording = {name: _recordings(finished[name], ahead) for name in names}
     trials = []
     for name in names:
-        models = [run.scores["models"]["network"] for run in finished[name]]
-        by_seed = {h: tuple(float(m["overall"][h]["mean"]["mae"]) for m in models) for h in ahead}
+        models = [run.scores.models["network"] for run in finished[name]]
+        by_seed = {h: tuple(metric(m.overall[h][MEAN], "mae") for m in models) for h in ahead}
         difference = None
         # An interval needs two recordings at least.
         if name != names[0] and len(by_recording[name][ahead[0]]) > 1:
@@ -304,16 +305,19 @@ def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str],
             )
         )
     scores = finished[names[0]][0].scores
-    persistence = {h: float(scores["models"]["persistence"]["overall"][h]["mean"]["mae"]) for h in ahead}
-    units = {target["unit"] for target in scores["targets"]}
+    persistence = {h: metric(scores.models["persistence"].overall[h][MEAN], "mae") for h in ahead}
+    units = {target.unit for target in scores.targets}
     unit = units.pop() if len(units) == 1 else "mixed units"
     return Trials(tuple(trials), persistence, unit, tuple(by_recording[names[0]][ahead[0]]), tuple(notes))
 
 
 def _recordings(runs: Sequence[_Finished], ahead: Sequence[str]) -> dict[str, dict[str, float]]:
     """Error by horizon and recording, mean over seeds."""
-    each = [run.scores["models"]["network"]["recordings"] for run in runs]
-    return {h: {name: float(np.mean([one[name][h]["mean"]["mae"] for one in each])) for name in each[0]} for h in ahead}
+    each = [run.scores.models["network"].recordings for run in runs]
+    return {
+        h: {name: float(np.mean([metric(one[name][h][MEAN], "mae") for one in each])) for name in each[0]}
+        for h in ahead
+    }
 
 
 def _difference(ours: Mapping[str, float], reference: Mapping[str, float]) -> PairedDifference:

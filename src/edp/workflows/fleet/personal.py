@@ -15,6 +15,7 @@ from edp.config.experiment import Change
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, EdpError, StorageError, closest
 from edp.evaluation.judge import score_predictions
+from edp.evaluation.scores_file import MEAN, metric
 from edp.jobs import Workforce
 from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.networks.predictor import Predictor
@@ -244,7 +245,7 @@ def _errors(network: Predictor, data: Prepared) -> float:
     """Mean absolute error over the outputs at the first horizon, on the ends of the recordings, in report units."""
     skip = max(network.spec.window, data.task.features.starting_ticks)
     scores = score_predictions(stream_predictions(network, data.test), data, skip)
-    return float(scores["overall"][str(data.task.horizons[0])]["mean"]["mae"])
+    return metric(scores.overall[str(data.task.horizons[0])][MEAN], "mae")
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,7 @@ from edp.report.common.provenance import provenance_rows
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts
 from edp.report.monitor.page import write_monitor_page
 from edp.storage import JSON_BYTES, object_with, parse_json, read_object, read_text
-from edp.storage.headers import check_files
+from edp.storage.headers import FILES, check_files
 from edp.storage.paths import full_path, is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import IDENTITY, missing_text
@@ -60,7 +60,7 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     if not is_there(folder / ALARM_LOG):
         raise StorageError(missing_text(folder, "monitor run"))
     content = read_object(file, ("promise", "monitor", "classes", "confusions"))
-    check_files(content, folder, "run the monitor again")
+    check_files(content.get(FILES, {}), folder, "run the monitor again")
     where = f"'{file}'"
     pairs, classes = content["confusions"], content["classes"]
     if not isinstance(pairs, list) or len(pairs) > MOST_PAIRS or type(classes) is not int or classes < 0:

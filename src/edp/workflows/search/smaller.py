@@ -22,6 +22,7 @@ from edp.errors import DataError, ExportError
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import score_predictions
+from edp.evaluation.scores_file import ModelScores, metric
 from edp.networks.predictor import ModelSpec, Predictor
 from edp.networks.running import stream_predictions
 from edp.training.bundle import blank_scaler
@@ -199,8 +200,8 @@ def _judged(recipe: Recipe, network: Predictor, data: Prepared) -> dict[str, Any
         formats[name] = {"scores": _overall(scored), "resource_usage": usage, "over": over}
         shown = scored if recipe.final else plain
     sessions = {
-        name: {k: {score: scores["mean"][score] for score in SCORES} for k, scores in horizons.items()}
-        for name, horizons in shown["recordings"].items()
+        name: {k: {score: metric(scores["mean"], score) for score in SCORES} for k, scores in horizons.items()}
+        for name, horizons in shown.recordings.items()
     }
     counted = footprint(network)
     return {
@@ -214,10 +215,10 @@ def _judged(recipe: Recipe, network: Predictor, data: Prepared) -> dict[str, Any
     }
 
 
-def _overall(scored: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+def _overall(scored: ModelScores) -> dict[str, dict[str, float]]:
     return {
-        horizon: {score: float(scores["mean"][score]) for score in ("mae", "composite")}
-        for horizon, scores in scored["overall"].items()
+        horizon: {score: metric(scores["mean"], score) for score in ("mae", "composite")}
+        for horizon, scores in scored.overall.items()
     }
 
 

@@ -17,6 +17,7 @@ from edp.errors import ConfigError, DataError
 from edp.evaluation.footprint import parameters_and_macs
 from edp.evaluation.judge import JudgeSpec, judge, score_predictions
 from edp.evaluation.mac_check import check_counted
+from edp.evaluation.scores_file import metric
 from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
 from edp.networks.running import window_predictions
@@ -173,11 +174,14 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
     if windowed:
         # Windows have no start-up of their own; the first whole one ends at the window's last tick.
         skip = max(spec.skip or 0, experiment.model.window, data.task.features.starting_ticks)
-        by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip)["recordings"]
+        by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip).recordings
     else:
-        by_recording = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
+        by_recording = judge(fitted.predictor, data, spec, "").scores.models["network"].recordings
     sessions = {
-        name: {k: {score: horizon_scores["mean"][score] for score in SCORES} for k, horizon_scores in horizons.items()}
+        name: {
+            k: {score: metric(horizon_scores["mean"], score) for score in SCORES}
+            for k, horizon_scores in horizons.items()
+        }
         for name, horizons in by_recording.items()
     }
     parameters, macs_tick = parameters_and_macs(fitted.predictor.costs())

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edp.data.prepared import Prepared
 from edp.evaluation.judge import Predictions, score_predictions
+from edp.evaluation.scores_file import MEAN, ByHorizon, metric
 from edp.signals import KINDS
 
 # An odd number, so that one bin is centred on zero error.
@@ -30,25 +31,27 @@ class MeasuredMethod:
         by_recording: mean absolute error over targets of each recording, by horizon.
     """
 
-    overall: Mapping[str, Any]
+    overall: ByHorizon
     by_recording: Mapping[str, Mapping[str, float]]
 
 
 def measure(predictions: Predictions, data: Prepared, skip: int) -> MeasuredMethod:
     """Return the scores of predictions on the test part."""
     scored = score_predictions(predictions, data, skip)
-    scores: dict[str, Any] = scored["overall"]
+    overall = {}
     for horizon, errors in errors_of(predictions, data, skip).items():
-        rows = scores[horizon]
-        for index, name in enumerate(data.task.targets):
-            rows[name] |= {"mse": rows[name]["rmse"] ** 2, "skew": skew(errors[:, index])}
-        own = [rows[name] for name in data.task.targets]
-        rows["mean"] |= {key: float(np.mean([row[key] for row in own])) for key in ("mse", "skew")}
+        rows = scored.overall[horizon]
+        own = {
+            name: {"mse": metric(rows[name], "rmse") ** 2, "skew": skew(errors[:, index])}
+            for index, name in enumerate(data.task.targets)
+        }
+        own[MEAN] = {key: float(np.mean([row[key] for row in own.values()])) for key in ("mse", "skew")}
+        overall[horizon] = {name: {**row, **own[name]} for name, row in rows.items()}
     by_recording = {
-        name: {horizon: row["mean"]["mae"] for horizon, row in by_horizon.items()}
-        for name, by_horizon in scored["recordings"].items()
+        name: {horizon: metric(row[MEAN], "mae") for horizon, row in by_horizon.items()}
+        for name, by_horizon in scored.recordings.items()
     }
-    return MeasuredMethod(scores, by_recording)
+    return MeasuredMethod(overall, by_recording)
 
 
 def errors_of(predictions: Predictions, data: Prepared, skip: int) -> Errors:

@@ -8,6 +8,7 @@ from typing import Any
 
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.errors import ConfigError
+from edp.evaluation.free_run_file import RUNS, FreeRunFile, StepResponses
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
@@ -20,11 +21,10 @@ from edp.storage.runs import Run, run_key
 from edp.training.ground_fit import fit_ground
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin, twin_hash
 from edp.workflows.twin.continue_twin import BaseTwin
-from edp.workflows.twin.judge_twin import SCORES, SHOWN, STEPS
 from edp.workflows.twin.prepare_twin import prepared_twin
 
 FOLDER, DATASHEET = "twin", "datasheet"
-JUDGED = (SCORES, SHOWN, STEPS)
+JUDGED = (FreeRunFile.NAME, RUNS, StepResponses.NAME)
 """What the judgement of a twin leaves in its run."""
 GROUND_BASIS = (
     "those of the ground from least squares on forces along logs in soil, errors of 2 s taken as one; numbers of a "

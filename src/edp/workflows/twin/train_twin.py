@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.evaluation.beyond import RANGES, command_ranges
 from edp.evaluation.free_run import calibrated, check_runs
+from edp.evaluation.free_run_file import CandidatesFile, FreeRunScores, read_models
 from edp.evaluation.step_response import step_responses
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
@@ -27,8 +28,8 @@ from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.networks.twin.recurrent_members import scales_for
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
-from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
+from edp.settings.results import plain_value
 from edp.signals import Kind
 from edp.sim.machine.machine_files import load_machine
 from edp.storage import write_bytes, write_json
@@ -40,7 +41,7 @@ from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
 from edp.workflows.twin.ground_twin import ground_twin
-from edp.workflows.twin.judge_twin import SCORES, STEPS, judge_twin, write_scores
+from edp.workflows.twin.judge_twin import judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
 FOLDER = "twin"
@@ -59,7 +60,7 @@ class TrainedTwin:
     """
 
     bundle: TwinBundle
-    scores: dict[str, Any]
+    scores: Mapping[str, FreeRunScores]
     resumed: bool
 
 
@@ -91,7 +92,7 @@ def train_twin(
     check_claimable(out, "twin")
     if experiment.ground:
         grounded, finished = ground_twin(source, experiment, out, start, progress)
-        return TrainedTwin(grounded, dict(grounded.scores), finished)
+        return TrainedTwin(grounded, read_models(grounded.scores, f"'{out}'"), finished)
     progress.note("reading recordings")
     base = None if start is None else BaseTwin.of(start)
     if base is not None:
@@ -110,7 +111,7 @@ def train_twin(
     with create as run, Helpers(_helpers(workers), member_died) as helpers:
         if run.is_finished:
             bundle = load_twin(run.path)
-            return TrainedTwin(bundle, dict(bundle.scores), True)
+            return TrainedTwin(bundle, read_models(bundle.scores, f"'{run.path}'"), True)
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, progress, helpers)
         result = _chosen(fit, KeyedRun(run, key), base)
         fitted = result.fitted
@@ -131,8 +132,8 @@ def train_twin(
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, progress)
         write_scores(run.path, scores, runs, intervals)
-        write_json(run.path / STEPS, step_responses(bundle.twin, data.test))
-        bundle = replace(bundle, scores=scores)
+        step_responses(bundle.twin, data.test).write(run.path)
+        bundle = replace(bundle, scores=plain_value(scores))
         save_twin(bundle, run.file(FOLDER))
     return TrainedTwin(bundle, scores, False)
 
@@ -181,13 +182,13 @@ def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormula
     spec = fit.experiment.twin
     if base is not None:
         result, tried = ContinuedTwin(fit, base, run).best()
-        write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
+        CandidatesFile(candidates=tuple(one.row() for one in tried)).write(run.folder.path)
         return result
     if not isinstance(spec, AutoTwin):
         result = fit.fitted(spec, run)
         return result if result.fitted.history else fit.refitted(result)
     result, tried = TwinChoice(fit, spec, run).best()
-    write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
+    CandidatesFile(candidates=tuple(one.row() for one in tried)).write(run.folder.path)
     return result
 
 
@@ -210,4 +211,4 @@ def _numbers(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(each, int | float) for each in value)
 
 
-__all__ = ["FOLDER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]
+__all__ = ["FOLDER", "TrainedTwin", "prepare_twin", "train_twin"]
