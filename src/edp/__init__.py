@@ -1,4 +1,4 @@
-"""Excavator Dynamics Predictor: recordings in, a judged and deployable plant model out.
+"""Excavator Dynamics Predictor: learn a deployable plant model of a hydraulic machine from recordings.
 
 The public names are imported when they are first asked for, so that ``import edp`` costs nothing; docs/python.md lists
 them. `__init__.pyi` states their types.

@@ -1,4 +1,4 @@
-"""Errors a user can act on: each message says what came, where, what must hold and what to change."""
+"""Errors that a user can act on: each message names the input, the file or setting, the requirement and the remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class EdpError(Exception):
 
 
 class DataError(EdpError):
-    """A recording, its channels, units or time stamps cannot be used as they are."""
+    """Invalid recording, channel, unit or time stamp."""
 
 
 class ConfigError(EdpError):
@@ -43,7 +43,7 @@ class BundleError(EdpError):
 
 
 class ExportError(EdpError):
-    """A network cannot be written in the form asked for."""
+    """Network that the requested export format cannot represent."""
 
 
 class StorageError(EdpError):
@@ -51,13 +51,13 @@ class StorageError(EdpError):
 
 
 class BusyError(StorageError):
-    """Another process holds the folder; the message says which. The exit code is the system's "try again later"."""
+    """Folder in use by another process, which the message names. The exit code means "try again later"."""
 
     exit_code = 75
 
 
 class LostError(EdpError):
-    """Processes were killed, so that nothing is known of what they did; to be tried again."""
+    """Worker processes that were killed; their results are unknown, so the command must be run again."""
 
     exit_code = 75
 
@@ -97,7 +97,7 @@ def count_of(count: float | str | None, noun: str) -> str:
 
 
 def closest(name: str, options: Iterable[str]) -> str:
-    """A suffix for messages: ``; did you mean 'x'?`` or ``; known: a, b, c``."""
+    """Return a suffix for a message: ``; did you mean 'x'?`` or ``; known: a, b, c``."""
     known_options = sorted(options)
     lower = {option.lower(): option for option in known_options}
     match = difflib.get_close_matches(name.lower(), list(lower), n=1, cutoff=0.6)

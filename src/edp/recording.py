@@ -39,7 +39,7 @@ class Digest:
         self._state.update(repr((float(rate_hz), [(c.name, str(c.kind)) for c in channels])).encode())
 
     def update(self, values: FloatArray) -> None:
-        """The next samples, float32, shape ``(time, channel)``."""
+        """Add samples to the digest, float32, shape ``(time, channel)``."""
         for start in range(0, len(values), HASHED_ROWS):
             self._state.update(np.ascontiguousarray(values[start : start + HASHED_ROWS]).data)
 
@@ -101,7 +101,7 @@ class Recording:
 
     @cached_property
     def digest(self) -> str:
-        """blake2b of rate, channels and values: equal content gives an equal digest whatever the file."""
+        """BLAKE2b digest of rate, channels and values: equal content has an equal digest, independent of the file."""
         digest = Digest(self.rate_hz, self.channels)
         digest.update(self.values)
         return digest.text
@@ -117,7 +117,10 @@ class Recording:
         return False
 
     def with_digest(self, digest: str) -> Recording:
-        """This recording with a digest that was taken before; a change of its values makes it take a new one."""
+        """Return a copy of the recording with a digest that was computed before.
+
+        Changing the values discards the digest.
+        """
         same = replace(self)
         same.__dict__["digest"] = digest
         return same
@@ -140,14 +143,14 @@ class Recording:
         return self.values[:, self.index(name)]
 
     def select(self, names: Sequence[str]) -> FloatArray:
-        """Values of several channels, shape ``(time, len(names))``, in the order asked for.
+        """Return the values of several channels, shape ``(time, len(names))``, in the order of `names`.
 
         Neighbouring columns are a view, others a copy.
         """
         return columns(self.values, [self.index(name) for name in names])
 
     def rows(self, start: int, stop: int, name: str | None = None) -> Recording:
-        """The samples ``start <= t < stop`` as a recording of their own."""
+        """Return the samples ``start <= t < stop`` as a new recording."""
         if not 0 <= start < stop <= self.samples:
             raise DataError(
                 f"recording '{self.name}': rows {start}:{stop} asked for, it has {self.samples}; "
@@ -194,7 +197,10 @@ def spread_stretches(lengths: Sequence[int], length: int, most: int = MOST_ROWS)
 
 
 def spread_recordings(recordings: Sequence[Recording], seconds: float, most: int = MOST_ROWS) -> list[Recording]:
-    """Recordings, or evenly spread stretches of them of so many seconds; samples on disk stay there."""
+    """Return the recordings, or evenly spaced segments of the given length in seconds if they are longer.
+
+    Samples on disk are not loaded.
+    """
     length = max(1, round(seconds * recordings[0].rate_hz))
     stretches = spread_stretches([recording.samples for recording in recordings], length, most)
     return [

@@ -70,7 +70,7 @@ class Registry(Mapping[str, T], Generic[T]):
     __hash__ = object.__hash__
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Decorator that enters its argument under `name`; raises `ConfigError` on a duplicate."""
+        """Return a decorator that registers its argument under `name`. Raises `ConfigError` if the name exists."""
         module = str(sys._getframe(1).f_globals.get("__name__", ""))
 
         def enter(part: T) -> T:

@@ -20,7 +20,7 @@ Number = TypeVar("Number", float, NDArray[np.floating])
 
 
 class Kind(StrEnum):
-    """What a channel measures; it fixes the SI unit, the scaler and the plausibility limits."""
+    """Physical quantity of a channel; it determines the SI unit, the scaler and the plausibility limits."""
 
     VELOCITY = "velocity"
     ACCELERATION = "acceleration"
@@ -199,7 +199,7 @@ class Channel:
 
 
 def conversion(unit: str, kind: Kind, where: str) -> Unit:
-    """The conversion from `unit` to the SI unit of `kind`.
+    """Return the conversion from `unit` to the SI unit of `kind`.
 
     Raises:
         ConfigError: the unit is unknown or does not measure `kind`; `where` names the column and the file.
@@ -336,7 +336,10 @@ _LONGEST = 1024
 
 @dataclass(frozen=True)
 class ChannelMap:
-    """How one channel is found in a file: its column, unit and kind; a constant where the machine lacks it."""
+    """Mapping from a file's column, with unit and kind, to one channel.
+
+    Or a constant if the machine lacks the channel.
+    """
 
     name: str
     column: str
@@ -347,7 +350,7 @@ class ChannelMap:
     description: str = ""
 
     def check(self) -> None:
-        """Refuse what no channel can be.
+        """Raise ConfigError for names, constants or scales that a channel cannot have.
 
         Raises:
             ConfigError: a name that is empty, too long or holds control characters, or a number that is not finite.

@@ -1,4 +1,4 @@
-"""Numbers and names as a reader wants them: few digits, one precision per column, units beside the figure."""
+"""Text for numbers and names: few digits, one precision per column, units next to the value."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def typed(value: float | None, digits: int = MAX_DIGITS) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit as pages show it: empty for numbers without a unit, which is "1" in files."""
+    """Return a unit for display: empty for dimensionless numbers, whose unit in files is "1"."""
     return "" if unit == "1" else unit
 
 
 def behind(unit: str) -> str:
-    """Return a unit with the blank before it, empty for numbers without a unit."""
+    """Return a unit with a leading space; empty for dimensionless numbers."""
     return f" {unit_text(unit)}".rstrip()
 
 
@@ -111,7 +111,7 @@ def _useful_decimals(value: float, digits: int = MAX_DIGITS) -> int:
 
 
 def percent(share: float | None, signed: bool = False) -> str:
-    """Return a share of one as a percentage: one decimal below ten percent, none above; a dash if it is not known.
+    """Return a fraction as a percentage: one decimal below ten percent, otherwise no decimals; a dash if unknown.
 
     Headlines, first lines, tables and pages show percentages of results by this rule alone.
     """
@@ -150,7 +150,7 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """The same for text of several lines."""
+    """Replace unprintable characters in a text of several lines, keeping the line breaks."""
     return "\n".join(map(printable, text.split("\n")))
 
 
@@ -219,7 +219,7 @@ def _around(name: str, start: int, most: int) -> str:
 
 
 def in_cell(text: str) -> str:
-    """Text as a cell of a CSV file: what a spreadsheet would take for a formula has an apostrophe in front."""
+    """Return text for a CSV cell: text that a spreadsheet would run as a formula gets a leading apostrophe."""
     # Numbers with a sign stay numbers; only text can be a formula.
     try:
         float(text)
@@ -229,18 +229,18 @@ def in_cell(text: str) -> str:
 
 
 def in_markdown(text: str) -> str:
-    """A sentence in a Markdown document: names in it start no element, link or line."""
+    """Escape a sentence for Markdown, so that names in it cannot start an element, a link or a line."""
     flat = printable(re.sub(r"[ \t\r\n\f\v]+", " ", text).strip())
     return flat.replace("<", "&lt;").replace("](", "]\\(").replace("][", "]\\[")
 
 
 def count_text(value: float | None) -> str:
-    """A count: no decimals, thousands separated."""
+    """Format a count: no decimals, thousands separated."""
     return number(value, 0)
 
 
 def duration(seconds: float | None) -> str:
-    """A time span in the unit a person would say it in."""
+    """Format a time span with a suitable unit: s, min or h."""
     if seconds is None or not math.isfinite(seconds):
         return MISSING
     if seconds == 0:
@@ -253,7 +253,7 @@ def duration(seconds: float | None) -> str:
 
 
 def moment(created: object) -> str:
-    """An ISO 8601 time as ``2026-03-04 10:20 UTC``; anything else as it is."""
+    """Format an ISO 8601 time as ``2026-03-04 10:20 UTC``; other text is returned unchanged."""
     text = str(created or "")
     try:
         when = datetime.fromisoformat(text)
@@ -263,11 +263,11 @@ def moment(created: object) -> str:
 
 
 def unbroken(sentence: str) -> str:
-    """A sentence whose figures stay on one line with the word before and the unit after them."""
+    """Return the sentence with non-breaking spaces that keep each number next to its unit and the word before."""
     return re.sub(r"(?<=\d) (?=[a-zA-Z%°]+/?[a-zA-Z]*\b)|(?<=\w) (?=[−\d][\d.,]*(?:;|\.$))", "\u00a0", sentence)
 
 
 def listed(parts: Iterable[str]) -> str:
-    """``a``, ``a and b`` or ``a, b and c``."""
+    """Join words as ``a``, ``a and b`` or ``a, b and c``."""
     items = list(parts)
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""

@@ -1,6 +1,7 @@
 """Units of reports: values have the offset of their unit, differences have none, and every use chooses one of both."""
 
 import ast
+import re
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,12 @@ def test_the_factor_alone_is_used_for_differences_only():
         if "report_factor" in names:
             used.add(path.relative_to(SOURCE).as_posix())
     assert used == set(DIFFERENCES)
+
+
+def test_no_text_shows_kelvin():
+    shown = re.compile(r"\} (?:K|kelvin)\b")
+    files = (path for suffix in ("py", "jinja", "js") for path in SOURCE.rglob(f"*.{suffix}"))
+    assert [path.name for path in files if shown.search(path.read_text(encoding="utf-8"))] == []
 
 
 @pytest.mark.parametrize("kind", list(Kind))

@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from browser import long_numbers
 
 from edp.errors import StorageError
 from edp.report.run.facts import read_history
@@ -208,6 +209,8 @@ def test_every_kind_of_file_that_a_command_leaves_is_refused_once_changed(edp, t
     ):
         ended = edp(*command)
         assert ended.code in (0, 6), ended.said  # 6: a judgement of so small a network
+        told = [line for line in ended.said.splitlines() if str(tmp_path) not in line]
+        assert long_numbers(told) == [], "figures in the terminal have at most four digits"
     files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json*") if path.is_file()}
     assert sorted(files) == sorted({*READ_BY, *NOT_READ}), "name its reader, or say why nothing reads it"
     problems = []

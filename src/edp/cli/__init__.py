@@ -1,4 +1,4 @@
-"""The command line: one file a command, each parses, calls the workflow and prints."""
+"""Command line: one module per command, which parses, calls the workflow and prints."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Recordings in, a judged and deployable plant model out."""
+    """Learn a deployable plant model of a hydraulic machine from recordings."""
     for failure in load_plugins():
         err.print(f"warning: {failure}")
 

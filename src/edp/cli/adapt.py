@@ -94,7 +94,7 @@ def replay(
 
 
 def replay_tables(facts: dict[str, Any]) -> None:
-    """Print a table a horizon: MAE with and without adaptation over time in motion, and by target."""
+    """Print one table per horizon: MAE with and without adaptation over time in motion, and by target."""
     units = {target["unit"] for target in facts["targets"]}
     unit = units.pop() if len(units) == 1 else "mixed units"
     heads = ["seconds of motion", "without", "adapted", "change", *(target["name"] for target in facts["targets"])]

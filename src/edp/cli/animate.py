@@ -78,7 +78,7 @@ def animate(
 
 
 def _run_and_log(paths: Sequence[Path]) -> tuple[Path | None, Path]:
-    """The run, where one is given, and the log.
+    """Return the run, if one is given, and the log.
 
     Raises:
         ConfigError: more than these two.

@@ -1,4 +1,4 @@
-"""``edp compare``: several judged runs beside each other."""
+"""Command ``edp compare``: compare several evaluated runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def compare(
     title: Annotated[str, typer.Option(help="Title of the page.")] = "",
     as_json: JsonFlag = False,
 ) -> None:
-    """Compare judged runs on the test recordings that they share: errors with paired intervals, one page.
+    """Compare evaluated runs on their common test recordings, with paired intervals and one page.
 
     Example: `edp compare runs/first runs/second`
     """
@@ -45,7 +45,7 @@ def compare(
 
 
 def facts_of(comparison: Any) -> dict[str, Any]:
-    """A comparison for machines."""
+    """Return a comparison as JSON types."""
     rows = []
     for measure in comparison.measures:
         differences = comparison.differences(measure)

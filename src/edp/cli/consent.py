@@ -15,7 +15,7 @@ FMU_CODE = "An FMU holds native code, which edp loads and runs on this computer 
 
 
 def ask(why: str) -> None:
-    """Ask on a terminal whether to go on.
+    """Ask on a terminal whether to continue.
 
     Raises:
         ConfigError: there is no terminal, or the answer is no.
@@ -29,7 +29,7 @@ def ask(why: str) -> None:
 
 
 def ask_for_fmus(yes: bool, *plants: Path | None) -> None:
-    """Ask for the FMUs among plants, unless told that they are trusted.
+    """Ask for permission to run the FMUs among the plants, unless they are declared trusted.
 
     Raises:
         ConfigError: there is no terminal, or the answer is no.

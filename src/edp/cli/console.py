@@ -1,4 +1,4 @@
-"""What every command shares: where text goes, progress with rate and time left, tables, and how errors end."""
+"""Common part of all commands: output, progress with rate and time left, tables, and error handling."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ KEPT_BREAK = re.compile(r"\n(?=  - )")
 
 
 def visible(text: str) -> str:
-    r"""Text as a terminal may have it: what moves its cursor, turns its direction or is no character is escaped.
+    r"""Escape characters that move the cursor, change the text direction or are invalid.
 
     Control characters and escape sequences, bidirectional and other invisible controls, line breaks, and the bytes of
     file names that are not UTF-8 become ``\x1b``, ``\u202e``, ``\n`` and ``\xff``.
@@ -49,7 +49,7 @@ def _escape(character: str) -> str:
 
 
 class Terminal(Console):
-    """Where all text of the command line becomes output: nothing in it is markup, and all of it is visible."""
+    """Console for all text of the command line: no markup, invisible characters escaped."""
 
     def __init__(self, stderr: bool = False) -> None:
         # Names of channels may look like markup.
@@ -113,7 +113,7 @@ PATH_OPTIONS = frozenset(
 
 
 def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None:
-    """Print facts as JSON for machines, or run `show` for people."""
+    """Print facts as JSON, or call `show` for readable output."""
     if as_json:
         # Strict JSON: NaN would break every other reader.
         sys.stdout.write(json.dumps(facts, indent=1, allow_nan=False) + "\n")
@@ -151,7 +151,7 @@ def _cell(value: Any) -> Text:
 
 
 def _widths(headings: Sequence[str], rows: Sequence[Sequence[Text]]) -> list[int]:
-    """The width that each column would have."""
+    """Return the width of each column."""
     return [
         max([_shown(heading).cell_len, *(row[i].cell_len for row in rows if i < len(row))])
         for i, heading in enumerate(headings)
@@ -201,7 +201,7 @@ class Words(ProgressColumn):
         self.of_task = of_task
 
     def render(self, task: Task) -> Text:
-        """The words now."""
+        """Return the present words."""
         return _shown(self.of_task(task))
 
 
@@ -256,7 +256,7 @@ def count_text(done: int, planned: int, sign: str = " of ") -> str:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Progress]:
-    """A progress display on standard error with a bar, a note (rate and figures) and the time left."""
+    """Show progress on standard error: a bar, a note (rate and figures) and the time left."""
     columns = (
         Words(lambda task: task.description),
         BarColumn(bar_width=24),
@@ -288,7 +288,7 @@ class Steps:
 
 @contextmanager
 def waiting(text: str, quiet: bool = False, every_s: float = 15.0) -> Iterator[None]:
-    """Say on standard error what takes long and cannot tell how far it is, and ever more seldom that it still does.
+    """Report a long step of unknown duration on standard error, at increasing intervals.
 
     Args:
         text: what is being done.
@@ -359,7 +359,7 @@ def run_app(app: typer.Typer | Callable[..., Any]) -> int:
 
 @cache
 def _command(app: typer.Typer) -> Callable[..., Any]:
-    """The commands with their options, read from the functions' signatures once a process."""
+    """Return the commands with their options, read from the function signatures once per process."""
     command: Any = typer.main.get_command(app)
     _check_options_of(command)
     return cast(Callable[..., Any], command)
@@ -380,7 +380,7 @@ def _check_options_of(command: Any) -> None:
 
 
 def refuse_empty(words: Sequence[str]) -> None:
-    """Refuse an empty path, which Python takes for the folder that one stands in.
+    """Refuse an empty path, which Python would interpret as the working directory.
 
     Raises:
         ConfigError: an empty word, or an option of `PATH_OPTIONS` with nothing behind it.
@@ -414,7 +414,7 @@ def _say_error(text: str) -> None:
 
 
 def _say_usage(error: Any) -> None:
-    """A mistake in the words of the command line itself, such as an unknown option; or help, where none were given."""
+    """Print a usage error, such as an unknown option; or the help if no words were given."""
     context = getattr(error, "ctx", None)
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()

@@ -57,7 +57,7 @@ def control(
     yes: YesOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a controller in closed loop: scores, a recording a loop, and a page with paths, errors and levers.
+    """Run a controller in closed loop; write scores, recordings and a page with paths, errors and levers.
 
     The plant is the simulator, or with --plant a twin or an FMU, whose native code it asks about first. Position
     errors are to the reference of the same time; the distance to the path stands beside them.
@@ -105,7 +105,7 @@ def tune(
     yes: YesOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Tune a controller's gains on the simulator, or with --on on a twin or FMU, and judge them on the plant.
+    """Tune a controller's gains on the simulator (with --on: on a twin or FMU) and evaluate them on the plant.
 
     References of the tuning are never those of the judgement. The tuned settings are for `edp control --config`.
 
@@ -141,7 +141,7 @@ def tune(
 
 
 def _options(task: str, machine: str, controller: str, seeds: int | None) -> dict[str, Any]:
-    """Settings of the options that were given."""
+    """Return the settings of the given options."""
     options: dict[str, Any] = {"machine": machine} if machine else {}
     options |= {} if seeds is None else {"loops": seeds}
     options |= {"task": {"kind": task}} if task else {}
@@ -149,7 +149,7 @@ def _options(task: str, machine: str, controller: str, seeds: int | None) -> dic
 
 
 def score_table(content: Mapping[str, Any]) -> None:
-    """Print a row a loop."""
+    """Print one row per loop."""
     rows = []
     for loop in content["loops"]:
         score = loop["score"]

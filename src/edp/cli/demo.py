@@ -27,7 +27,7 @@ def demo(
     seed: Annotated[int, typer.Option(callback=within(SEED), help="Seed of data and training.")] = 0,
     as_json: JsonFlag = False,
 ) -> None:
-    """Simulate a 22 t excavator, train the hybrid for k = 10, judge it, and write a report page.
+    """Simulate a 22 t excavator, train the hybrid network for k = 10, evaluate it and write a report.
 
     Example: `edp demo --out demo`
     """

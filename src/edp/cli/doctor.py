@@ -1,4 +1,4 @@
-"""``edp doctor``: what this installation has, what is missing, and what that would be needed for."""
+"""Command ``edp doctor``: installed and missing parts of EDP, and their purpose."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 
 @dataclass(frozen=True)
 class InstallationCheck:
-    """One thing that was looked at.
+    """Result of one installation check.
 
     Attributes:
         what: its name.
@@ -199,7 +199,7 @@ def sandbox_layers() -> list[InstallationCheck]:
 
 
 def extras() -> list[InstallationCheck]:
-    """Optional parts of EDP."""
+    """Check the optional parts of EDP."""
     checks = []
     for extra, (module, needed_for) in _EXTRAS.items():
         there = importlib.util.find_spec(module) is not None

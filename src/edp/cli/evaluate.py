@@ -1,4 +1,4 @@
-"""``edp evaluate``: held-out scores beside baselines."""
+"""Command ``edp evaluate``: scores on held-out recordings, compared with baselines."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def evaluate(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Score a trained model on held-out recordings beside baselines; a twin on free runs.
+    """Evaluate a trained model on held-out recordings and compare it with baselines.
 
     Ends with exit code 6 where a baseline has less error than the network.
 
@@ -119,7 +119,7 @@ def evaluate(
 
 
 def show_scores(scores: ScoresFile, sentences: Sequence[str], minutes: float | None) -> None:
-    """Print the tables of an evaluation, what is to be said of it, and what the time was too short for."""
+    """Print the tables of an evaluation, its messages, and the parts omitted for lack of time."""
     score_table(scores)
     by_situation_table(scores)
     for sentence in sentences:
@@ -205,7 +205,7 @@ def run_importance(
 
 
 def importance_table(importances: ChannelImportances) -> None:
-    """Print a table a horizon: what the error grows by without each channel, most first."""
+    """Print one table per horizon: the error increase without each channel, largest first."""
     unit = importances.units["mean"]
     for horizon, error in importances.error.items():
         rows = []
@@ -223,7 +223,7 @@ def importance_table(importances: ChannelImportances) -> None:
 
 
 def score_table(scores: ScoresFile) -> None:
-    """Print a table a horizon: every model's mean scores, best first."""
+    """Print one table per horizon: mean scores of every model, best first."""
     from edp.evaluation.guard import MEASURE, MEASURE_NAME
     from edp.evaluation.scores_file import MEAN, metric
 
@@ -258,7 +258,7 @@ def _ahead(scores: ScoresFile, horizon: int) -> str:
 
 
 def by_situation_table(scores: ScoresFile) -> None:
-    """Print where the network's error is by what the axes did, at its furthest horizon, where the scores tell."""
+    """Print the network's error by motion of the axes, at the longest horizon, if the scores contain it."""
     from edp.report.run.sheets import situation_sheet
 
     horizon = max(scores.task.horizons)
@@ -269,7 +269,7 @@ def by_situation_table(scores: ScoresFile) -> None:
 
 
 def _tables_by_output(scores: ScoresFile) -> None:
-    """Print a table a horizon with a column an output: numbers in different units, or in none, have no mean."""
+    """Print one table per horizon with one column per output, for outputs in different units, which have no mean."""
     from edp.evaluation.guard import MEASURE, MEASURE_NAME
     from edp.evaluation.scores_file import metric
 

@@ -14,7 +14,7 @@ from edp.storage.paths import full_path, is_file_at
 
 
 def _list_forms(listing_asked: bool) -> None:
-    """Every form, with what it is in a line."""
+    """Print every export form with a one-line description."""
     if listing_asked:
         from edp.workflows.export_forms import all_forms
 

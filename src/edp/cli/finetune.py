@@ -1,4 +1,4 @@
-"""``edp finetune``: a network of one machine, trained on for another."""
+"""Command ``edp finetune``: adapt a network of one machine to another machine."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def finetune(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Fine-tune a network of one machine with logs of another, and judge it beside baselines on the same ticks.
+    """Fine-tune a network trained on one machine with logs of another, and compare it with baselines.
 
     Each log is divided by time: its beginning trains, a part validates, its end tests. The source's scaling is
     kept. The result is a run, which can be judged, reported and exported. After a stop (Ctrl-C) the same command
@@ -120,7 +120,7 @@ def finetune(
 def _finetune_fleet(
     bundle: Path, store: Path, folder: Path, order: PersonalOrder, workforce: Workforce, as_json: bool
 ) -> None:
-    """Fine-tune for every machine of a store, with a progress display, and print what it came to."""
+    """Fine-tune for every machine of a store with a progress display, and print the results."""
     from edp.workflows.fleet.personal import errors_by_machine, finetune_fleet
 
     with shown_progress("finetune", as_json) as progress:

@@ -1,4 +1,4 @@
-"""``edp fleet``: many machines under one network: their report, and the network of one of them."""
+"""Command ``edp fleet``: report on many machines with one network, and the network of one machine."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def report(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Report a fleet: machines by error, drift and alarms, and what stands out of the ten worst.
+    """Report on a fleet: machines by error, drift and alarms, and the anomalies of the ten worst.
 
     Example: `edp fleet report runs/foundation stores/fleet --out fleet --deltas fleet/own --workers 4`
     """

@@ -1,4 +1,4 @@
-"""``edp footprint``: what a network costs to store and run."""
+"""Command ``edp footprint``: memory and computing cost of a network."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _of_monitor(file: Path, limits: Budget, as_json: bool) -> None:
 
 
 def _budget_table(facts: Mapping[str, Any]) -> None:
-    """What is held against a controller's limits."""
+    """Print the comparison with a controller's limits."""
     limits = [
         (v["what"], v["value"], v["limit"], v["unit"], "fits" if v["fits"] else "too large", v["note"])
         for v in facts["verdict"]

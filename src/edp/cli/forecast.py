@@ -1,4 +1,4 @@
-"""``edp forecast``: logs with what a twin says of the ticks to come as further channels."""
+"""Command ``edp forecast``: add forecasts of a twin to logs as additional channels."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def forecast(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Add forecasts of a twin to logs, from which a network learns what the twin leaves.
+    """Add forecasts of a twin to logs, so that a network can learn the twin's residual error.
 
     At each tick an observer has followed the measured machine; from there the twin runs free with the commands held.
     The channel CylVels_1_in_10 is what it then says of CylVels_1 in ten ticks: a network with task.features = "all"

@@ -73,7 +73,7 @@ def identify(
 
 
 def number_table(result: Identified) -> None:
-    """Print a row a number: the guess, what was identified and its interval, or that the logs do not tell it."""
+    """Print one row per parameter: guess, identified value and interval, or that the logs do not identify it."""
     rows = []
     for row in result.rows:
         interval = row.interval("kept: not told by the logs")

@@ -76,7 +76,7 @@ def init(
 
 
 def show_proposal(proposal: LogsProposal) -> None:
-    """Print what each column is taken for, within 80 columns, and what else a person should know."""
+    """Print the proposed meaning of each column, within 80 columns, and the remarks."""
     look, clock = proposal.proposal.look, proposal.proposal.clock
     rate = "unknown rate" if clock.rate_hz is None else f"{figure(clock.rate_hz)} Hz"
     count = len(proposal.group.paths)
@@ -120,7 +120,7 @@ def _rows(columns: Sequence[ColumnGuess]) -> list[tuple[str, ...]]:
 
 
 def _follows(name: str, other: str) -> bool:
-    """Whether a name is another one but for its first number, which is one more."""
+    """Return whether a name equals another one except for its first number, which is larger by one."""
     one, two = _NUMBERED.fullmatch(name), _NUMBERED.fullmatch(other)
     if one is None or two is None:
         return False

@@ -1,4 +1,4 @@
-"""``edp inspect``: what is in a log, what is wrong with it, and what a data set covers."""
+"""Command ``edp inspect``: content and problems of logs, and coverage of a data set."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def inspect(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Report the quality of recordings: time, gaps, noise, steps, clipping, units, repeats; nothing is changed.
+    """Report the quality of recordings: time, gaps, noise, steps, clipping, units, repeats. Nothing is changed.
 
     Then what the data cover: how rich the inputs are, poses, joint histograms, events.
     Ends with exit code 3 where a log has an error that training would refuse.
@@ -136,7 +136,7 @@ def _undescribed(quality: DataQuality) -> bool:
 
 
 def _training(data: Sequence[Path], signal_map: Path | None) -> str:
-    """The command that trains: with the settings of `edp init` where they lie beside its map or data-set file."""
+    """Return the training command, with the settings of `edp init` if they are next to its map or data-set file."""
     described = signal_map or (data[0] if data[0].suffix == ".toml" else None)
     settings = None if described is None else described.parent / SETTINGS
     mapped = "" if signal_map is None else f" --map {signal_map}"
@@ -149,7 +149,10 @@ def _training(data: Sequence[Path], signal_map: Path | None) -> str:
 def _coverage(
     source: DataSource, split: str, inputs: tuple[str, ...], asked: bool, inspection: Inspection | None
 ) -> tuple[Coverage | None, str]:
-    """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
+    """Return the coverage of a source, or the reason for its absence.
+
+    An explicitly requested coverage raises the error.
+    """
     from edp.workflows.covering import coverage
 
     if inspection is not None and (inspection.coverage is not None or not asked):
@@ -165,7 +168,7 @@ def _coverage(
 
 
 def show_coverage(coverage: Coverage, whole: bool = True) -> None:
-    """Print what a data set covers; where not the `whole`, only the figures that are wanted of it."""
+    """Print the coverage of a data set; only figures with a target unless `whole`."""
     from edp.data.coverage_targets import wanted
 
     rows: list[tuple[Any, ...]] = []

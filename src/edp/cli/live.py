@@ -151,7 +151,7 @@ def _print_mirror(address: str, as_json: bool) -> None:
 
 
 def _source(options: Mapping[str, object]) -> tuple[str, object]:
-    """The one source that was given.
+    """Return the given source; raises ConfigError unless there is exactly one.
 
     Raises:
         ConfigError: none, or several.

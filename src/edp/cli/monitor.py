@@ -62,7 +62,7 @@ def fit(
     workers: WorkersOption = 1,
     as_json: JsonFlag = False,
 ) -> None:
-    """Fit a monitor: what each channel should read is learned from healthy logs, and so is when to raise an alarm.
+    """Fit a monitor to healthy logs: expected readings of each channel and alarm limits.
 
     Healthy logs are divided by sessions: some train, the others say how widely a healthy machine scatters and set the
     limit. Hours that are too few for the promise are refused, with the rate that they support. Faults are simulated on
@@ -117,7 +117,7 @@ def fit(
 
 
 def show_fitted(fitted: FittedMonitor) -> None:
-    """Print what a monitor watches, what it promises, and for which machines."""
+    """Print the monitored residuals, the false alarm rate, and the machines to which a monitor applies."""
     monitor = fitted.monitor
     for name in fitted.doubtful:
         out.print(f"'{name}' was left out: it lies far from all other healthy sessions; look into it")
@@ -208,7 +208,7 @@ def report(
     title: Annotated[str | None, typer.Option(help="Title of the page.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write one offline page: alarms with evidence and causes, time line, and faults that cannot be told apart.
+    """Write an offline page: alarms with evidence and causes, time line, indistinguishable faults.
 
     Example: `edp monitor report watched/today`
     """

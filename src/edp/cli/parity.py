@@ -1,4 +1,4 @@
-"""``edp parity``: does every form of a network say the same?"""
+"""Command ``edp parity``: check that all forms of a network give equal results."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def parity(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run one recording through PyTorch and every exported form; compare the numbers and the time of a tick.
+    """Run one recording through PyTorch and every exported form; compare results and time per sample.
 
     Each form is exported, compiled and run on this computer: C with cc, Python and MATLAB code with this Python and GNU
     Octave, where they are there. Of a bundle that is not in a run folder it asks first.

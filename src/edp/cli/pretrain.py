@@ -41,7 +41,7 @@ def pretrain(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Train one network over many machines, and judge it on unseen machines.
+    """Train one network over many machines, and evaluate it on unseen machines.
 
     Whole machines validate and test. What comes out is a run: fine-tune, judge, report and export it. Stop it at any
     moment (Ctrl-C): the same command continues.

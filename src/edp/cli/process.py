@@ -40,12 +40,12 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 
 def stopped_code(usual: int) -> int:
-    """The exit code of a stopped command: 128 and the signal that asked for it, or `usual` after Ctrl-C."""
+    """Return the exit code of a stopped command: 128 plus the signal number, or `usual` after Ctrl-C."""
     return 128 + _stopped_by[-1] if _stopped_by else usual
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Python's, NumPy's and PyTorch's ways to say that memory is gone."""
+    """Return whether an error of Python, NumPy or PyTorch means that memory is exhausted."""
     message = str(error)
     named = isinstance(error, MemoryError) or any("OutOfMemory" in kind.__name__ for kind in type(error).__mro__)
     # PyTorch on the CPU raises a plain RuntimeError; only its text tells.
@@ -62,7 +62,7 @@ ADVICE = {
 
 
 def memory_message(error: BaseException) -> str:
-    """What was being done, what is free, and what to reduce."""
+    """Return a message on exhausted memory: the command, the free memory, and what to reduce."""
     command = next((word for word in sys.argv[1:] if word in ADVICE), "")
     doing = " ".join(sys.argv[1:2]) or "this command"
     reason = " ".join(str(error).split())[:SHOWN_REASON] or "an allocation failed"

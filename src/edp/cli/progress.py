@@ -1,4 +1,4 @@
-"""Presenter of `edp.progress.Progress`: a bar in a terminal, lines in a pipe or file, nothing with ``--json``."""
+"""Presenter of `edp.progress.Progress`: a bar in a terminal, lines in a pipe or file, silent with ``--json``."""
 
 from __future__ import annotations
 

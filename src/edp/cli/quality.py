@@ -1,4 +1,4 @@
-"""How a shell shows the quality of recordings; `edp inspect` and `edp screen` share it."""
+"""Terminal output of recording quality, shared by `edp inspect` and `edp screen`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ VERDICT_TEXTS = {
 
 
 def show_report(report: QualityReport) -> None:
-    """Print one recording's facts, a row for each channel, and all findings."""
+    """Print one recording's data, one row per channel, and all findings."""
     out.print(report.name, style="bold", end="")
     out.print(
         f": {number(report.duration_s, 1)} s, {figure(report.rate_hz)} Hz, {report.samples:,} samples, verdict: "
@@ -67,7 +67,7 @@ def show_report(report: QualityReport) -> None:
 
 
 def show_lines(quality: DataQuality) -> None:
-    """Print a line a log, then each kind of finding once with the logs that have it."""
+    """Print one line per log, then each type of finding once with the logs affected."""
     rows = []
     for report in quality.reports:
         counts = [sum(f.severity == severity for f in report.findings) for severity in ("error", "warning", "note")]
@@ -120,7 +120,7 @@ def show_between(quality: DataQuality) -> None:
 
 
 def verdict_text(quality: DataQuality) -> str:
-    """The last line: how many recordings, errors and repeats, and what to do."""
+    """Return the last line: number of recordings, errors and repeats, and the remedy."""
     count, errors = len(quality.reports), quality.errors
     parts = [
         f"{count_of(count, 'recording')}",

@@ -31,7 +31,7 @@ def add(
     name: Annotated[str, typer.Option(help="Name of the entry; the latest of one name is meant.")],
     as_json: JsonFlag = False,
 ) -> None:
-    """Copy a network, or the deltas of a fleet, into a registry; what is there is never overwritten.
+    """Copy a network, or the deltas of a fleet, into a registry. Existing entries are never overwritten.
 
     Example: `edp registry add registry runs/foundation --name foundation`
     """
@@ -71,7 +71,7 @@ def show_entry(
     asked: Annotated[str, typer.Argument(metavar="ENTRY", help="Name, or beginning of the identifier.")],
     as_json: JsonFlag = False,
 ) -> None:
-    """Show one entry, hold its files to its identifier, and tell where it comes from.
+    """Show one entry, check its files against its identifier, and show its origin.
 
     Example: `edp registry show registry foundation`
     """

@@ -241,7 +241,7 @@ def _show_trials(selection: Selection) -> None:
 
 
 def facts_of(selection: Selection) -> dict[str, Any]:
-    """What a machine needs; the whole is in the files."""
+    """Return the result for scripts; the full result is in the files."""
     proposal = selection.screening.proposal
     return {
         "kept": list(proposal.kept),
@@ -261,7 +261,7 @@ def facts_of(selection: Selection) -> dict[str, Any]:
 
 
 def next_command(data: Sequence[Path], signal_map: Path | None, repair: Sequence[str], selection: Selection) -> str:
-    """The training that the proposal is for."""
+    """Return the training command that uses the proposal."""
     chosen = signal_map or selection.map
     parts = [f"edp train {shlex.join(map(str, data))}"] + ([f"--map {chosen}"] if chosen is not None else [])
     parts += [f"--repair {entry}" for entry in repair]

@@ -31,7 +31,7 @@ class _RunByDefault(TyperGroup):
     """`edp search DATA ...` is `edp search run DATA ...`."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that is named, or `run`."""
+        """Return the named command, or `run`."""
         if args and args[0] not in self.commands:
             args = [DEFAULT, *args]
         return super().resolve_command(ctx, args)
@@ -130,7 +130,7 @@ def run(
 
 @app.command("status")
 def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
-    """How far a study is: phases, trainings done, running and left, what was decided. Changes nothing.
+    """Show the progress of a study: phases, trainings done, running and left, decisions. Nothing is changed.
 
     Example: `edp search status studies/first`
     """
@@ -165,7 +165,7 @@ def export(
     output: Annotated[Path | None, typer.Option("--out", help="The journal; default: optuna.journal in DIR.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Copy the questions of phases 1, 4 and 5 into a journal for optuna-dashboard; the study itself stays as it is.
+    """Export the trials of phases 1, 4 and 5 as a journal for optuna-dashboard. The study is unchanged.
 
     Example: `edp search export studies/first && optuna-dashboard studies/first/optuna.journal`
     """
@@ -195,7 +195,7 @@ class SearchDisplay:
             out.print(text)
 
     def on_phase(self, name: str, study_log: StudyLog) -> None:
-        """A phase begins."""
+        """Print the beginning of a phase."""
         from edp.workflows.search.phases import PHASES
 
         self.title = f"phase {list(PHASES).index(name) + 1} of {len(PHASES)}, {PHASES[name].title}"
@@ -212,7 +212,7 @@ class SearchDisplay:
         self.steps.say(f"search: {note}" + ("" if not left else f", at most {duration(max(1.0, left))}"))
 
     def on_decision(self, decision: Decision) -> None:
-        """Print what was decided, and why."""
+        """Print a decision and its reason."""
         from edp.workflows.search.phases import PHASES
 
         if not self.quiet:
@@ -254,7 +254,7 @@ def _show(result: SearchResult, page: Path) -> None:
 
 
 def _deploying(result: SearchResult) -> str:
-    """The command that goes on with the network that phase 6 chose."""
+    """Return the command that deploys the network chosen by phase 6."""
     facts = result.context.decided["compression"].facts
     run = result.networks.get("chosen", result.networks.get("teacher"))
     if facts["rows"][facts["chosen"]]["format"] == "w8a16":

@@ -68,7 +68,7 @@ def simulate(
     open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Simulate recordings of an excavator: M22 in free air, or what a scenario file describes.
+    """Simulate recordings of an excavator: M22 in free air by default, or as a scenario file describes.
 
     Example: `edp simulate data/m22 --minutes 90 --recordings 30 --seed 1`
 
@@ -132,7 +132,7 @@ def run(
     quiet: bool = False,
     workforce: Workforce | None = None,
 ) -> list[Path]:
-    """Simulate with a progress display; a workforce stands for the workers of this machine."""
+    """Simulate with a progress display, by the workers of this machine or a workforce."""
     from edp.sim.data_set import simulate_data_set
 
     began, steps, counts = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
@@ -174,7 +174,7 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: in
 
 
 def limit_table(limit: dict[str, Any]) -> None:
-    """Print the limit beside persistence."""
+    """Print the limit together with persistence."""
     names = [
         target.replace("CylVels_1", "boom").replace("CylVels_2", "arm").replace("CylVels_3", "bucket")
         for target in limit["targets"]

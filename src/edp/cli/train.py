@@ -85,7 +85,7 @@ def train(
 def _train_auto(
     source: DataSource, folder: Path, config: Path | None, changes: Sequence[str], workers: int, quiet: bool
 ) -> None:
-    """Train the portfolio with a progress display, and say what was chosen."""
+    """Train the portfolio with a progress display, and print the chosen candidate."""
     from edp.workflows.auto import load_auto, train_auto
 
     settings = load_auto(config, changes)
@@ -109,7 +109,7 @@ def _train_auto(
 
 
 def _promise_table(facts: dict[str, Any]) -> None:
-    """Print what each candidate promises, by output."""
+    """Print the expected error of each candidate by output."""
     rows = []
     for name, one in facts["candidates"].items():
         mark = "*" if name == facts["chosen"] else ""

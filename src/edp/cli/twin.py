@@ -113,7 +113,7 @@ def twin(
 
 
 def show_trained(trained: TrainedTwin) -> None:
-    """Print what a trained twin has learned of ground and network, and how far its free runs are off."""
+    """Print the free-run errors of a trained twin, and what it learned of ground and network."""
     from edp.evaluation.beyond import beyond_sentence
     from edp.report.twin.facts import ground_line
 
@@ -152,7 +152,7 @@ def rollout(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a twin along a log: measured up to a moment, on the commands alone from there on.
+    """Run a twin along a log: measured up to a given time, then on the commands only.
 
     Prints the error by the time since then. Channels of the written file that end in _twin are the twin's, those
     that end in _twin_low and _twin_high are its intervals.
@@ -201,7 +201,7 @@ def candidate_table(candidates: Sequence[CandidateRow]) -> None:
 
 
 def score_table(models: Mapping[str, FreeRunScores]) -> None:
-    """Print a row a model: errors of velocities, strokes by time, pressures, and the share of diverged runs.
+    """Print one row per model: errors of velocities, strokes by time, pressures, and the fraction of diverged runs.
 
     Actuators of different units have no mean over them: each has a table of its own.
     """
@@ -225,7 +225,7 @@ def score_table(models: Mapping[str, FreeRunScores]) -> None:
 
 
 def actuator_tables(models: Mapping[str, FreeRunScores]) -> None:
-    """Print a table an actuator: errors of its velocity and of its stroke by time, a row a model."""
+    """Print one table per actuator: errors of velocity and of stroke by time, one row per model."""
     first = next(iter(models.values()))
     strokes = first.stroke_error
     out.print(f"{count_of(first.runs, 'free run')} of {figure(first.seconds)} s on commands alone, mean over runs:")
@@ -262,7 +262,7 @@ def error_table(scores: FreeRunScores) -> None:
 
 
 def coverage_table(scores: FreeRunScores) -> None:
-    """Print the share of free runs that the intervals hold, by time and kind of channel."""
+    """Print the fraction of free runs inside the intervals, by time and kind of channel."""
     intervals = scores.intervals
     if intervals is None or not intervals.at:
         return
@@ -283,7 +283,7 @@ def situation_table(scores: FreeRunScores) -> None:
 
 
 def ahead_table(scores: FreeRunScores) -> None:
-    """Print the errors a few ticks ahead of measured ports, beside a look-ahead predictor where one was given."""
+    """Print the k-step-ahead errors, together with those of a look-ahead predictor if one was given."""
     ahead, beside = scores.ahead, scores.beside
     if ahead is not None:
         velocity = ahead.velocity_mae

@@ -1,4 +1,4 @@
-"""Settings of a command: a table of its name, in a settings file beside those of a training, or by ``--set``."""
+"""Settings of a command: its table in a settings file with training settings, or ``--set``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def command_settings(
     others: Collection[str] = (),
     tree: SettingsTree = SETTINGS,
 ) -> tuple[T, tuple[Table, ...]]:
-    """The settings of a command from its table in a TOML file, changed by overrides; and what else was set.
+    """Return the settings of a command from its table in a TOML file, changed by overrides; and the other settings.
 
     Args:
         command: name of the command and of its table.

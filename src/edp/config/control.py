@@ -1,4 +1,4 @@
-"""The settings of closed loops: TOML in, validated specs out, as those of an experiment."""
+"""Settings of closed loops: conversion from TOML to validated objects."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ControlExperiment:
 def load_control_experiment(
     path: str | Path | None = None, overrides: Sequence[str] = (), options: Table | None = None
 ) -> ControlExperiment:
-    """Settings from a TOML file, changed by options of the command and ``key.path=value`` overrides.
+    """Load settings from a TOML file, changed by command options and ``key.path=value`` overrides.
 
     Args:
         path: settings file.
@@ -81,5 +81,5 @@ def load_control_experiment(
 
 
 def control_toml(experiment: ControlExperiment) -> str:
-    """The whole settings as TOML, defaults included: what a run folder keeps."""
+    """Return the complete settings as TOML, including defaults, for the run folder."""
     return tomli_w.dumps(CONTROL_SETTINGS.plain(experiment))

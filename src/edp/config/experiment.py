@@ -108,7 +108,7 @@ class TaskSettings:
         check_ends(self)
 
     def resolve(self, rate_hz: float, channels: Sequence[str] = (), physics: PhysicsSpec | None = None) -> Task:
-        """The task for recordings of `rate_hz` with these channels, with what a physics base reads beside them."""
+        """Return the task for recordings of `rate_hz` with these channels, including the inputs of a physics base."""
         chosen = self.features
         if isinstance(chosen, FeatureSettings):
             features = FeatureSet(**{field.name: getattr(chosen, field.name) for field in fields(chosen)})
@@ -127,7 +127,7 @@ class TaskSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """Everything that settles a training and its judgement.
+    """All settings of a training and its evaluation.
 
     Attributes:
         task: what is read and predicted.
@@ -150,7 +150,7 @@ def load_experiment(
     overrides: Sequence[Change] = (),
     aside: Collection[str] = (),
 ) -> Experiment:
-    """Settings from a preset, changed by a TOML file, changed by overrides.
+    """Load settings from a preset, changed by a TOML file, changed by overrides.
 
     Without a preset the file is taken as it stands, over the defaults of the specs: what a run folder keeps is whole.
 
@@ -179,7 +179,7 @@ def load_experiment(
 
 
 def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()) -> list[Table]:
-    """The table of a settings file and that of all overrides, in the order in which they are laid over settings.
+    """Return the table of a settings file and of all overrides, in the order of application.
 
     Raises:
         ConfigError: a file or an override that cannot be read.
@@ -191,7 +191,7 @@ def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()
 
 
 def preset_table(name: str) -> Table:
-    """The table of a preset, laid over that of its `base` where it names one.
+    """Return the table of a preset, merged with its `base` if it names one.
 
     Raises:
         ConfigError: there is none of this name.
@@ -205,13 +205,13 @@ def preset_table(name: str) -> Table:
 
 
 def experiment_toml(experiment: Experiment) -> str:
-    """The whole settings as TOML, defaults included: what a run folder keeps."""
+    """Return the complete settings as TOML, including defaults, for the run folder."""
     # Defaults included: a run must not change with the defaults of a later version.
     return tomli_w.dumps(plain_tree(experiment))
 
 
 def with_set_file(table: Table, folder: Path) -> Table:
-    """`table` with the feature set that its ``task.features`` names by a file, so that a run folder keeps all of it."""
+    """Return `table` with the feature set in place of its file name, so that a run folder is self-contained."""
     task = table.get("task")
     if not isinstance(task, dict) or not is_set_file(task.get("features")):
         return table

@@ -1,4 +1,4 @@
-"""The settings of a monitor: TOML in, validated specs out, as those of an experiment."""
+"""Settings of a monitor: conversion from TOML to validated objects."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def trains_networks(experiment: MonitorExperiment) -> bool:
 
 
 def default_residuals() -> tuple[ResidualSpec, ...]:
-    """Sources that need no settings; what a machine does not offer gives none."""
+    """Return residual sources that need no settings; unsuitable ones are skipped when fitting."""
     return VirtualSensorsSpec(), LookAheadSpec(), BalancesSpec(), FlowBalancesSpec()
 
 
@@ -38,7 +38,7 @@ AUTOMATIC, NO_MACHINE = "", "none"
 
 @dataclass(frozen=True, kw_only=True)
 class DictionarySpec:
-    """How the dictionary of faults is simulated, from which causes of alarms are named.
+    """Settings for simulating the fault dictionary, from which causes of alarms are named.
 
     Attributes:
         machine: name or file of the machine that is simulated; empty takes the one that the logs name, ``none`` makes
@@ -121,7 +121,7 @@ class MonitorExperiment:
 def load_monitor_experiment(
     path: str | Path | None = None, overrides: Sequence[str] = (), options: Table | None = None
 ) -> MonitorExperiment:
-    """Settings from a TOML file, changed by options of the command and ``key.path=value`` overrides.
+    """Load settings from a TOML file, changed by command options and ``key.path=value`` overrides.
 
     Args:
         path: settings file.
@@ -135,5 +135,5 @@ def load_monitor_experiment(
 
 
 def monitor_toml(experiment: MonitorExperiment) -> str:
-    """The whole settings as TOML, defaults included: what a monitor's folder keeps."""
+    """Return the complete settings as TOML, including defaults, for the monitor's folder."""
     return tomli_w.dumps(MONITOR_SETTINGS.plain(experiment))

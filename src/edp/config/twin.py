@@ -1,4 +1,4 @@
-"""The settings of a twin: TOML in, validated specs out, as those of an experiment."""
+"""Settings of a twin: conversion from TOML to validated objects."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TWIN_SETTINGS = SettingsTree(
 
 @dataclass(frozen=True, kw_only=True)
 class TwinExperiment:
-    """Everything that settles a twin and its judgement.
+    """All settings of a twin and its evaluation.
 
     Attributes:
         channels: which channels command, and which it answers.
@@ -64,7 +64,7 @@ def trains_several(experiment: TwinExperiment) -> bool:
 
 
 def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str] = ()) -> TwinExperiment:
-    """Settings from a TOML file, changed by ``key.path=value`` overrides, over the defaults of the specs.
+    """Load settings from a TOML file, changed by ``key.path=value`` overrides, on top of the defaults.
 
     Raises:
         ConfigError: names every unknown key, wrong type and impossible value at once.
@@ -89,5 +89,5 @@ def has_choice(experiment: TwinExperiment) -> bool:
 
 
 def twin_toml(experiment: TwinExperiment) -> str:
-    """The whole settings as TOML, defaults included: what a run folder keeps."""
+    """Return the complete settings as TOML, including defaults, for the run folder."""
     return tomli_w.dumps(TWIN_SETTINGS.plain(experiment))

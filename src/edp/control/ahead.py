@@ -1,4 +1,4 @@
-"""Velocities some ticks ahead, for commands that are tried: of a look-ahead predictor, or of a twin."""
+"""Velocity models for controllers: k-step-ahead velocities for candidate commands, from a predictor or a twin."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class VelocityModel(ABC):
 
 
 class PredictorAhead(VelocityModel):
-    """A look-ahead predictor: what it says of commands now is what usually follows them.
+    """Velocity model from a k-step-ahead predictor; its output for present commands assumes their usual continuation.
 
     Args:
         bundle: it must read pilot pressures and predict the velocities.
@@ -93,7 +93,7 @@ class PredictorAhead(VelocityModel):
             _, self._state = self._predictor.predict(rows.expand(1, self._predictor.window, self._width), start)
 
     def ahead(self, measured: Array, commands: Array) -> Array:
-        """Every candidate is a lane of one step."""
+        """Return the predictions; each candidate is one batch entry with one step."""
         rows = self._rows(measured, commands)
         with _one_thread():
             lanes = map_state(lambda tensor: tensor.expand(len(rows), *tensor.shape[1:]).contiguous(), self._state)
@@ -101,12 +101,12 @@ class PredictorAhead(VelocityModel):
         return np.asarray(answers[:, -1, self._horizon, self._targets].numpy(), float)
 
     def advance(self, measured: Array, command: Array) -> None:
-        """One step with what was given."""
+        """Advance by one step with the applied command."""
         with _one_thread():
             _, self._state = self._predictor.predict(self._rows(measured, command[None]), self._state)
 
     def _rows(self, measured: Array, commands: Array) -> torch.Tensor:
-        """Inputs, shape (candidate, 1, input)."""
+        """Return the inputs, shape (candidate, 1, input)."""
         rows = np.empty((len(commands), 1, self._width), np.float32)
         rows[:, 0, self._measured] = measured
         rows[:, 0, self._commands] = commands[:, self._pilots]
@@ -114,7 +114,7 @@ class PredictorAhead(VelocityModel):
 
 
 class TwinAhead(VelocityModel):
-    """A twin: it is told the commands and runs on them alone from what is measured now.
+    """Velocity model from a twin, which simulates the commands from the present measurement.
 
     What the plant does not measure, such as pump pressures, is a free port of the twin: it reads its own last answer.
 
@@ -140,7 +140,7 @@ class TwinAhead(VelocityModel):
         self._state: Any = None
 
     def begin(self, measured: Array, command: Array) -> None:
-        """Form the memory by a prefix at rest; free ports start from the means of the training."""
+        """Initialise the memory by a steady prefix; free ports start from the training means."""
         ticks = max(self.twin.prefix_ticks, 1)
         rows = np.repeat(self._row(measured)[None, None], ticks, axis=1)
         rows[0, 0] = np.where(np.isfinite(rows[0, 0]), rows[0, 0], self.twin.scales.answer_offset)
@@ -148,14 +148,14 @@ class TwinAhead(VelocityModel):
         self._state = self.twin.reset(commands, rows)
 
     def ahead(self, measured: Array, commands: Array) -> Array:
-        """Candidates are runs; the first tick reads what is measured, the others run free."""
+        """Return the predictions. Candidates are runs; the first sample reads the measurement, later ones run free."""
         lasting = np.repeat(commands[:, None, self._pilots], self.ticks, axis=1).astype(np.float32)
         first = np.zeros(len(commands), np.int64)
         answers = self._runner.neighbours(lasting, self._state, self._row(measured), first)
         return np.asarray(answers[:, -1, self._velocities], float)
 
     def advance(self, measured: Array, command: Array) -> None:
-        """One tick that reads what was measured."""
+        """Advance by one sample with the measured values."""
         pilots = np.asarray(command[self._pilots], np.float32)
         self._state = self._runner.step(pilots, self._state, self._row(measured))
 

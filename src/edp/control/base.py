@@ -1,4 +1,4 @@
-"""What every controller shares: its registry, the plant as it sees it, and the command that is always safe."""
+"""Common base of controllers: registry, plant interface, and the command that is always safe."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MOST_EVENTS = 1_000
 
 @dataclass(frozen=True)
 class ControlEvent:
-    """Something that a controller had to answer otherwise than asked.
+    """Event in which a controller deviated from its regular output.
 
     Attributes:
         tick: at which it began.
@@ -44,7 +44,7 @@ class ControlEvent:
 
 
 def log_event(events: list[ControlEvent], tick: int, text: str) -> None:
-    """Keep an event; one that goes on is made longer, and of many the first `MOST_EVENTS` are kept."""
+    """Append an event. A continuing event is extended; only the first `MOST_EVENTS` are stored."""
     last = events[-1] if events else None
     if last is not None and last.text == text and last.tick + last.ticks == tick:
         events[-1] = ControlEvent(last.tick, last.ticks + 1, text)
@@ -53,7 +53,10 @@ def log_event(events: list[ControlEvent], tick: int, text: str) -> None:
 
 
 class ControlFault(Exception):
-    """A controller has no answer at this tick, since a solver failed; `Controller.step` gives the safe command."""
+    """Raised by a controller without a result at this sample, such as a failed solver.
+
+    `Controller.step` gives the safe command.
+    """
 
 
 class Controller(ABC):
@@ -125,7 +128,7 @@ class Controller(ABC):
         raise ControlFault(f"it has no fallback where a guard asks for one{f' ({reason})' if reason else ''}")
 
     def check(self, measured: Array) -> None:  # noqa: B027
-        """Refuse what makes no controller of it, before any loop; nothing by default.
+        """Raise an error before any loop if the controller cannot work; the default accepts everything.
 
         Args:
             measured: the channels of `reads` at a start, at rest.
@@ -135,7 +138,7 @@ class Controller(ABC):
         """
 
     def missed(self, tick: int) -> None:
-        """Called at each tick at which the safe command is given; a controller with memory brings it up to date."""
+        """Update the memory at a sample with the safe command; called in place of `step`."""
         self.info = {}
 
     @property
@@ -185,7 +188,7 @@ class Controller(ABC):
         return self._before.copy()
 
     def late(self, before: Array, tick: int, reason: str) -> Array:
-        """Levers in place of those of `step` where they came too late: towards neutral; an event is logged.
+        """Return levers moved towards neutral if the levers of `step` came too late; an event is logged.
 
         Args:
             before: levers of the tick before, shape (3,).
@@ -239,7 +242,7 @@ class ControllerSpec(Protocol):
     """Lowest and highest value worth trying, by option: what a tuning varies."""
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
-        """The controller for a plant.
+        """Build the controller for a plant.
 
         Raises:
             ConfigError: the plant or the models lack what it needs, or the limits contradict it.

@@ -1,4 +1,4 @@
-"""What a loop asks beside its controller: which channels are not to be trusted, and whether to fall back.
+"""Guard of a control loop: channels not to be trusted, and requests to fall back.
 
 A monitor is such a guard. A loop knows no more of it than `LoopGuard` says: any object with its two methods will do.
 """
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GuardVerdict:
-    """What a guard says of a tick.
+    """Result of a guard for one sample.
 
     Attributes:
         untrusted: names of measured channels whose values controllers must not read.
@@ -42,7 +42,7 @@ TRUSTED = GuardVerdict()
 
 
 class LoopGuard(Protocol):
-    """Watches a loop and says at each tick what its controller may rely on.
+    """Monitor of a control loop that decides at each sample which data the controller may use.
 
     A guard decides alone, hysteresis included: what it says holds for one tick. It sees a tick before the controller
     does, so that no value is acted on which it has just refused.
@@ -60,7 +60,7 @@ class LoopGuard(Protocol):
         ...
 
     def step(self, observation: Array) -> GuardVerdict:
-        """What holds for this tick.
+        """Return the verdict for this sample.
 
         Args:
             observation: SI values in the order of ``plant.channels``, pilot pressures of the tick before among them
@@ -70,7 +70,7 @@ class LoopGuard(Protocol):
 
 
 def verdict_of(guard: LoopGuard, plant: PlantInterface, observation: Array) -> GuardVerdict:
-    """The verdict of a tick; a guard that fails, or names a channel that the plant does not measure, falls back.
+    """Return the verdict of a sample. A guard that fails or names an unknown channel causes a fallback.
 
     Args:
         guard: that is asked.

@@ -1,4 +1,4 @@
-"""What a loop must keep: positions and speeds of the levers, strokes and pressures."""
+"""Limits of a control loop: positions and speeds of the levers, strokes and pressures."""
 
 from __future__ import annotations
 

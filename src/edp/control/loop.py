@@ -57,7 +57,7 @@ class LoopResult:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """What is collected, a row a tick."""
+    """Collected samples, one row each."""
 
     observed: Array
     truth: Array
@@ -160,7 +160,7 @@ def start_options(task: ControlTask, geometry: TipGeometry) -> dict[str, Any]:
 
 
 def _trace(rows: _Rows, names: tuple[str, ...], geometry: TipGeometry, controller: Controller) -> LoopTrace:
-    """What the score reads; true values where the plant has them, else by the kinematics from its own answers."""
+    """Return the data for scoring: true values if the plant has them, otherwise from its outputs by kinematics."""
     truth = {name: rows.truth[:, n] for n, name in enumerate(names)}
     measured = {channel.name: rows.observed[:, n] for n, channel in enumerate(controller.plant.channels)}
     strokes = np.stack([truth[name] for name in STROKES], axis=1)

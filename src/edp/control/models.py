@@ -1,4 +1,4 @@
-"""What controllers know of a plant: a static valve map, and models that were learned from its recordings."""
+"""Models available to controllers: a static valve map, and models trained on recordings of the plant."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edp.training.bundle import Bundle
 
 @dataclass(frozen=True, eq=False)
 class ControlModels:
-    """Models for controllers; None where there is none.
+    """Models for controllers; missing models are None.
 
     Attributes:
         valve_map: cylinder speed by lever, measured on the plant or on a twin of it.
@@ -25,7 +25,7 @@ class ControlModels:
     predictor: Bundle | None = None
 
     def needed_map(self, who: str) -> ValveMap:
-        """The valve map.
+        """Return the valve map.
 
         Raises:
             ConfigError: there is none; `who` needs it.
@@ -35,7 +35,7 @@ class ControlModels:
         return self.valve_map
 
     def needed_twin(self, who: str) -> Twin:
-        """The twin.
+        """Return the twin.
 
         Raises:
             ConfigError: there is none; `who` needs it.

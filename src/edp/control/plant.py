@@ -1,4 +1,4 @@
-"""A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry."""
+"""Controller's view of a plant: measured channels, mapping from levers to commands, and machine geometry."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VELOCITIES = ("CylVels_1", "CylVels_2", "CylVels_3")
 
 @dataclass(frozen=True, eq=False)
 class PlantInterface:
-    """A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry.
+    """Controller's view of a plant: measured channels, mapping from levers to commands, and machine geometry.
 
     Attributes:
         channels: of an observation, in its order; SI units.
@@ -40,7 +40,7 @@ class PlantInterface:
     source: str = "plant"
 
     def columns(self, names: tuple[str, ...]) -> NDArray[np.int64]:
-        """Where channels lie in an observation.
+        """Return the positions of channels in an observation.
 
         Raises:
             ConfigError: one is not measured; the closest is offered.
@@ -53,7 +53,7 @@ class PlantInterface:
 
 
 def interface_of(env: Any) -> PlantInterface:
-    """What a controller sees of an environment.
+    """Return the controller's view of an environment.
 
     Args:
         env: a gymnasium environment with `channels`, `rate_hz`, `machine` and `commands` to the channels `PILOTS`, such

@@ -30,7 +30,7 @@ def is_fmu(plant: str | Path) -> bool:
 def plant_of(
     machine: str, duration_s: float, rate_hz: float, plant: str | Path | None = None, trusted: bool = False
 ) -> Any:
-    """An environment in which a controller can be run.
+    """Create an environment for running a controller.
 
     Args:
         machine: name of a machine, or path of a machine file: simulated, or the kinematics of another plant.
@@ -53,12 +53,12 @@ def plant_of(
 
 
 def twin_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -> Twin:
-    """The twin of a run folder; arguments and errors are those of `bundle_of`."""
+    """Return the twin of a run folder; arguments and errors as in `bundle_of`."""
     return bundle_of(run, machine, rate_hz).twin
 
 
 def bundle_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -> TwinBundle:
-    """The twin of a run folder, with its ground where it has one.
+    """Return the twin of a run folder, with its ground if it has one.
 
     Args:
         run: folder.
@@ -86,7 +86,7 @@ def bundle_of(run: str | Path, machine: Machine, rate_hz: float | None = None) -
 
 
 def of_rate(twin: Twin, what: str, rate_hz: float) -> Twin:
-    """A twin of a rate.
+    """Return the twin after a check of its sampling rate.
 
     Raises:
         ConfigError: it has another one.

@@ -1,4 +1,4 @@
-"""What a loop is to follow: strokes and tip poses over time, checked against the machine before the start."""
+"""Reference of a control loop: strokes and tip poses over time, checked against the machine before the start."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class TipReference:
         return self.ticks / self.rate_hz
 
     def rows(self, start: int, count: int) -> NDArray[np.int64]:
-        """Indices of `count` ticks from `start` on; the first and last tick stand for what lies beyond the ends."""
+        """Return the indices of `count` samples from `start`; beyond the ends the first or last sample is used."""
         return np.clip(np.arange(start, start + count), 0, self.ticks - 1)
 
     def speeds(self) -> Array:
@@ -56,7 +56,7 @@ def reference_of_tip(
     judged: NDArray[np.bool_] | None = None,
     margin: float = 0.0,
 ) -> TipReference:
-    """A reference of tip poses.
+    """Create a reference from tip poses.
 
     Args:
         name: of the task, for messages.
@@ -91,7 +91,7 @@ def reference_of_strokes(
     judged: NDArray[np.bool_] | None = None,
     margin: float = 0.0,
 ) -> TipReference:
-    """A reference of strokes (m), shape (ticks, 3); see `reference_of_tip`.
+    """Create a reference from strokes (m), shape (ticks, 3); see `reference_of_tip`.
 
     Raises:
         ConfigError: names the first stroke outside the cylinder, and its time.
@@ -106,7 +106,7 @@ def _mask(judged: NDArray[np.bool_] | None, strokes: Array) -> NDArray[np.bool_]
 
 
 def _checked(name: str, reference: TipReference, geometry: TipGeometry, margin: float) -> TipReference:
-    """The reference, refused where a stroke lies within the margin of an end."""
+    """Return the reference; raises ConfigError if a stroke is within the margin of an end."""
     if reference.ticks < 2:
         raise ConfigError(f"reference '{name}' has {reference.ticks} ticks; at least 2 must hold")
     shares = reference.strokes / geometry.full_m
@@ -123,7 +123,7 @@ def _checked(name: str, reference: TipReference, geometry: TipGeometry, margin: 
 
 
 def check_speeds(name: str, reference: TipReference, geometry: TipGeometry, fastest: Array) -> None:
-    """Refuse a reference that asks a cylinder for more than it can.
+    """Raise ConfigError if a reference requires a higher cylinder speed than possible.
 
     Args:
         name: of the task, for messages.

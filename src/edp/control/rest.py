@@ -1,4 +1,4 @@
-"""What a machine shows at rest: the measured rows with which plants without a simulator behind them begin."""
+"""Measured rows of a machine in steady state, with which plants without a simulator begin."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RestingMachine:
         self.machine, self.commands = self._env.machine, self._env.commands
 
     def rows(self, shares: Any) -> NDArray[np.float32]:
-        """What it shows at strokes (shares of full), a row a tick, shape (ticks + 1, channel)."""
+        """Return the steady rows at the given strokes (fractions of full stroke), shape (ticks + 1, channel)."""
         options = {"strokes": tuple(map(float, shares))}
         rows = [self._env.reset(seed=0, options=options)[0]]
         rows += [self._env.step(np.zeros(AXES))[0] for _ in range(self._ticks)]
@@ -53,7 +53,7 @@ class RestingMachine:
 
 
 def check_plant_channels(what: str, commands: Sequence[str], answers: Sequence[str], change: str) -> None:
-    """Refuse a plant that is no excavator of Table A.1.
+    """Raise an error unless the plant is an excavator of Table A.1.
 
     Args:
         what: the plant, for the message.

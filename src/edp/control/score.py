@@ -1,4 +1,4 @@
-"""How well a loop did: errors to the path and to the time of the reference, energy, levers, and limits."""
+"""Scores of a control loop: errors to path and timed reference, energy, lever motion, and limit violations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIMITS = ("lever", "slew", "stroke", "pressure")
 
 @dataclass(frozen=True, eq=False)
 class LoopTrace:
-    """What a loop did, a row a tick.
+    """Recorded control loop, one row per sample.
 
     Attributes:
         tip: true tip x, y (m) and attitude (rad), shape (ticks, 3).
@@ -41,7 +41,7 @@ class LoopTrace:
 
 @dataclass(frozen=True)
 class LoopScore:
-    """Figures of a loop over its judged ticks.
+    """Metrics of a control loop over its evaluated samples.
 
     Distances to the path alone reward standing still, so the position error, which is the distance to where the
     reference is at that time, always stands beside them.
@@ -78,7 +78,7 @@ class LoopScore:
     finished: bool
 
     def plain(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Convert to JSON types."""
         return {**asdict(self), "violations": dict(self.violations)}
 
 

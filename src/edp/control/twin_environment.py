@@ -24,7 +24,7 @@ TIP = ("TipX", "TipY", "TipAngle")
 
 
 class TwinStart:
-    """How a twin becomes a plant: its channels, how levers command it, and how it begins.
+    """Conversion of a twin to a plant: channels, mapping from levers to commands, and initial state.
 
     Args:
         twin: of an excavator, with the channels of Table A.1 and strokes.
@@ -51,7 +51,7 @@ class TwinStart:
         self.machine, self.commands = self._rest.machine, self._rest.commands
 
     def begin(self, shares: Any) -> tuple[TwinState, NDArray[np.float32]]:
-        """State of a batch of one at rest at strokes (shares of full), and its row."""
+        """Return the steady state at the given strokes (fractions of full stroke) and its measurement row."""
         rows = self._rest.rows(shares)
         state = self._twin.reset(rows[None, :-1, self._answers :], rows[None, :-1, : self._answers])
         return state, rows[-1]
@@ -103,7 +103,7 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode at rest.
+        """Begin an episode in steady state.
 
         Args:
             seed: of the environment's own generator; a twin draws nothing.
@@ -145,7 +145,7 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return row, 0.0, False, self._tick >= self._ticks, self._info(row)
 
     def _moved(self, command: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Answer to a command, which brings the state on."""
+        """Return the output for a command, and advance the state."""
         if self._grounded is not None and self._digs:
             self._state = self._grounded.step(command, self._state, self._free)
             return np.asarray(self._state["answer"][0], np.float32)
@@ -159,7 +159,7 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def check_air(material: Any, what: str = "a twin") -> None:
-    """Refuse a soil where a plant knows none.
+    """Raise ConfigError for a soil in a plant without soil.
 
     Raises:
         ConfigError: there is one.

@@ -48,7 +48,7 @@ class ValveMap:
     speeds: Array
 
     def lever(self, axis: int, speed: float, rest: float = 0.0) -> float:
-        """Lever for a cylinder speed (m/s); zero below `rest`, full where the cylinder cannot go as fast."""
+        """Return the lever for a cylinder speed (m/s): zero below `rest`, full beyond the largest speed."""
         size = abs(speed)
         if size <= rest:
             return 0.0
@@ -115,7 +115,7 @@ def measure_valve_map(env: Any, plant: PlantInterface, seed: int = 0) -> ValveMa
 
 
 def map_of_speeds(levels: Array, measured: Array, source: str) -> ValveMap:
-    """A map from mean speeds at lever positions.
+    """Create a map from mean speeds at lever positions.
 
     Args:
         levels: positions, shape (levels,), rising.

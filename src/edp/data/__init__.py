@@ -1,1 +1,1 @@
-"""From recordings to what a network is trained on: features, scaling, splits, chunks."""
+"""Data preparation: features, scaling, splits and chunks for training."""

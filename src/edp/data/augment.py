@@ -1,4 +1,4 @@
-"""Augmentations: seeded changes of training stretches, drawn anew for each stretch in each epoch; never of others."""
+"""Seeded data augmentation. Each training segment gets a new random change in each epoch; other data stay unchanged."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class AugmentationSpec(Protocol):
     """Options of an augmentation."""
 
     def apply(self, part: Series, deviation: NDArray[np.float32], rng: np.random.Generator) -> Series:
-        """A changed stretch of the same length.
+        """Return an augmented segment of the same length.
 
         Args:
             part: from a reset to the next one, with what its last targets need.
@@ -83,7 +83,7 @@ class WindowShift:
 @AUGMENTATIONS.register("time_warp")
 @dataclass(frozen=True, kw_only=True)
 class TimeWarp:
-    """Time runs faster and slower along the stretch, for inputs and targets alike; both ends stay.
+    """Time warping: inputs and targets are resampled with a varying speed; both ends of the segment stay in place.
 
     The speed is one plus three sines of random phase, whose periods lie between a quarter of the stretch and the whole.
     Values are interpolated, not scaled: what changes is how fast the plant answers. So are teacher predictions.
@@ -101,7 +101,7 @@ class TimeWarp:
         check_bounds("time_warp", self, strength=above(0.0, 0.5))
 
     def apply(self, part: Series, deviation: NDArray[np.float32], rng: np.random.Generator) -> Series:
-        """Read the stretch at warped rows."""
+        """Return the segment resampled at warped rows."""
         last = part.samples - 1
         if last < 1:
             return part
@@ -124,7 +124,7 @@ class TimeWarp:
 
 
 def input_deviation(series: list[Series]) -> NDArray[np.float32]:
-    """Standard deviation of each input over all stretches, ``(input,)``, SI units."""
+    """Return the standard deviation of each input over all segments, ``(input,)``, SI units."""
     count = sum(part.samples for part in series)
     mean = sum(part.inputs.sum(axis=0, dtype=np.float64) for part in series) / count
     squares = sum(

@@ -1,4 +1,7 @@
-"""Chunks for training: long pieces of recordings, walked in parallel lanes with carried state; windows are a case."""
+"""Sampling of training chunks: long segments in parallel batch rows, the state is carried from chunk to chunk.
+
+Windows are a special case.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from edp.settings.bounds import MOST_BATCH, MOST_TICKS, check_bounds, integer
 
 @dataclass(frozen=True, kw_only=True)
 class ChunkSpec:
-    """How a recording is cut for training.
+    """Settings for cutting recordings into training chunks.
 
     Attributes:
         regime: ``chunk`` walks lanes with carried state, one target per sample; ``window`` draws windows of
@@ -105,10 +108,10 @@ Piece = tuple[Any, Any, Any, Any]
 
 
 class Sampler(Protocol):
-    """Where the batches of a training come from."""
+    """Source of the training batches."""
 
     def epoch(self, number: int) -> Iterator[Batch]:
-        """The batches of epoch `number`, as a function of it and a seed alone."""
+        """Yield the batches of epoch `number`, which depend on this number and the seed only."""
         ...
 
     def updates(self, number: int = 0) -> int:
@@ -150,7 +153,7 @@ class ChunkSampler:
                 )
 
     def epoch(self, number: int) -> Iterator[Batch]:
-        """The batches of epoch `number`."""
+        """Yield the batches of epoch `number`."""
         rng = np.random.default_rng([self.seed, number])
         return self._windows(rng, number) if self.spec.regime == "window" else self._lanes(rng, number)
 
@@ -163,7 +166,10 @@ class ChunkSampler:
         return max(_ticks(lane) for lane in self._plan(np.random.default_rng([self.seed, number]))) // self.spec.length
 
     def _plan(self, rng: np.random.Generator) -> list[list[tuple[int, int, int]]]:
-        """Pieces (series, start, stop), multiples of the chunk length, dealt to lanes of nearly equal load."""
+        """Distribute segments (series, start, stop) over the batch rows with nearly equal load.
+
+        Lengths are multiples of the chunk length.
+        """
         length, lanes = self.spec.length, self.spec.batch
         total = sum(part.samples for part in self.series)
         # At least a few chunks per piece, so that burn-in stays a small share; at most an even share of a lane.
@@ -182,7 +188,7 @@ class ChunkSampler:
         return [[lane[i] for i in rng.permutation(len(lane))] for lane in plan]
 
     def _pieces(self, rng: np.random.Generator, piece: int) -> Iterator[tuple[int, int, int]]:
-        """All series cut into pieces of `piece` ticks."""
+        """Yield segments of `piece` samples that cover all series."""
         length = self.spec.length
         for i in rng.permutation(len(self.series)):
             samples = self.series[i].samples
@@ -206,7 +212,7 @@ class ChunkSampler:
             yield stack([piece for piece, _ in steps], [reset for _, reset in steps])
 
     def _lane(self, pieces: Sequence[tuple[int, int, int]], number: int) -> Iterator[tuple[Piece, bool]]:
-        """Chunks of one lane in order, and whether each begins a piece."""
+        """Yield the chunks of one batch row in order, each with a flag that is true at the beginning of a segment."""
         length, burn_in = self.spec.length, self.spec.burn_in
         for i, start, stop in pieces:
             part, origin = self._stretch(i, start, stop, self._chance(number, i, start))
@@ -231,15 +237,15 @@ class ChunkSampler:
             yield stack(rows, [True] * len(rows))
 
     def _groups(self, part: Series, offset: int) -> int:
-        """How many groups of consecutive windows a series holds from `offset` on."""
+        """Return the number of groups of consecutive windows in a series from `offset`."""
         return max(0, part.samples - self.spec.length + 1 - max(self.horizons) - offset) // self.spec.consecutive
 
     def _chance(self, *key: int) -> np.random.Generator | None:
-        """A source of chance of its own for what is augmented: neither the order of lanes nor a stop matters."""
+        """Return a random generator for augmentation, seeded by the key, so that order and restarts do not matter."""
         return np.random.default_rng([self.seed, *key]) if self.augmentations else None
 
     def _stretch(self, i: int, start: int, stop: int, rng: np.random.Generator | None) -> tuple[Series, int]:
-        """The series to cut ``start:stop`` from, and the row of series i at which it begins."""
+        """Return the series from which ``start:stop`` is cut, and the row of series i at which this series begins."""
         part = self.series[i]
         if rng is None or self.deviation is None:
             return part, 0
@@ -257,7 +263,7 @@ class ChunkSampler:
 
 
 def cut(part: Series, ticks: range, horizons: tuple[int, ...], silent: int) -> Piece:
-    """Inputs, future targets, validity and teacher targets of a piece of a series.
+    """Cut inputs, future targets, validity and teacher targets for a range of samples of a series.
 
     Args:
         part: the series.

@@ -1,4 +1,4 @@
-"""What a data set covers: spectrum of its inputs, poses, joint histograms, events, and how far tests lie from training.
+"""Coverage of a data set: spectrum of the inputs, poses, joint histograms, events, distance of test from training data.
 
 It works on any recordings: roles come from names or kinds (`edp.data.roles`), and what a recording lacks is named in
 `Coverage.absent`, never guessed.
@@ -108,7 +108,7 @@ class JointHistogram:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """What a data set covers.
+    """Coverage of a data set.
 
     Attributes:
         recordings, hours, rate_hz: its size.
@@ -136,7 +136,7 @@ class Coverage:
     contradictions: tuple[str, ...] = field(default=())
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; arrays as lists, share of cells with them."""
+        """Convert to JSON types; arrays become lists, the occupancy gets its fraction of visited cells."""
         plain: dict[str, Any] = _plain(asdict(self))
         plain["singular"] = {str(lags): value for lags, value in self.singular.items()}
         if self.occupancy is not None:
@@ -147,7 +147,7 @@ class Coverage:
 def cover(
     recordings: Sequence[Recording], inputs: Sequence[str] = (), split: Split | None = None, dead_band: float = 0.14
 ) -> Coverage:
-    """Look at what a data set covers.
+    """Compute the coverage of a data set.
 
     Args:
         recordings: at one rate, with equal channels.
@@ -205,7 +205,7 @@ def cover(
 
 
 def _known_axes(first: Recording, roles: Roles, absent: list[str]) -> tuple[Axis, ...]:
-    """The axes of which something is known to move; numbers of no kind may be anything, and are named as absent."""
+    """Return the axes whose velocity has a known kind; names of the other axes are added to `absent`."""
     kinds = {channel.name: channel.kind for channel in first.channels}
     unknown = [axis.velocity for axis in roles.axes if kinds.get(axis.velocity) is Kind.GENERIC]
     if not unknown:
@@ -219,7 +219,7 @@ def _known_axes(first: Recording, roles: Roles, absent: list[str]) -> tuple[Axis
 
 
 def _contradictions(recordings: Sequence[Recording], axes: Sequence[Axis]) -> Iterator[str]:
-    """Of each axis whose stroke is no integral of its velocity."""
+    """Yield a message for each axis whose stroke is not the integral of its velocity."""
     kinds = {channel.name: channel.kind for channel in recordings[0].channels}
     for axis in axes:
         # What answers where no velocity is recorded may be anything.
@@ -231,7 +231,7 @@ def _contradictions(recordings: Sequence[Recording], axes: Sequence[Axis]) -> It
 
 
 def _inputs(recordings: Sequence[Recording], roles: Roles) -> tuple[list[str], tuple[str, ...]]:
-    """Inputs that change, and those that do not."""
+    """Return the inputs that change, and the inputs that are constant."""
 
     def changes(name: str) -> bool:
         values = [r.column(name) for r in recordings]
@@ -257,7 +257,7 @@ def _spectrum(recordings: Sequence[Recording], roles: Roles) -> Spectrum | None:
 
 
 def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> Occupancy | None:
-    """Occupancy of the strokes of up to three axes, from what is there."""
+    """Compute the occupancy of the strokes of up to three axes, from measured strokes or integrated velocities."""
     stroked = [axis for axis in axes if axis.stroke][:3]
     if stroked:
         names, source = tuple(axis.stroke for axis in stroked), MEASURED

@@ -1,4 +1,4 @@
-"""What a data set should cover to learn a model of a machine from, and whether it does."""
+"""Coverage targets for learning a model of a machine, and their check."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BEYOND = 0.1
 
 @dataclass(frozen=True)
 class CoverageTarget:
-    """One figure of the coverage against what is wanted of it.
+    """One coverage figure and its target.
 
     Attributes:
         name: what.
@@ -44,7 +44,7 @@ class CoverageTarget:
 
 
 def wanted(coverage: Coverage) -> tuple[CoverageTarget, ...]:
-    """Every figure that the data allow to judge, by what is wanted of it."""
+    """Return all coverage figures that can be computed from the data, each with its target."""
     targets = []
     if coverage.occupancy is not None:
         targets.append(

@@ -22,7 +22,7 @@ RATE_OF = {integral: velocity for velocity, integral in INTEGRAL.items()}
 def complete_velocities(
     recordings: Sequence[Recording], settings: TwinChannelSettings
 ) -> tuple[list[Recording], TwinChannelSettings]:
-    """Recordings and settings with a velocity for each position, where no velocity is recorded or named.
+    """Add a velocity for each position without a recorded or named velocity, to recordings and settings.
 
     Positions are the strokes that the settings name, else every position and angle that commands nothing. Recordings
     with a velocity, and those without a position, come back as they are.
@@ -46,7 +46,9 @@ def complete_velocities(
 
 
 def matched(channels: TwinChannels, recording: Recording) -> Recording:
-    """A recording with all channels of a twin: velocities that were derived from positions in its training are derived.
+    """Return the recording with all channels of a twin.
+
+    Velocities that the training derived from positions are derived again.
 
     Raises:
         DataError: it lacks another channel, or measures one as another kind.
@@ -63,7 +65,7 @@ def matched(channels: TwinChannels, recording: Recording) -> Recording:
 
 
 def _with_velocities(recording: Recording, positions: Sequence[str]) -> Recording:
-    """The backward difference of each position, times the rate; zero at the first tick, where nothing came before."""
+    """Add the backward difference of each position times the sampling rate. The first sample is zero."""
     columns, channels = [recording.values], list(recording.channels)
     for name in positions:
         channel = recording.channels[recording.index(name)]

@@ -1,4 +1,4 @@
-"""How far test data lie from training data: nearest neighbours among states of motion."""
+"""Distance of test data from training data, by nearest neighbours in the space of motion states."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Distance:
 
 
 def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split: Split) -> Distance | None:
-    """Distance of the tests of a split; None where nothing but a single stretch of a few samples trains."""
+    """Return the distance of the test data of a split; None if only one short segment is used for training."""
     halves = (split.train[::2], split.train[1::2])
     if not halves[1]:
         only = split.train[0]

@@ -1,4 +1,4 @@
-"""Episodes: from each of some machines, pieces to adapt on and other pieces to judge the adapted network by."""
+"""Episodes for meta-learning: segments of a machine for adaptation, and others to evaluate the adapted network."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class EpisodeSampler:
         return -(-len(self.owned) // self.machines)
 
     def epoch(self, number: int) -> Iterator[Batch]:
-        """The batches of epoch `number`; the last one takes machines again where they do not fill it."""
+        """Yield the batches of epoch `number`. The last batch is filled with machines from the beginning."""
         rng = np.random.default_rng([self.seed, number])
         names = list(self.owned)
         order = [names[i] for i in rng.permutation(len(names))]
@@ -69,7 +69,7 @@ class EpisodeSampler:
             yield stack(rows, [True] * len(rows))
 
     def _pieces(self, part: Series, offset: int) -> int:
-        """How many pieces with a loss on all but the burn-in a series has from `offset` on."""
+        """Return the number of segments in a series from `offset`, with a loss on all samples after the burn-in."""
         return max(0, (part.samples - offset - max(self.horizons)) // self.spec.length)
 
     def _episode(self, machine: str, rng: np.random.Generator) -> list[Piece]:

@@ -1,4 +1,4 @@
-"""Whether every part of a split holds its share of ticks and motion, and what tests moves as the rest; and blocks."""
+"""Check that each part of a split has its fraction of samples and motion, and choose blocks otherwise."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def is_even(
     gap: int,
     weights: Sequence[NDArray[np.bool_]],
 ) -> bool:
-    """Whether each part has at least `LEAST_OF_SHARE` of the weight that its share of the data stands for.
+    """Return whether each part has at least `LEAST_OF_SHARE` of the weight expected from its fraction of the data.
 
     Args:
         split: how to divide.
@@ -76,7 +76,7 @@ def is_even(
 
 
 def _shares(split: ByRecording | ByTime | ByBlocks) -> dict[str, float]:
-    """Of the data that each part is to have."""
+    """Return the fraction of the data for training, validation and test."""
     test = 1 / split.every if isinstance(split, ByBlocks) else split.test_share
     validation = split.validation_share * (1 - test if isinstance(split, ByBlocks) else 1)
     return {"train": 1 - validation - test, "validation": validation, "test": test}
@@ -85,7 +85,7 @@ def _shares(split: ByRecording | ByTime | ByBlocks) -> dict[str, float]:
 def most_unlike(
     split: ByTime | ByBlocks, recordings: Sequence[Recording], gap: int, channels: Sequence[str], spans: Sequence[int]
 ) -> tuple[float, str, int]:
-    """How unlike the rest the part that tests moves: root-mean-square changes over those of the rest.
+    """Compare root-mean-square changes of each channel in the test part with the rest; return the largest difference.
 
     Args:
         split: how to divide.
@@ -116,12 +116,12 @@ def most_unlike(
 
 
 def _distance(ratio: float) -> float:
-    """Of a ratio from 1, the same for its inverse."""
+    """Return the absolute logarithm of a ratio, so that a ratio and its inverse are equally far from 1."""
     return float(abs(np.log(ratio))) if ratio > 0 else float(np.inf)
 
 
 def _mean_change(recordings: Sequence[Recording], stretches: Sequence[Stretch], name: str, span: int) -> float:
-    """Root-mean-square change of a channel over so many ticks; missing values are passed over."""
+    """Return the root-mean-square change of a channel over `span` samples, ignoring missing values."""
     squared, count = 0.0, 0
     for one in stretches:
         recording = recordings[one.recording]
@@ -137,7 +137,7 @@ def _mean_change(recordings: Sequence[Recording], stretches: Sequence[Stretch], 
 def blocks_where_time_is_uneven(
     recordings: Sequence[Recording], channels: Sequence[str], horizons: Sequence[int], by_time: ByTime
 ) -> tuple[ByBlocks, str] | None:
-    """Blocks for recordings whose end says nothing of the rest, and why in words; None where time will do.
+    """Return a split by blocks and its reason if the end of the recordings does not represent the rest; otherwise None.
 
     The end says nothing where the machine rests there, or moves far less or far more than before (sweeps of frequency,
     a warm-up): a model would be tested by what it was not trained for, or by the easiest of what it was.
@@ -171,7 +171,7 @@ def blocks_where_time_is_uneven(
 def rests_where_it_tests(
     recordings: Sequence[Recording], channels: Sequence[str], horizons: Sequence[int], by_time: ByTime
 ) -> bool:
-    """Whether the machine rests in most of what would be tested or validated, however it is divided.
+    """Return whether the machine stands still in most of the test or validation data of every possible split.
 
     Args:
         recordings: the data set.
@@ -184,7 +184,7 @@ def rests_where_it_tests(
 
 
 def _gap(horizons: Sequence[int]) -> int:
-    """Ticks that are set apart around what tests."""
+    """Return the number of samples left out around test data."""
     return HISTORY + max(1, *horizons)
 
 
@@ -198,7 +198,7 @@ def _evenness(
 
 
 def blocks_of_motion(recordings: Sequence[Recording], gap: int) -> ByBlocks:
-    """Blocks that test in turn, so that rest at one end of a recording is shared out."""
+    """Return a split whose test blocks are spread over the recording, so that standstill at one end is distributed."""
     shortest = min(recording.samples / recording.rate_hz for recording in recordings)
     least = LEAST_GAPS * gap / min(recording.rate_hz for recording in recordings)
     return ByBlocks(block_s=max(shortest / BLOCKS, least), every=EVERY)

@@ -26,7 +26,7 @@ CONTACT = 2e-3
 
 @dataclass(frozen=True)
 class Activity:
-    """How often an axis was asked to move: counts over the data set.
+    """Activity of one axis: counts of its commands over the data set.
 
     Attributes:
         reversals: changes of the sign of a command that left the dead band.
@@ -42,7 +42,7 @@ class Activity:
 
 @dataclass(frozen=True)
 class RareEvent:
-    """A thing that happens now and then; `count` and `share` of the time are None where it is not recorded."""
+    """Rare event; `count` and `share` (fraction of the time) are None if the needed channel is not recorded."""
 
     name: str
     count: int | None
@@ -56,14 +56,14 @@ def rises(on: NDArray[np.bool_]) -> int:
 
 
 def reversals(command: Array, threshold: float) -> int:
-    """Changes of sign between moments at which a command exceeds the threshold."""
+    """Count sign changes of a command between samples at which the command exceeds the threshold."""
     # Samples within the dead band are left out, so that noise about zero is no reversal.
     signs = np.sign(command[np.abs(command) > threshold])
     return int(np.count_nonzero(signs[1:] != signs[:-1]))
 
 
 def thresholds(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: float) -> list[float]:
-    """The dead band of each axis in units of its command."""
+    """Return the dead band of each axis in units of its command."""
     return [
         dead_band * max(float(np.abs(axis.signed_command(r)).max()) for r in recordings) if axis.command else 0.0
         for axis in axes
@@ -71,7 +71,7 @@ def thresholds(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band:
 
 
 def activity_of(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: float) -> tuple[Activity, ...]:
-    """Counts for each axis."""
+    """Return the activity of each axis."""
     activity = []
     for axis, level in zip(axes, thresholds(recordings, axes, dead_band), strict=True):
         turned = crossed = active = None

@@ -1,4 +1,4 @@
-"""Feature sets as TOML files: what `edp screen` writes, what a user may write, and what `task.features` may name."""
+"""Feature sets as TOML files, written by `edp screen` or by the user and read by `task.features`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def is_set_file(features: object) -> bool:
 
 
 def read_set_table(path: str | Path) -> dict[str, Any]:
-    """The table of a feature-set file, whole: what it leaves out is empty, its name is the file's where none is given.
+    """Read the table of a feature-set file. Missing keys are empty; a missing name is replaced by the file name.
 
     The names of its keys and the values are checked where the settings are.
 
@@ -39,7 +39,7 @@ def read_set_table(path: str | Path) -> dict[str, Any]:
 def set_text(
     features: FeatureSet, head: Sequence[str] = (), why: Mapping[str, str] | None = None, tail: Sequence[str] = ()
 ) -> str:
-    """A feature set as TOML that `read_set_table` reads back.
+    """Format a feature set as TOML that `read_set_table` can read.
 
     Args:
         features: the set.
@@ -63,10 +63,10 @@ def set_text(
 
 
 def _text(value: str) -> str:
-    """A basic string of TOML; JSON's escapes are among TOML's, but for the delete character."""
+    """Return a basic TOML string. JSON escapes are valid TOML, except for the delete character."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
 
 
 def _comment(line: str) -> str:
-    """A line of comment; control characters, which TOML forbids there, become spaces."""
+    """Return a TOML comment line; control characters, which TOML forbids in comments, become spaces."""
     return ("# " + "".join(c if c.isprintable() else " " for c in line)).rstrip()

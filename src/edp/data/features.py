@@ -111,7 +111,7 @@ class Derived:
         return round(exact)
 
     def gain(self, rate_hz: float) -> float:
-        """What the mean is multiplied by at a rate."""
+        """Return the factor of the mean at a sampling rate."""
         return DERIVATIONS[self.how].gain(self.ticks(rate_hz), rate_hz)
 
 
@@ -155,12 +155,12 @@ class FeatureSet:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Logged channels that are fed at each tick; those of `starting` count in the first ticks only."""
+        """Logged channels that are read at each sample; channels of `starting` are used in the first samples only."""
         return self.channels + self.hidden + self.starting
 
     @property
     def features(self) -> tuple[str, ...]:
-        """What the network sees: channels, derived ones, then those of the start."""
+        """Features in network order: channels, derived channels, initialisation inputs."""
         return self.lasting + self.starting + ((STARTING,) if self.starting else ())
 
     @property
@@ -180,7 +180,7 @@ FEATURE_SETS: Mapping[str, FeatureSet] = {"FG1": FG1, "FG2": FG2}
 
 
 def derive(entry: Derived, source: FloatArray, rate_hz: float) -> FloatArray:
-    """A derived channel over a whole stretch, shape ``(time,)``, as a stream gives it from reset.
+    """Return a derived channel over a whole segment, shape ``(time,)``, equal to the values of a stream after a reset.
 
     Raises:
         ConfigError: a span that does not go with the rate.
@@ -195,7 +195,7 @@ def derive(entry: Derived, source: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def _trailing_mean(values: FloatArray, ticks: int) -> np.ndarray:
-    """Mean of the last `ticks` values, before that of those seen, ``(time,)`` in double precision."""
+    """Return the mean of the last `ticks` values, or of all values so far, ``(time,)`` in double precision."""
     # About the first value: sums of 30 MPa over hours would lose the digits in which the signal lies.
     first = float(values[0]) if len(values) else 0.0
     sums = np.concatenate([np.zeros(1), np.cumsum(values.astype(np.float64) - first)])
@@ -205,7 +205,7 @@ def _trailing_mean(values: FloatArray, ticks: int) -> np.ndarray:
 
 
 def column(recording: Recording, name: str, derived: Sequence[Derived]) -> FloatArray:
-    """A logged or derived channel of a recording by name, shape ``(time,)``.
+    """Return a logged or derived channel of a recording by name, shape ``(time,)``.
 
     Raises:
         DataError: neither a channel of the recording nor a derived one.

@@ -123,7 +123,7 @@ class _Spectrum:
 
     @classmethod
     def of(cls, moments: TableMoments) -> _Spectrum:
-        """That of some rows."""
+        """Return the eigenvalue decomposition for the moments of some rows."""
         values, vectors = np.linalg.eigh(moments.covariance)
         # Rounding can leave eigenvalues of a singular matrix just below zero.
         return cls(moments, np.maximum(values, 0.0), vectors, vectors.T @ moments.cross)
@@ -136,7 +136,7 @@ class _Spectrum:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Sums over rows of products, of what lies about common centres.
+    """Sums of products over rows, centred on common values.
 
     Attributes:
         rows: how many.
@@ -154,12 +154,12 @@ class _Sums:
 
     @classmethod
     def none(cls, columns: int, targets: int) -> _Sums:
-        """Those of no rows."""
+        """Return sums over zero rows."""
         shapes = ((columns, columns), (columns, targets), (columns,), (targets,), (targets,))
         return cls(0, *(np.zeros(shape) for shape in shapes))
 
     def plus(self, other: _Sums, sign: int = 1) -> _Sums:
-        """Those of the rows of both, or without those of the other."""
+        """Return the sums over the rows of both, or with ``sign=-1`` the difference."""
         pairs = [(mine, vars(other)[name]) for name, mine in vars(self).items()]
         return _Sums(*(mine + sign * theirs for mine, theirs in pairs))
 
@@ -206,8 +206,9 @@ def _fold_moments(
 def _sums(
     table: NDArray[np.floating], targets: DoubleArray, rows: NDArray[np.int64], centre: DoubleArray, level: DoubleArray
 ) -> _Sums:
-    """Sums over some rows, of a block at a time; targets of several folds lie side by side, so that columns are
-    multiplied out once, however many there are.
+    """Return sums over the given rows, computed block by block.
+
+    Targets of several folds are columns of one matrix, so that the table is multiplied once.
     """
     total = _Sums.none(table.shape[1], len(level))
     for start in range(0, len(rows), 8_192):  # double-precision copies of a block, not of the whole table

@@ -1,4 +1,4 @@
-"""Blocked cross-validation: folds of unbroken pieces of the rows of all stretches, gaps beside what is left out."""
+"""Blocked cross-validation: each fold leaves out contiguous segments, with gaps around them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ then: of two recordings, or where one has nearly all rows, a fold would learn ne
 
 @dataclass(frozen=True, eq=False)
 class Folds:
-    """Which rows each fold leaves out and trains on.
+    """Cross-validation folds: the training rows and the left-out rows of each fold.
 
     Attributes:
         owner: fold that leaves a row out, ``(row,)``.
@@ -35,17 +35,17 @@ class Folds:
         return len(self.training)
 
     def left_out(self, fold: int) -> NDArray[np.int64]:
-        """Rows that `fold` is judged by."""
+        """Return the rows on which `fold` is evaluated."""
         return np.flatnonzero(self.owner == fold)
 
     def thinned(self, stride: int) -> Folds:
-        """The folds of every `stride`-th row."""
+        """Return the folds restricted to every `stride`-th row."""
         training = tuple(rows[rows % stride == 0] // stride for rows in self.training)
         return Folds(self.owner[::stride], training)
 
 
 def blocked_folds(lengths: Sequence[int], folds: int, gap: int, pieces: int = 1) -> Folds:
-    """Folds with nearly equal shares of the rows of all stretches, laid end to end, each of so many unbroken pieces.
+    """Return folds of nearly equal size over the concatenated segments, each of `pieces` contiguous parts.
 
     Args:
         lengths: rows of each stretch, in order.

@@ -1,4 +1,7 @@
-"""The split of a model search: its frozen sessions are known by their content and never train, whatever their name."""
+"""Data split of a model search.
+
+Its frozen sessions are identified by content and never used for training, even if renamed.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +90,7 @@ class ByFrozen:
         return {session.digest: session.name for session in (*self.test, *self.second)}
 
     def opened(self) -> ByFrozen:
-        """The same split with the second sealed test set in the place of the test sessions.
+        """Return the split with the second sealed test set in place of the test sessions.
 
         Raises:
             ConfigError: the search set no second sealed test set apart.
@@ -125,7 +128,7 @@ class ByFrozen:
     def _drawn(
         self, recordings: Sequence[Recording], free: list[int], test: list[int], validation: list[int], gap: int
     ) -> Split:
-        """Parts for which no session is there are drawn from those that are free."""
+        """Fill the parts that have no session by a random draw from the free sessions."""
         candidates = [recordings[i] for i in (*free, *validation, *test)]
         # The second sealed test set stays out of the draw.
         names = {i: recordings[i].name for i in (*free, *validation, *test)}
@@ -161,12 +164,14 @@ class ByFrozen:
 
 
 def frozen_of(split: SplitSpec) -> dict[str, str]:
-    """Names of frozen sessions by digest; none where a split has none."""
+    """Return the names of the frozen sessions by digest; empty for a split without frozen sessions."""
     return split.frozen if isinstance(split, ByFrozen) else {}
 
 
 def frozen_before(provenance: Mapping[str, Any]) -> dict[str, str]:
-    """Names of the frozen sessions by digest that a run's provenance names; they stay frozen for what comes of it.
+    """Return the names of the frozen sessions by digest from the provenance of a run.
+
+    They stay frozen for derived runs.
 
     Raises:
         StorageError: it is no table of names.
@@ -215,7 +220,7 @@ def keep_frozen(before: SplitSpec, after: SplitSpec) -> None:
 
 
 def _refuse_pieces(recordings: Sequence[Recording], frozen: Mapping[str, str], development: set[str]) -> None:
-    """Refuse a recording that the search did not know and that shares rows with a frozen one."""
+    """Raise an error if a recording unknown to the search shares rows with a frozen recording."""
     strange = [
         recording for recording in recordings if recording.digest not in frozen and recording.digest not in development
     ]

@@ -1,4 +1,4 @@
-"""Columns of samples that stay on disk: rows come into memory as they are asked for."""
+"""Columns of samples on disk, whose rows are read on demand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Make = Callable[[], FloatArray]
 
 
 class _OnDemand(NDArrayOperatorsMixin):
-    """What reads as a float32 array ``(time, column)`` and holds none.
+    """Array-like ``(time, column)`` of float32 that computes its values on access.
 
     Rows are read by index. Whatever else arrays can do reads all rows first, and drops them afterwards.
     """
@@ -44,7 +44,7 @@ class _OnDemand(NDArrayOperatorsMixin):
 
 
 class _Gathered(_OnDemand):
-    """Columns, and changes of columns from tick to tick, of a stretch of mapped samples.
+    """Columns of memory-mapped samples, and differences of columns between samples, for one segment.
 
     Args:
         values: all samples of the recording, ``(time, channel)``.
@@ -102,7 +102,7 @@ class LastMade:
         self._values: FloatArray | None = None
 
     def values(self, owner: object, make: Make) -> FloatArray:
-        """What `make` gives, made anew where another array was asked for in between."""
+        """Return the result of `make`, computed again if another owner used the slot in between."""
         if self._owner is not owner or self._values is None:
             self._owner, self._values = None, None  # before the next one is made: two would lie in memory
             self._values, self._owner = make(), owner
@@ -110,7 +110,7 @@ class LastMade:
 
 
 class _Made(_OnDemand):
-    """An array that is made when it is read; of those with one slot, the last one stays in memory."""
+    """Array that is computed on access; a slot keeps only the array used last."""
 
     def __init__(self, shape: tuple[int, int], make: Make, slot: LastMade) -> None:
         self.shape, self._make, self._slot = shape, make, slot
@@ -120,7 +120,7 @@ class _Made(_OnDemand):
 
 
 def made_when_read(shape: tuple[int, int], make: Make, slot: LastMade) -> FloatArray:
-    """An array ``(time, column)`` that is made when it is read, for what is read recording by recording.
+    """Return an array ``(time, column)`` that is computed on access, for data that are read recording by recording.
 
     Args:
         shape: of what `make` gives.
@@ -143,7 +143,7 @@ def some_columns(values: FloatArray, places: Sequence[int]) -> FloatArray:
 
 
 def some_rows(values: FloatArray, start: int, stop: int) -> FloatArray:
-    """The rows ``start:stop`` of an array; those of a gathered one stay where they are."""
+    """Return the rows ``start:stop`` of an array without loading rows that are on disk."""
     if isinstance(values, _Gathered):
         first = values._rows[0]
         rows = first + start, min(first + stop, values._rows[1])
@@ -163,7 +163,7 @@ def on_demand(values: FloatArray, places: Sequence[int]) -> FloatArray:
 def stored_columns(
     recording: Recording, names: Sequence[str], derived: Sequence[Derived], start: int, stop: int | None
 ) -> FloatArray:
-    """Logged and derived channels of a stretch of a recording whose samples lie on disk, ``(time, column)``.
+    """Return logged and derived channels of a segment whose samples are on disk, ``(time, column)``.
 
     Channels and their changes from tick to tick stay there; means and changes over a span are copied into memory, the
     whole table with them.

@@ -23,7 +23,7 @@ Rows = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class IntegralFit:
-    """How a stroke changes, beside what its velocity adds up to.
+    """Fit between the changes of a stroke and the integral of its velocity.
 
     Attributes:
         ratio: root-mean-square change of the stroke over that of the integral; negative where they go against each
@@ -36,7 +36,7 @@ class IntegralFit:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the two tell the same story at another scale, or the other way round."""
+        """Return whether stroke and velocity are correlated but differ in scale or sign."""
         return abs(self.correlation) >= TOLD and not LOW <= self.ratio <= HIGH
 
 
@@ -64,7 +64,7 @@ def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> Integral
 
 
 def contradiction(velocity: str, stroke: str, fit: IntegralFit) -> str:
-    """What a fit that `contradicts` says of two channels, and what to do."""
+    """Return the message for a fit that `contradicts`, with the remedy."""
     scale = typed(fit.ratio, 3)
     return (
         f"stroke '{stroke}' changes by {scale} times what velocity '{velocity}' adds up to (over {typed(WINDOW_S)} s, "

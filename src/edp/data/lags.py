@@ -60,7 +60,7 @@ def origins(series: Series, task: LagTask) -> range:
 
 
 def future(series: Series, task: LagTask, ticks: NDArray[np.int64]) -> DoubleArray:
-    """What is to be predicted at `ticks`: targets at tick + horizon, ``(tick, horizon, target)``."""
+    """Return the targets at sample + horizon, ``(tick, horizon, target)``."""
     return np.stack([series.targets[ticks + horizon] for horizon in task.horizons], axis=1).astype(np.float64)
 
 
@@ -71,7 +71,7 @@ def target_means(series: Sequence[Series]) -> DoubleArray:
 
 
 def anchors(inputs: FloatArray, task: LagTask, means: DoubleArray) -> DoubleArray:
-    """Value that each prediction starts from: the present value, or the training mean where none is measured.
+    """Return the reference value of each prediction: the present measurement, or the training mean if there is none.
 
     Args:
         inputs: ``(row, input)``.

@@ -14,7 +14,7 @@ Vector = NDArray[np.float64]
 
 
 class Moments:
-    """What is known of some columns after the rows so far.
+    """Running minimum, maximum, mean and deviation of columns.
 
     Sums of squares are about the mean of each block and merged with the distance of the means (Chan, Golub and LeVeque,
     1983): squares about zero would cancel for pressures of 30 MPa.

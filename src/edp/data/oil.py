@@ -14,7 +14,7 @@ FREEZING_K = 273.15
 
 
 def oil_celsius(recording: Recording) -> NDArray[np.float64]:
-    """Temperature of the oil at each tick ``(time,)``, degC; NaN where the recording does not tell it."""
+    """Return the oil temperature at each sample ``(time,)``, degC; NaN if the recording has no such channel."""
     if OIL not in recording.channel_names or recording.channels[recording.index(OIL)].kind is not Kind.TEMPERATURE:
         return np.full(recording.samples, np.nan)
     return recording.column(OIL).astype(np.float64) - FREEZING_K

@@ -33,7 +33,7 @@ class RandomOrder:
         return self.count
 
     def part(self, start: int, stop: int) -> Numbers:
-        """The entries ``start:stop``, cut at the end."""
+        """Return the entries ``start:stop``, limited to the length."""
         stop = min(stop, self.count)
         if self._listed is not None:
             return self._listed[start:stop]

@@ -1,4 +1,4 @@
-"""A data set made ready for a task: the series of each part, and a digest of what went in."""
+"""Data set prepared for a task: the series of each part, and a digest of the inputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from edp.signals import Channel, Kind
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Series by part, with the facts of the channels.
+    """Series of each part of the split, with the kinds of their channels.
 
     Attributes:
         task: what is read and predicted.
@@ -40,7 +40,7 @@ class Prepared:
     digest: str
 
     def scaler(self) -> Scaler:
-        """Fitted on the training stretches only."""
+        """Return a scaler fitted to the training segments only."""
         return fit_scaler(self.task, self.train, self.feature_kinds)
 
 

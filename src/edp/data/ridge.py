@@ -154,7 +154,7 @@ def crossed_solution(
 
 
 def _folds(parts: Sequence[Series], task: LagTask, folds: int) -> list[list[Series]]:
-    """Contiguous pieces with nearly equal shares of the ticks, in order; each tick is the origin of one piece."""
+    """Divide the series into contiguous folds of nearly equal size; each sample is the origin in one fold."""
     ticks = [origins(part, task) for part in parts]
     edges = np.linspace(0, sum(len(own) for own in ticks), folds + 1).round().astype(int)
     pieces: list[list[Series]] = [[] for _ in range(folds)]
@@ -192,7 +192,7 @@ def _solve(fitted: RidgeMoments, size: int, relative: float) -> DoubleArray:
 
 
 def _squared_error(held_out: RidgeMoments, fitted: RidgeMoments, weights: DoubleArray) -> DoubleArray:
-    """Mean squared validation error per output, from the moments; zero when there is no validation row."""
+    """Return the mean squared validation error per output from the moments; zero without validation rows."""
     if held_out.rows == 0:
         return np.zeros(weights.shape[1])
     size, rows = len(weights), held_out.rows

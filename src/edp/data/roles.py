@@ -1,4 +1,4 @@
-"""Which channels of a recording command an axis and which show what it does: by Table A.1, else by kind."""
+"""Roles of channels: which channels command an axis and which show its response, by Table A.1 or by kind."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TABLE_A1 = (
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of motion and its channels; what a recording lacks is empty.
+    """One axis of motion and its channels; a missing channel is an empty name.
 
     Attributes:
         name: for readers.
@@ -48,7 +48,7 @@ class Axis:
 
 
 def signed(recording: Recording, names: Sequence[str]) -> Array:
-    """The first channel less the second, if there is one, shape ``(time,)``."""
+    """Return the first channel minus the second, if there is one, shape ``(time,)``."""
     values = recording.column(names[0]).astype(np.float64)
     return values - recording.column(names[1]) if len(names) > 1 else values
 
@@ -62,7 +62,7 @@ class Roles:
 
 
 def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
-    """The axes of Table A.1 where a recording has its names, else one a velocity channel.
+    """Return the axes of Table A.1 if a recording has its names, otherwise one axis per velocity channel.
 
     Args:
         recording: whose channels are looked at.
@@ -78,7 +78,7 @@ def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
 
 
 def roles_of_channels(channels: Sequence[Channel], inputs: Sequence[str] = ()) -> Roles:
-    """The same of channels without values; `inputs` are among them."""
+    """Return the roles of channels given without values; `inputs` names the commands."""
     names = [channel.name for channel in channels]
     table_axes = [] if inputs else [axis for i in range(3) if (axis := _of_table(i, names)) is not None]
     if table_axes:
@@ -104,7 +104,10 @@ def _of_table(i: int, names: Sequence[str]) -> Axis | None:
 
 
 def _by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
-    """An axis for each velocity; commands, pressures and positions go to them in order where their numbers fit."""
+    """Create an axis for each velocity.
+
+    Commands, pressures and positions are assigned in order if their counts match.
+    """
     kinds = {channel.name: channel.kind for channel in channels}
 
     def of(*accepted: Kind) -> list[str]:

@@ -40,7 +40,7 @@ class Scaler:
 
 
 def least_spread(kind: Kind, largest: float) -> float:
-    """Standard deviation, in SI units, at or below which a channel counts as constant.
+    """Return the standard deviation, in SI units, up to which a channel counts as constant.
 
     Args:
         kind: its nominal size is the measure: the noise of a frozen sensor is not motion.
@@ -50,7 +50,7 @@ def least_spread(kind: Kind, largest: float) -> float:
 
 
 def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
-    """Features of a whole stretch, ``(time, feature)``, those of the start as if they were read at every tick."""
+    """Return the features of a whole segment, ``(time, feature)``, with initialisation inputs at every sample."""
     inputs = task.features.inputs
     if not task.features.derived and not task.features.starting:
         return series.inputs[:, : len(task.features.channels)]
@@ -68,7 +68,9 @@ def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
 
 
 def feature_columns(task: Task, series: Series, places: Sequence[int], slot: LastMade) -> NDArray[np.float32]:
-    """Some features of a stretch, ``(time, len(places))``: channels as a view or on demand, derived ones when read.
+    """Return selected features of a segment, ``(time, len(places))``.
+
+    Channels are a view; derived features are computed on access.
 
     Args:
         task: what is read.
@@ -83,7 +85,9 @@ def feature_columns(task: Task, series: Series, places: Sequence[int], slot: Las
 
 
 def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Scaler:
-    """Fit on the training stretches: min-max to [-1, 1] for bounded kinds (position, angle, ratio), else z-score.
+    """Fit a scaler to the training segments.
+
+    Bounded kinds (position, angle, ratio) use min-max scaling to [-1, 1], other kinds the z-score.
 
     Args:
         task: what is read and predicted.

@@ -1,4 +1,4 @@
-"""A series: one unbroken stretch of a recording, cut to the columns that a task reads and predicts."""
+"""Series: one contiguous segment of a recording, reduced to the columns that a task reads and predicts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from edp.recording import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Inputs and targets of one unbroken stretch, in SI units.
+    """Inputs and targets of one contiguous segment, in SI units.
 
     Attributes:
         name: the recording it comes from (with the row range when it is a part of one).

@@ -1,4 +1,4 @@
-"""How rich inputs are: persistent excitation by the input Hankel matrix, and the power spectral density."""
+"""Richness of inputs: persistent excitation by the input Hankel matrix, and power spectral density."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SEGMENT_S = 10.24
 
 
 def hankel_gram(inputs: Sequence[Array], lags: int) -> tuple[Array, int]:
-    """Gram matrix of the block Hankel matrix of several stretches, and its number of columns.
+    """Return the Gram matrix of the block Hankel matrix of several segments, and its number of columns.
 
     Column t of the Hankel matrix holds u(t), u(t + 1), ... u(t + lags - 1). Its Gram matrix is block by block a sum of
     products at one distance, so that each block follows from its neighbour by one product less and one more.
@@ -74,7 +74,7 @@ def smallest_singular_values(inputs: Sequence[Array], lags: int = LAGS) -> dict[
 
 
 def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
-    """Power spectral density by Welch's method, averaged over stretches by their length.
+    """Return the power spectral density by Welch's method, averaged over segments by their length.
 
     Returns:
         frequencies in Hz without zero, shape ``(frequency,)``; density, shape ``(frequency, signal)``. Empty where no
@@ -95,12 +95,12 @@ def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
 
 
 def used_hz(rate_hz: float) -> float:
-    """The frequency up to which commands of a log should be flat."""
+    """Return the frequency up to which the spectrum of commands should be flat."""
     return min(USED_HZ, 0.4 * rate_hz)
 
 
 def flat_to(frequency: Array, power: Array, used: float, within_db: float = FLAT_DB) -> tuple[float, float]:
-    """How flat a density is, averaged over a third of an octave.
+    """Return the flatness of a power density, averaged over a third of an octave.
 
     Returns:
         the highest frequency up to which it stays within some dB of its maximum, Hz; how far it lies below the maximum

@@ -1,4 +1,4 @@
-"""Splits: which stretches train, validate and test; whole recordings, or time blocks with a gap between them."""
+"""Splits into training, validation and test data: whole recordings, or time blocks with a gap between them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Split:
-    """Stretches of each part; none is empty."""
+    """Segments of each part; every part has at least one."""
 
     train: tuple[Stretch, ...]
     validation: tuple[Stretch, ...]
@@ -51,7 +51,7 @@ class SplitSpec(Protocol):
     """A rule that divides a data set."""
 
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
-        """Divide; `gap` samples (W + k) are left out between neighbouring stretches of one recording."""
+        """Divide the recordings; `gap` samples (W + k) are left out between neighbouring segments of one recording."""
         ...
 
 
@@ -61,7 +61,7 @@ SPLITS: Registry[type] = Registry("split")
 @SPLITS.register("recordings")
 @dataclass(frozen=True, kw_only=True)
 class ByRecording:
-    """Whole recordings, drawn at random with a seed, or named.
+    """Split by whole recordings, chosen at random with a seed or by name.
 
     Simulated recordings, whose meta has an ``excitation``, are drawn so that each part has its share of every family.
 
@@ -112,7 +112,7 @@ class ByRecording:
         return _checked(parts, recordings, gap)
 
     def _families(self, recordings: Sequence[Recording]) -> dict[str, str]:
-        """What recordings are of, by name; each part has its share of every family."""
+        """Return the family of each recording by name; each part receives its fraction of every family."""
         return {recording.name: str(recording.meta.get(FAMILY, "")) for recording in recordings}
 
     def _drawn(self, names: Sequence[str]) -> list[str]:
@@ -123,7 +123,7 @@ class ByRecording:
 @SPLITS.register("names")
 @dataclass(frozen=True, kw_only=True)
 class ByName(ByRecording):
-    """Whole recordings as in `ByRecording`, drawn by nothing but their names and the seed.
+    """Split by whole recordings as in `ByRecording`, with a random draw that depends on names and seed only.
 
     The same logs draw the same tests in every format, in any order, beside any others of other kinds: formats differ in
     what else they keep. Kinds are names without their numbers (``dig_01`` and ``dig_02`` are of one kind), and each
@@ -139,14 +139,14 @@ class ByName(ByRecording):
 
 
 def kind_of_name(name: str) -> str:
-    """The name of a recording without its numbers: ``m22_003_dig`` is of the kind ``m dig``."""
+    """Return the name of a recording without its numbers: ``m22_003_dig`` becomes ``m dig``."""
     return " ".join(re.findall(r"[^\W\d_]+", name))
 
 
 @SPLITS.register("time")
 @dataclass(frozen=True, kw_only=True)
 class ByTime:
-    """The beginning of every recording trains, then a part validates, the end tests; a gap lies between.
+    """Split by time: the beginning of every recording for training, then validation, then test, with gaps between.
 
     Attributes:
         validation_share: share of each recording.
@@ -186,7 +186,7 @@ class ByTime:
 @SPLITS.register("blocks")
 @dataclass(frozen=True, kw_only=True)
 class ByBlocks:
-    """Blocks of equal duration in turn: every `every`-th block tests, a share of the others validates.
+    """Split by blocks of equal duration: every `every`-th block for test, a fraction of the others for validation.
 
     Where neighbouring blocks have different parts, the gap is cut from the one that does not test. A rest shorter
     than half a block joins the block before it.
@@ -248,7 +248,9 @@ class ByBlocks:
 @SPLITS.register("machines")
 @dataclass(frozen=True, kw_only=True)
 class ByMachine:
-    """Whole machines, drawn at random with a seed, named, or by mass: those that validate and test never train.
+    """Split by whole machines, chosen at random with a seed, by name or by mass.
+
+    A test machine is never used for training.
 
     Simulated recordings say their machine in their meta, a data-set file says it of each log (``machine = "..."``).
 
@@ -316,7 +318,7 @@ class ByMachine:
         return _checked(parts, recordings, gap)
 
     def _heavy(self, recordings: Sequence[Recording], owners: Sequence[str]) -> list[str]:
-        """Machines whose mass lies in the range that tests."""
+        """Return the machines whose mass is in the test range."""
         if not self.test_masses:
             return []
         low, high = self.test_masses
@@ -334,7 +336,7 @@ class ByMachine:
 
 
 def machine_of(recording: Recording) -> str:
-    """The machine that a recording is of, in lower case.
+    """Return the machine of a recording, in lower case.
 
     Raises:
         DataError: the recording does not say it.
@@ -349,7 +351,7 @@ def machine_of(recording: Recording) -> str:
 
 
 def _spread(names: Sequence[str], families: Mapping[str, str]) -> list[str]:
-    """Names in the order given, but each family spread evenly over it, so that any cut has its share of all."""
+    """Return the names in order with each family evenly distributed, so that any cut has its fraction of all."""
     size = Counter(families[name] for name in names)
     seen: Counter[str] = Counter()
     position = {}
@@ -368,7 +370,7 @@ def _take(names: list[str], share: float, total: int) -> tuple[list[str], list[s
 
 
 def _hold_tail(parts: dict[str, list[Stretch]], share: float, gap: int) -> dict[str, list[Stretch]]:
-    """The end of each training recording validates: for data sets with too few recordings to spare one."""
+    """Use the end of each training recording for validation, for data sets with too few recordings."""
     train, validation = [], []
     for stretch in parts["train"]:
         cut = stretch.stop - round(share * (stretch.stop - stretch.start))

@@ -1,4 +1,4 @@
-"""Evenly spread stretches of series, where there are more than a computation could hold or is to look at."""
+"""Evenly spaced segments of series, for computations that cannot hold or need not use all data."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from edp.recording import spread_stretches
 
 
 def spread_series(series: Sequence[Series], length: int, most: int, on_disk: bool = False) -> list[Series]:
-    """Series, or evenly spread stretches of `length` ticks of them, of `most` ticks in all, about.
+    """Return the series, or evenly spaced segments of `length` samples with about `most` samples in total.
 
     Args:
         series: the series.

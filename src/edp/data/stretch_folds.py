@@ -1,4 +1,4 @@
-"""Blocked cross-validation of what learns from unbroken stretches, and is judged by such."""
+"""Blocked cross-validation for models that train on contiguous segments and are evaluated on such."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edp.data.series import Series
 
 @dataclass(frozen=True, eq=False)
 class StretchFold:
-    """One way to divide stretches.
+    """One division of segments into training and validation.
 
     Attributes:
         train: stretches to learn from.
@@ -26,7 +26,7 @@ class StretchFold:
 
 
 def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int, seed: int) -> list[StretchFold]:
-    """Divide stretches `count` times; each tick is left out in one of the folds at most (see `blocked_folds`).
+    """Divide segments `count` times; each sample is left out in at most one fold (see `blocked_folds`).
 
     Args:
         series: at least one stretch. They are laid end to end in an order drawn by the seed, since files often lie in
@@ -48,7 +48,7 @@ def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int,
 
 
 def _stretches(series: Sequence[Series], lengths: Sequence[int], rows: NDArray[np.int64]) -> list[Series]:
-    """Rows of all stretches as the unbroken ones that they make up."""
+    """Return the contiguous segments formed by the given rows."""
     first = np.cumsum(lengths) - lengths
     owner = np.searchsorted(first, rows, side="right") - 1
     breaks = np.flatnonzero((np.diff(rows) != 1) | (np.diff(owner) != 0)) + 1
@@ -57,7 +57,7 @@ def _stretches(series: Sequence[Series], lengths: Sequence[int], rows: NDArray[n
 
 
 def _part(whole: Series, start: int, stop: int) -> Series:
-    """Rows of a stretch; named after the recording with its rows, as `prepare` does."""
+    """Return rows of a segment, named after the recording with its row range, as `prepare` does."""
     if (start, stop) == (0, whole.samples):
         return whole
     name, bracket, rows = whole.name.removesuffix("]").rpartition("[")

@@ -1,4 +1,4 @@
-"""A task: what is read, what is predicted, how far ahead and in which form."""
+"""Task: inputs, outputs, horizons and form of the targets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from edp.wording import typed
 
 
 class TargetMode(StrEnum):
-    """How the network encodes its target (thesis 3.2.1): the value itself, or its change from the present value."""
+    """Target encoding of the network (thesis 3.2.1): the value itself, or its change from the present value."""
 
     ABSOLUTE = "absolute"
     DELTA = "delta"
@@ -33,7 +33,7 @@ MOST_RATE_HZ = 1e6
 
 
 class Ends(Protocol):
-    """What a task and its settings have in common."""
+    """Interface common to a task and its settings."""
 
     @property
     def targets(self) -> tuple[str, ...]: ...
@@ -46,7 +46,7 @@ class Ends(Protocol):
 
 
 def check_ends(task: Ends) -> None:
-    """Refuse targets and horizons that cannot be, whatever the data.
+    """Raise ConfigError for targets and horizons that are invalid for any data.
 
     Raises:
         ConfigError: no targets, one twice, too many, or a horizon out of range.
@@ -125,7 +125,7 @@ class Task:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Logged channels that must be fed at each tick: those of the features, then those of the physics base."""
+        """Logged channels required at each sample: channels of the features, then channels of the physics base."""
         return self.features.inputs + self.physics
 
     @property
@@ -149,7 +149,7 @@ class Task:
         return tuple(kind_of(name, recording, self.derived) for name in self.targets)
 
     def series(self, recording: Recording, start: int = 0, stop: int | None = None, name: str | None = None) -> Series:
-        """The stretch ``start:stop`` of a recording as inputs and targets.
+        """Return the segment ``start:stop`` of a recording as inputs and targets.
 
         Raises:
             DataError: another rate, a missing channel, or a value that is not finite.
@@ -191,7 +191,7 @@ class Task:
 
 
 def first_not_finite(values: FloatArray) -> tuple[int, int] | None:
-    """Row and column of the first value that is NaN or infinite, None where there is none."""
+    """Return row and column of the first value that is NaN or infinite; None if all are finite."""
     for start in range(0, len(values), CHECKED_ROWS):
         bad = ~np.isfinite(values[start : start + CHECKED_ROWS])
         if bad.any():

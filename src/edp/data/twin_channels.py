@@ -1,4 +1,4 @@
-"""The channels of a plant model that runs free: what commands it, and the velocities, strokes and pressures it answers.
+"""Channels of a plant model for free-run simulation: commands, and the simulated velocities, strokes and pressures.
 
 Which channel is which comes from names and kinds (`edp.data.roles`), or from settings: three cylinders of an excavator
 and one actuator of a test rig are the same thing here.
@@ -52,7 +52,7 @@ class TwinChannelSettings:
 
 @dataclass(frozen=True)
 class TwinChannels:
-    """Channels by part; answers are ordered velocities, strokes, pressures.
+    """Channels by role; outputs are ordered velocities, strokes, pressures.
 
     Attributes:
         commands: read at each tick.
@@ -97,24 +97,24 @@ class TwinChannels:
 
     @property
     def answers(self) -> tuple[Channel, ...]:
-        """What the twin answers with: velocities, then strokes, then pressures."""
+        """Output channels of the twin: velocities, then strokes, then pressures."""
         return self.velocities + self.strokes + self.pressures
 
     @property
     def parts(self) -> dict[str, slice]:
-        """Columns of the answers by part: velocities, strokes, pressures; a part may be empty."""
+        """Column ranges of the outputs by type: velocities, strokes, pressures; a range may be empty."""
         first, second = len(self.velocities), len(self.velocities) + len(self.strokes)
         return {"velocities": slice(0, first), "strokes": slice(first, second), "pressures": slice(second, None)}
 
     def task(self) -> Task:
-        """Commands as inputs and answers as targets one tick later, for the parts of EDP that cut recordings."""
+        """Return a task with commands as inputs and outputs one sample later as targets, to cut recordings."""
         commands = FeatureSet("commands", tuple(channel.name for channel in self.commands))
         names = tuple(channel.name for channel in self.answers)
         return Task(commands, names, (1,), TargetMode.ABSOLUTE, self.rate_hz)
 
 
 def twin_channels(recording: Recording, settings: TwinChannelSettings | None = None) -> TwinChannels:
-    """The channels of a recording by their part.
+    """Return the channels of a recording by role.
 
     Args:
         recording: whose names and kinds are looked at.
@@ -142,7 +142,7 @@ def twin_channels(recording: Recording, settings: TwinChannelSettings | None = N
 
 
 def _strokes(velocities: Sequence[str], by_velocity: dict[str, str]) -> tuple[str, ...]:
-    """The stroke of each velocity where all have one."""
+    """Return the stroke of each velocity; empty unless every velocity has one."""
     strokes = tuple(by_velocity.get(name, "") for name in velocities)
     return strokes if all(strokes) else ()
 

@@ -12,7 +12,7 @@ from edp.wording import typed
 
 
 def unlabelled(task: Task, recording: Recording) -> Series:
-    """The inputs of a recording for a training strategy; the targets need not be in it.
+    """Return the inputs of a recording for a training strategy; target channels are not required.
 
     Raises:
         DataError: another rate, a missing input, or one that is not finite.

@@ -1,4 +1,4 @@
-"""Export targets: the registry, and what a target does."""
+"""Registry and interface of export targets."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ TARGETS: Registry[type[ExportTarget]] = Registry("export target")
 
 
 def make_target(name: str, options: Mapping[str, object] | None = None) -> ExportTarget:
-    """A target by name with its options.
+    """Create a target by name with its options.
 
     Raises:
         ConfigError: there is no such target, it has no such option, or text that must be a number is none.
@@ -64,7 +64,7 @@ def _options(kind: type[ExportTarget]) -> dict[str, type]:
 
 
 def _read(target: str, option: str, value: object, kind: type) -> object:
-    """An option as the target wants it; text of a command line becomes a number, or yes or no."""
+    """Convert an option to the type of the target; text from the command line becomes a number or a boolean."""
     if not isinstance(value, str) or kind is str:
         return value
     try:

@@ -1,4 +1,4 @@
-"""What the reader of any exported form must know: names, units, order, rate, window, hashes; as JSON and MAT."""
+"""Description common to all exported forms: names, units, order, rate, window, hashes; as JSON and MAT."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What is described.
+    """Network to be described.
 
     Attributes:
         name: of the network in the exported form.
@@ -87,7 +87,7 @@ def shape_of_result(graph: Graph, value: str, targets: int) -> tuple[int, int]:
 
 
 def float_graph(predictor: Predictor, form: str, solves: bool = False) -> Graph:
-    """The layers of a network in single precision, for a form that has no other numbers.
+    """Return the layer graph of a network in single precision, for export targets without integer arithmetic.
 
     Args:
         predictor: the network.
@@ -113,12 +113,12 @@ def float_graph(predictor: Predictor, form: str, solves: bool = False) -> Graph:
 
 
 def has_equations(graph: Graph) -> bool:
-    """Whether one of the layers is the equations of a grey box."""
+    """Return whether a layer contains the equations of a grey box."""
     return any(isinstance(layer, HydraulicTick) for layer in graph.layers)
 
 
 def golden(predictor: Predictor, window: int) -> dict[str, Any]:
-    """A recording to compare with.
+    """Return a recording for comparison.
 
     Returns:
         Random `inputs` ``(tick, input)``; what PyTorch streams from them, `stream` ``(tick, number)``, the results of
@@ -136,13 +136,16 @@ def golden(predictor: Predictor, window: int) -> dict[str, Any]:
 
 
 def as_json(content: Mapping[str, Any]) -> bytes:
-    """A description as a JSON file."""
+    """Return a description as a JSON file."""
     # NaN is no JSON; a reader in another language would fail on it.
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
 def as_mat(variables: Mapping[str, Any]) -> bytes:
-    """Variables as a MAT file (version 5), the same bytes at any time of day; lists become rows of numbers or cells."""
+    """Return variables as a MAT file (version 5) that is independent of the time of day.
+
+    Lists become rows of numbers or cells.
+    """
     import scipy.io  # late: training and search import this module
 
     buffer = io.BytesIO()
@@ -152,7 +155,7 @@ def as_mat(variables: Mapping[str, Any]) -> bytes:
 
 
 def _for_matlab(value: Any) -> Any:
-    """Lists as rows of numbers or as cells; text that UTF-8 holds."""
+    """Convert lists to rows of numbers or cells, and text to valid UTF-8."""
     if isinstance(value, str):
         # A lone surrogate has no UTF-8, in which text is written.
         return value.encode("utf-8", "replace").decode()

@@ -1,4 +1,4 @@
-"""Text of a bundle's author in generated files: one function a language, names that a target can carry, templates.
+"""Escaping of text from bundles in generated files: one function per language, portable names, templates.
 
 Names, descriptions and titles come from whoever made the bundle. Whatever of them goes into C, MATLAB, XML, HTML, YAML,
 Python or Markdown passes the function of that language here, and `fill` refuses text that did not.
@@ -83,7 +83,7 @@ def c_comment(text: object) -> Code:
 
 
 def c_string(text: object) -> Code:
-    """A literal of C; what is not plain ASCII, and quotes, backslashes and question marks, is written in octal digits.
+    """Return a C literal; quotes, backslashes, question marks and characters outside ASCII are octal escapes.
 
     A lone surrogate, which has no UTF-8, becomes a question mark.
     """
@@ -99,13 +99,13 @@ def matlab_comment(text: object) -> Code:
 
 
 def matlab_string(text: object) -> Code:
-    r"""A literal of MATLAB in single quotes; control characters become ``\uXXXX``."""
+    r"""Return a MATLAB literal in single quotes; control characters become ``\uXXXX``."""
     # MATLAB ends a string with one quote and writes it with two.
     return Code("'" + visible(text, 10 * LONGEST_TEXT).replace("'", "''") + "'")
 
 
 def python_literal(text: object) -> Code:
-    """A literal of Python in ASCII."""
+    """Return a Python literal in ASCII."""
     # `ascii` escapes every character that could end the literal.
     return Code(ascii(str(text)))
 
@@ -116,7 +116,7 @@ def xml_text(text: object) -> Code:
 
 
 def yaml_scalar(text: object) -> Code:
-    """A scalar of YAML in double quotes and ASCII, read back as it was; a lone surrogate becomes U+FFFD."""
+    """Return a double-quoted YAML scalar in ASCII that is read back unchanged; a lone surrogate becomes U+FFFD."""
     # YAML readers refuse lone surrogates.
     whole = str(text).encode("utf-16", "surrogatepass").decode("utf-16", "replace")
     return Code('"' + "".join(c if " " <= c <= "~" and c not in '"\\' else _yaml_point(c) for c in whole) + '"')
@@ -161,7 +161,10 @@ def shown_names(names: Iterable[str]) -> list[str]:
 
 
 def distinct(names: Iterable[str], most: int) -> list[str]:
-    """The same names, cut to `most` characters; an empty one is `UNNAMED`, equal ones get ``_1``, ``_2`` and so on."""
+    """Return unique names of at most `most` characters.
+
+    An empty name is `UNNAMED`, duplicates get ``_1``, ``_2`` and so on.
+    """
     distinct_names: list[str] = []
     used_names: set[str] = set()
     tried: dict[str, int] = {}
@@ -182,7 +185,7 @@ def _numbered(name: str, number: int, most: int) -> str:
 
 
 def fill(template: str, values: Mapping[str, object]) -> Code:
-    """A template with its blanks filled.
+    """Fill in the blanks of a template.
 
     Args:
         template: with blanks as `string.Template` reads them.

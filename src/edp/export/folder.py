@@ -28,7 +28,7 @@ Listed = dict[str, set[str]]
 
 
 def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Write an export in place of the one that the folder holds; what no export wrote stays, unless of the same name.
+    """Write an export in place of an earlier one. Other files of the folder stay, unless they have the same name.
 
     Args:
         folder: made when absent.
@@ -91,7 +91,7 @@ def _held(path: Path) -> Iterator[None]:
 
 
 def _listed(path: Path) -> Listed:
-    """Files of a list with the hashes that they may have; none if it is absent, and none of lines of another form."""
+    """Return the files of a list with their permitted hashes; empty if the list is absent or malformed."""
     listed: Listed = {}
     try:
         if is_link_at(path) or not is_file_at(path) or status_of(path).st_size > LONGEST_LIST:
@@ -134,7 +134,7 @@ def _ours(path: Path, file: str, digests: set[str]) -> bool:
 
 
 def _linked(path: Path, target: Path) -> bool:
-    """Whether a place below a folder, or one on the way to it, is a symbolic link."""
+    """Return whether a path below a folder, or a folder on the way to it, is a symbolic link."""
     steps = target.relative_to(path).parts
     return any(is_link_at(path.joinpath(*steps[: at + 1])) for at in range(len(steps)))
 
@@ -155,7 +155,7 @@ def _remove(path: Path) -> None:
 
 
 def _clean(path: Path, every: Mapping[str, object]) -> None:
-    """Remove what a killed export has not finished."""
+    """Remove the temporary files of a killed export."""
     for folder in {path, *((path / file).parent for file in every)}:
         if is_folder_at(folder) and not (folder != path and _linked(path, folder)):
             for rest in entries_of(folder):
@@ -164,7 +164,7 @@ def _clean(path: Path, every: Mapping[str, object]) -> None:
 
 
 def _remove_empty(path: Path, stale: list[str]) -> None:
-    """Remove folders that hold nothing any more."""
+    """Remove empty folders."""
     # In reverse order, inner folders come before outer ones.
     for folder in sorted({(path / file).parent for file in stale} - {path}, reverse=True):
         with contextlib.suppress(OSError):  # not empty

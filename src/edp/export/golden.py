@@ -1,4 +1,4 @@
-"""Golden recordings of a network: random inputs, what PyTorch makes of them, how far another form may be from it."""
+"""Golden recordings of a network: random inputs, outputs of PyTorch, and the tolerance for other forms."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Rows = NDArray[np.float32]
 
 
 def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
-    """How far another form may be from `outputs`, PyTorch's in single precision, for each number of a tick.
+    """Return the permitted deviation of another form from `outputs` (PyTorch, single precision), for each element.
 
     `SHARE` of a standard deviation and of the largest value; where PyTorch in single precision is farther than that
     from itself in double precision (a layer norm of a cell near zero), twice that distance. Integers: nothing. Ticks
@@ -65,7 +65,7 @@ def _is_plant(predictor: Predictor) -> TypeGuard[TwinPlant]:
 
 
 def grown_tolerance(plant: TwinPlant, inputs: Rows, outputs: Rows) -> Rows:
-    """How far another form of a plant may be from `outputs` at each tick, ``(tick, number)``; it never shrinks.
+    """Return the permitted deviation of another form of a plant at each sample, ``(tick, number)``; it never decreases.
 
     What `tolerance` allows without feedback, plus what comes of it when it is fed back: the largest distance up to the
     tick between the plant in double precision and `DISTURBED` runs of it in which every answer that is fed back is off
@@ -81,7 +81,7 @@ def grown_tolerance(plant: TwinPlant, inputs: Rows, outputs: Rows) -> Rows:
 
 
 def _disturbed(graph: Graph, inputs: Rows, draw: np.random.Generator | None) -> NDArray[np.float64]:
-    """Answers in double precision ``(tick, number)``, with noise on what is fed back."""
+    """Return outputs in double precision ``(tick, number)``, with noise on the feedback."""
     run = Reference(graph)
     fed_back = [layer.into for layer in graph.layers if isinstance(layer, Feed)]
     rows = []
@@ -95,7 +95,7 @@ def _disturbed(graph: Graph, inputs: Rows, draw: np.random.Generator | None) -> 
 
 
 def at_thresholds(predictor: Predictor, inputs: Rows, near: float = NEAR) -> Rows:
-    """How far another form may be beyond `tolerance` where rounding decides on which side of a threshold a tree goes.
+    """Return the additional tolerance at samples where rounding decides the branch of a tree.
 
     Args:
         predictor: the network.
@@ -142,7 +142,7 @@ def golden_recording(predictor: Predictor, ticks: int) -> tuple[Rows, Rows, Rows
 
 
 def _until_clear(draws: Iterable[tuple[Rows, Rows]]) -> Iterator[tuple[Rows, Rows]]:
-    """Draws up to the first one without a step."""
+    """Yield draws up to the first one without a step."""
     for inputs, steps in draws:
         yield inputs, steps
         if not steps.any():
@@ -162,7 +162,7 @@ def random_inputs(predictor: Predictor, ticks: int, seed: int, mixed: bool = Tru
 
 
 def _set_ports(plant: TwinPlant, rows: Rows, seed: int, mixed: bool) -> None:
-    """Flags of a plant, and zeros where nobody reads: as a program feeds it that knows nothing of the sensors."""
+    """Set the flags of a plant, and zero unread inputs, like a program without sensors."""
     commands, answers, _ = plant.sizes
     flags = np.zeros((len(rows), answers), np.float32)
     flags[: plant.window] = 1.0
@@ -189,7 +189,7 @@ def _smooth(predictor: Predictor, ticks: int, seed: int) -> Rows:
 
 
 def stream(predictor: Predictor, inputs: Rows) -> Rows:
-    """What PyTorch predicts from reset, ``(tick, number)``: predictions, then lower and upper bounds, SI units."""
+    """Return PyTorch's results after a reset, ``(tick, number)``: predictions, lower and upper bounds, SI units."""
     like = predictor.front.offset
     x = torch.from_numpy(inputs).to(like).unsqueeze(0)
     with torch.inference_mode():

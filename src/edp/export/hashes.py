@@ -25,7 +25,7 @@ def model_hash(graph: Graph) -> str:
 
 
 def scale_hash(predictor: Predictor) -> str:
-    """Content address of the scaling between SI units and the network's numbers."""
+    """Return the content address of the scaling between SI units and network values."""
     state = hashlib.blake2b(digest_size=16)
     for part in (predictor.front.offset, predictor.front.width, predictor.code.offset, predictor.code.width):
         # Little-endian on every machine, so that hashes compare.
@@ -34,5 +34,5 @@ def scale_hash(predictor: Predictor) -> str:
 
 
 def little_endian(values: NDArray[Any]) -> bytes:
-    """The values' bytes in the order that hashes and checksums take them."""
+    """Return the bytes of the values in the byte order of hashes and checksums."""
     return values.astype(values.dtype.newbyteorder("<")).tobytes()

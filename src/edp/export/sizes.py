@@ -1,4 +1,4 @@
-"""What the generated code counts with: sizes beyond it are refused before anything is written."""
+"""Size limits of the generated code, checked before anything is written."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check_numbers(bundle: Bundle) -> None:
 
 
 def check_sizes(sizes: Mapping[str, int], limit: int = LARGEST) -> None:
-    """Refuse sizes beyond what an index of the generated code reaches.
+    """Refuse sizes beyond the index range of the generated code.
 
     Args:
         sizes: by what they are sizes of.

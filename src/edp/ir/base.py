@@ -1,4 +1,4 @@
-"""What a layer of the list is, what it remembers, and the list itself."""
+"""Layer graph: layers, their states, and the list of layers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INPUT = "input"
 
 
 class Number(StrEnum):
-    """What a value or a slot is made of."""
+    """Number type of a value or slot."""
 
     FLOAT = "float"
     INT16 = "int16"
@@ -27,7 +27,7 @@ class Number(StrEnum):
 
     @property
     def bytes(self) -> int:
-        """Of one number."""
+        """Size of one number in bytes."""
         # Only activations are 16-bit; single precision and 32-bit states take four bytes.
         return 2 if self is Number.INT16 else 4
 
@@ -50,7 +50,7 @@ class Slot:
 
     @property
     def size(self) -> int:
-        """How many numbers."""
+        """Number of elements."""
         return int(np.prod(self.shape))
 
 
@@ -78,17 +78,17 @@ class Layer(ABC):
 
     @property
     def number(self) -> Number:
-        """What its value is made of."""
+        """Number type of the layer's value."""
         return Number.FLOAT
 
     @property
     def slots(self) -> tuple[Slot, ...]:
-        """What it remembers."""
+        """State slots of the layer."""
         return ()
 
     @property
     def macs(self) -> int:
-        """Multiply-accumulates of one tick with weights or with what it remembers; element-wise work is not counted."""
+        """Multiply-accumulates per sample with weights or state; element-wise work is not counted."""
         return 0
 
     def tensors(self) -> dict[str, NDArray[Any]]:
@@ -97,7 +97,7 @@ class Layer(ABC):
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
     def options(self) -> dict[str, Any]:
-        """What it is besides its kind and its constant arrays, by name."""
+        """Return the options of the layer by name, without its constant arrays."""
         arrays = self.tensors()
         return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in arrays}
 
@@ -121,7 +121,7 @@ class Graph:
     window: int = 1
 
     def layer(self, name: str) -> Layer:
-        """A layer by name.
+        """Return a layer by name.
 
         Raises:
             KeyError: there is none.
@@ -132,7 +132,7 @@ class Graph:
         raise KeyError(name)
 
     def width_of(self, value: str) -> int:
-        """How many numbers a value has."""
+        """Return the number of elements of a value."""
         return self.inputs if value == INPUT else self.layer(value).width
 
     def tensors(self) -> Iterator[tuple[str, str, NDArray[Any]]]:
@@ -154,7 +154,7 @@ class Graph:
 
     @property
     def fed_back(self) -> bool:
-        """Whether a tick reads an answer of the tick before, as a plant model does."""
+        """Whether a sample reads an output of the previous sample, as a plant model does."""
         return any(layer.kind == "Feed" for layer in self.layers)
 
     @property

@@ -1,4 +1,4 @@
-"""Makes a graph layer by layer, with names that say where in the network each one sits."""
+"""Builder of layer graphs, whose layer names state the position in the network."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edp.ir.layers import BinaryOperation, Elementwise, Gather
 
 
 def constant(values: Any) -> Array:
-    """Numbers, an array or a tensor as a float32 array of its own.
+    """Return numbers, an array or a tensor as a new float32 array.
 
     Raises:
         ExportError: one of them is not finite.
@@ -34,7 +34,7 @@ MOST_INDEX = 2**16 - 1
 
 
 def indices(values: Any) -> Indices:
-    """Integers, an array or a tensor as a uint16 array of its own.
+    """Return integers, an array or a tensor as a new uint16 array.
 
     Raises:
         ExportError: one of them is not from 0 to `MOST_INDEX`.
@@ -71,7 +71,7 @@ class Builder:
             self._scope.pop()
 
     def add(self, kind: type[Layer], name: str, *inputs: str, **options: Any) -> str:
-        """Add a layer; arrays among `options` are taken as constants, those of `indices` as they are.
+        """Add a layer. Arrays among `options` become float constants; arrays of `indices` are unchanged.
 
         Returns:
             The name of its value.
@@ -90,7 +90,7 @@ class Builder:
         return self.add(Elementwise, name, a, b, operation=operation, size=self.width(a))
 
     def pick(self, name: str, x: str, columns: Sequence[int]) -> str:
-        """Chosen numbers of a value; the value itself where they are all of it in order."""
+        """Select elements of a value; the value itself is returned if all are selected in order."""
         chosen = tuple(columns)
         # A gather that moves nothing would cost a copy a tick in the exported code.
         if chosen == tuple(range(self.width(x))):
@@ -104,15 +104,15 @@ class Builder:
         return self.add(Gather, name, *parts, columns=tuple(range(sum(map(self.width, parts)))))
 
     def width(self, value: str) -> int:
-        """How many numbers a value has."""
+        """Return the number of elements of a value."""
         return self.inputs if value == INPUT else next(x.width for x in self.layers if x.name == value)
 
     def slots_since(self, count: int) -> list[tuple[str, Slot]]:
-        """What the layers after the first `count` remember, in order."""
+        """Return the slots of the layers after the first `count`, in order."""
         return [(layer.name, slot) for layer in self.layers[count:] for slot in layer.slots]
 
     def start_from(self, slots: Sequence[tuple[str, Slot]], numbers: Any) -> None:
-        """Let these slots start from `numbers`, one slot after the other, instead of from their fill."""
+        """Set the initial values of these slots to `numbers`, one slot after the other."""
         values, at = constant(numbers).ravel(), 0
         for layer, slot in slots:
             self._initial[layer, slot.name] = values[at : at + slot.size].reshape(slot.shape)
@@ -121,7 +121,7 @@ class Builder:
             raise ExportError(f"{values.size} numbers for the state at reset, but the layers remember {at}")
 
     def graph(self, results: dict[str, str], window: int) -> Graph:
-        """The finished list without layers whose value nobody reads."""
+        """Return the finished graph without unread layers."""
         used_layers: list[Layer] = []
         used_values = set(results.values())
         for layer in reversed(self.layers):
@@ -136,5 +136,5 @@ class Builder:
 
 
 def _is_real(value: Any) -> bool:
-    """Whether an option is an array or a tensor of real numbers."""
+    """Return whether an option is an array or tensor of real numbers."""
     return hasattr(value, "shape") and value.dtype != np.uint16

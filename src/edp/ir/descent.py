@@ -1,4 +1,4 @@
-"""What complete regression trees give, for any number of rows at once."""
+"""Evaluation of complete regression trees for any number of rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edp.ir.layers import depth_of
 
 
 def reached_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
-    """The leaf of each tree of `edp.ir.layers.TreeSums` that a row of the input reaches.
+    """Return the leaf that an input row reaches in each tree of `edp.ir.layers.TreeSums`.
 
     Args:
         feature: ``(output, tree, node)``.
@@ -35,6 +35,6 @@ def reached_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any]
 
 
 def summed(leaves: NDArray[Any]) -> NDArray[Any]:
-    """Sums over the last axis, one after the other from nought on, as a loop in C does."""
+    """Return sums over the last axis, added sequentially from zero like a loop in C."""
     # NumPy's own sum adds in pairs, which gives other bits; plus nought makes +0 of a sum of -0.
     return np.asarray(np.add.accumulate(leaves, axis=-1)[..., -1] + leaves.dtype.type(0))

@@ -13,7 +13,7 @@ VALVE_STATES = 5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HydraulicTick(Layer):
-    """Velocities and pressures after a tick, scaled as the answers are, from commands in SI units and what ports read.
+    """Velocities and pressures after one sample, scaled like the outputs, from commands in SI units and port values.
 
     The equations are those of `edp.networks.twin.grey`, in double precision; what is carried on is single precision.
     Units within are m, s, MPa, MN and Gg. Places are those of numbers in `numbers`, `NONE` where there is none.
@@ -76,7 +76,7 @@ class HydraulicTick(Layer):
 
     @property
     def unknown(self) -> int:
-        """Pressures and velocities that an implicit stage solves for."""
+        """Number of pressures and velocities solved for in an implicit stage."""
         actuators, _, pumps = self.sizes
         return 3 * actuators + pumps
 
@@ -105,14 +105,14 @@ class HydraulicTick(Layer):
 
     @property
     def macs(self) -> int:
-        """Of the linear equations of every stage, solved once each: the least of a tick, which iterates."""
+        """Multiply-accumulates of the linear equations with one iteration per stage, the minimum of a sample."""
         size = self.unknown
         elimination, substitution = (size - 1) * size * (2 * size - 1) // 6, size * (size - 1)
         return 2 * self.steps * (elimination + substitution)
 
     @property
     def room(self) -> int:
-        """Double-precision numbers that a tick works in, as the C code divides them."""
+        """Number of double-precision work elements per sample, as divided in the C code."""
         n, valves, pumps = self.sizes
         nodes, terms = self.unknown + 2 - n, len(self.exponents)
         network = 4 * self.unknown + self.unknown**2 + 2 * nodes + nodes**2

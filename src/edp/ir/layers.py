@@ -1,4 +1,4 @@
-"""Layers without memory: moving numbers, element-wise work, linear maps and norms.
+"""Stateless layers: reordering, element-wise operations, linear maps and norms.
 
 A value is a flat vector; where a layer has `rows`, it is that many rows of equal length, one after the other.
 """
@@ -37,7 +37,7 @@ class Function(StrEnum):
 
 
 class BinaryOperation(StrEnum):
-    """What two numbers become; the first one comes first."""
+    """Operation on two numbers, the first operand first."""
 
     ADD = "add"
     SUBTRACT = "subtract"
@@ -49,7 +49,7 @@ class BinaryOperation(StrEnum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Gather(Layer):
-    """Chosen numbers of the inputs, which are laid end to end: selects, joins, repeats and transposes."""
+    """Selected elements of the concatenated inputs: selects, joins, repeats and transposes."""
 
     columns: tuple[int, ...]
 
@@ -59,7 +59,7 @@ class Gather(Layer):
 
 
 def runs(columns: Sequence[int], widths: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Runs of neighbouring columns of inputs that are laid end to end: which input, its first column, how many."""
+    """Return runs of neighbouring columns of concatenated inputs: input, first column, number of columns."""
     # A run becomes one copy in C and one split in ONNX; single columns would be a table.
     origin = [(which, column) for which, width in enumerate(widths) for column in range(width)]
     column_runs: list[tuple[int, int, int]] = []
@@ -110,7 +110,7 @@ class Clip(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Elementwise(Layer):
-    """An operation on each pair of numbers of two values of `size` numbers."""
+    """Element-wise operation on two values of `size` elements."""
 
     operation: BinaryOperation
     size: int
@@ -142,7 +142,7 @@ class Activate(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Glu(Layer):
-    """Each row's first half times the sigmoid of its second; a row of `size` numbers gives ``size / 2``."""
+    """First half of each row times the sigmoid of its second half; a row of `size` elements gives ``size / 2``."""
 
     rows: int
     size: int
@@ -154,7 +154,7 @@ class Glu(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Accumulate(Layer):
-    """Running sums down `rows` rows of `size` numbers: row i is the sum of rows 0 to i."""
+    """Cumulative sums over `rows` rows of `size` elements: row i is the sum of rows 0 to i."""
 
     rows: int
     size: int
@@ -166,7 +166,7 @@ class Accumulate(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Dense(Layer):
-    """``W x + b`` on each row; `weight` ``(out, in)``, `bias` ``(out,)``, zeros where the network has none."""
+    """``W x + b`` on each row; `weight` ``(out, in)``, `bias` ``(out,)``, zeros if the network has no bias."""
 
     weight: Array
     bias: Array
@@ -231,7 +231,7 @@ NEVER = float(np.finfo(np.float32).max)
 
 
 def depth_of(leaves: int) -> int:
-    """Depth of a complete binary tree with so many leaves."""
+    """Return the depth of a complete binary tree with the given number of leaves."""
     return leaves.bit_length() - 1
 
 

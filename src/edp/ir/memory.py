@@ -1,4 +1,4 @@
-"""Layers that carry numbers from tick to tick: differences, convolutions, recurrences, trailing windows.
+"""Layers with state: differences, convolutions, recurrences, trailing windows.
 
 In the equations `before` is what the layer had at the tick before.
 """
@@ -36,7 +36,10 @@ class Difference(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Starting(Layer):
-    """``[x ; 1]`` in the first `ticks` ticks after a reset, ``[mean ; 0]`` from then on. Slot: ticks, up to `ticks`."""
+    """``[x ; 1]`` in the first `ticks` samples after a reset, ``[mean ; 0]`` afterwards.
+
+    Slot: sample count up to `ticks`.
+    """
 
     mean: Array
     ticks: int
@@ -78,7 +81,7 @@ class Convolution(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Gated(Layer):
-    """What both kinds of LSTM have; neither is the other, since they are distinguished by their class."""
+    """Common part of both kinds of LSTM, which are distinguished by their class."""
 
     weight_x: Array
     weight_h: Array
@@ -145,7 +148,7 @@ class Gru(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MinGru(Layer):
-    """``h = (1 - z) h_before + z c`` with ``[z' ; c] = x`` of ``2 units`` numbers and ``z = sigmoid(z')``."""
+    """``h = (1 - z) h_before + z c`` with ``[z' ; c] = x`` of ``2 units`` elements and ``z = sigmoid(z')``."""
 
     units: int
 
@@ -175,7 +178,7 @@ class Rotation(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrailingMean(Layer):
-    """Mean of the last `window` inputs, before that of those seen. Slots: ring, and ticks seen up to `window`."""
+    """Mean of the last `window` inputs, or of all inputs so far. Slots: ring, and sample count up to `window`."""
 
     size: int
     window: int
@@ -237,7 +240,7 @@ class WindowAttention(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Feedback(Layer):
-    """What `Feed` kept at the tick before, `size` numbers; the slot `last` holds it."""
+    """Value of `Feed` at the previous sample, `size` elements; stored in the slot `last`."""
 
     size: int
 
@@ -252,7 +255,7 @@ class Feedback(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Feed(Layer):
-    """The feedback edge of a plant model: its input is what the layer `into`, a `Feedback`, gives at the next tick.
+    """Feedback edge of a plant model: its input is the value of the layer `into`, a `Feedback`, at the next sample.
 
     It gives no value and comes after all readers of that layer.
     """

@@ -1,4 +1,4 @@
-"""Runs a graph tick by tick in NumPy: what each layer means, in plain steps. Slow; tests and quantisation read it."""
+"""Reference implementation of layer graphs in NumPy, sample by sample. Slow; used by tests and quantisation."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Reference:
         return values
 
     def results(self, inputs: Values) -> dict[str, Values]:
-        """Feed one tick; returns the results of the graph by what they mean."""
+        """Process one sample and return the results of the graph by meaning."""
         values = self.step(inputs)
         return {meaning: values[name] for meaning, name in self.graph.results.items()}
 

@@ -1,4 +1,4 @@
-"""The live view: what a source and its models say, tick by tick, on a page of a small server of this machine."""
+"""Live view: source and model data, sample by sample, on a page of a small local server."""
 
 from edp.live.layout import Forecast, LiveLayout, LiveTrace
 from edp.live.pace import Pace

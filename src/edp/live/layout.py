@@ -1,4 +1,4 @@
-"""What the columns of a live session are, and how a page shows them."""
+"""Columns of a live session, and their presentation on a page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LiveTrace:
 
     @staticmethod
     def of(channel: Channel) -> LiveTrace:
-        """A channel in the unit of reports."""
+        """Create the trace of a channel in report units."""
         facts = KINDS[channel.kind]
         return LiveTrace(
             label(channel.name), facts.report_unit, facts.report_factor, facts.report_offset, label(channel.description)
@@ -75,7 +75,7 @@ class Forecast:
 
 @dataclass(frozen=True)
 class LiveLayout:
-    """The columns of a session, and what a page needs to show them.
+    """Columns of a session, and the data that a page needs to show them.
 
     Attributes:
         title: of the page.
@@ -115,12 +115,12 @@ class LiveLayout:
 
 
 def sentence(text: str) -> str:
-    """A text without invisible signs, which could turn its direction or move a cursor."""
+    """Replace invisible characters, which could change the text direction or move a cursor."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 def label(text: str) -> str:
-    """A text of a file or a sender as a page may have it: of bounded length, and without invisible signs."""
+    """Return a text from a file or sender for a page: limited length, invisible characters replaced."""
     visible = sentence(text[: MOST_LABEL + 1])
     # The end is kept: names of one machine often begin alike.
     return visible if len(visible) <= MOST_LABEL else f"{visible[: MOST_LABEL - 32]}…{sentence(text[-31:])}"

@@ -1,4 +1,4 @@
-"""When a tick is due: real time times a speed, with pauses; viewers change it, the thread of the source obeys."""
+"""Timing of samples: real time multiplied by a speed, with pauses, controlled by viewers."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Pace:
             return began + (tick - first) / (self.rate_hz * self.speed) <= self._clock()
 
     def pause(self, paused: bool) -> None:
-        """Let ticks wait, or go on."""
+        """Pause or continue the samples."""
         with self._changed:
             self.paused, self._base = paused, None
             self._changed.notify_all()
@@ -96,7 +96,7 @@ class Pace:
             self._changed.notify_all()
 
     def run_ahead(self, tick: int) -> None:
-        """Let all ticks before this one come as fast as they can: models have seen each of them."""
+        """Process all samples before this one without delay, so that models have seen them."""
         with self._changed:
             self._ahead = tick
             self._changed.notify_all()
@@ -109,7 +109,7 @@ class Pace:
 
 
 def checked_speed(speed: float) -> float:
-    """A factor on real time.
+    """Return a checked speed factor.
 
     Raises:
         ConfigError: it is none.

@@ -1,4 +1,4 @@
-"""Messages between server and page: rows as binary, everything else as JSON; what a page may ask for."""
+"""Messages between server and page: binary rows, otherwise JSON; and the requests of a page."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REQUESTS = {"past": ("first", "count"), "pause": ("value",), "speed": ("value",)
 
 @dataclass(frozen=True)
 class Request:
-    """What a page asks for; see `REQUESTS`."""
+    """Request of a page; see `REQUESTS`."""
 
     name: str
     numbers: tuple[float, ...]
@@ -44,7 +44,7 @@ def text_message(kind: str, **values: Any) -> str:
 
 
 def request_of(message: Any) -> Request:
-    """What a page asks for.
+    """Parse the request of a page.
 
     Raises:
         DataError: anything else.

@@ -1,4 +1,4 @@
-"""The page of a session: live, from a server, or as one file that replays what was streamed."""
+"""Page of a session: live from a server, or one file that replays the streamed data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STYLES = ("uplot/uPlot.min.css", "live.css")
 
 
 def live_page(title: str, host: str) -> tuple[str, str]:
-    """The page that a server gives, and the content security policy that goes with it.
+    """Return the page of a server with its content security policy.
 
     Args:
         title: of the page.
@@ -47,7 +47,7 @@ def live_page(title: str, host: str) -> tuple[str, str]:
 
 
 def session_page(session: LiveSession) -> str:
-    """What was streamed so far as one page that needs no server; at most `SAVED_BYTES` of rows, the newest ones."""
+    """Return the data streamed so far as one page without a server, with at most the latest `SAVED_BYTES` of rows."""
     most = max(1, SAVED_BYTES // (4 * session.layout.width))
     first, rows = session.read(session.ticks - most, most)
     content = {

@@ -77,13 +77,13 @@ class LiveServer:
 
     @property
     def address(self) -> str:
-        """Of the page, with the token."""
+        """Address of the page, including the token."""
         # An address that stands for all of a machine's is none to type into a browser.
         host = socket.gethostname() if self.bind.is_everywhere else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
 
     async def run(self, stop: asyncio.Event, on_ready: Callable[[LiveServer], None] | None = None) -> None:
-        """Serve until told to stop.
+        """Serve until stopped.
 
         Args:
             stop: set to end.
@@ -122,7 +122,7 @@ class LiveServer:
             await self._broadcast(stop)
 
     async def _broadcast(self, stop: asyncio.Event) -> None:
-        """Hand out what is new, at a steady rate, to viewers that each have a queue of their own."""
+        """Send new data to viewers at a steady rate, through one queue each."""
         loop = asyncio.get_running_loop()
         state_due = 0.0
         while not stop.is_set():
@@ -249,7 +249,7 @@ class LiveServer:
             sending.cancel()
 
     def _obey(self, viewer: Viewer, message: str | bytes) -> None:
-        """Do what a viewer asks for, or tell it why not."""
+        """Execute a viewer's request, or tell it why not."""
         if not viewer.may_ask():
             return
         try:

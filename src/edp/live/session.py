@@ -1,4 +1,4 @@
-"""What was streamed so far, bounded: a ring of rows, and a log of events. One thread writes, any may read."""
+"""Bounded session data: a ring of rows, and a log of events. One thread writes, any thread may read."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class LiveSession:
         return max(0, self.ticks - len(self._rows))
 
     def append(self, row: Rows) -> None:
-        """Take a row, shape (width,), SI units, NaN where there is nothing.
+        """Append a row, shape (width,), SI units, NaN for missing values.
 
         Raises:
             DataError: another width.
@@ -97,13 +97,13 @@ class LiveSession:
             self._counted += 1
 
     def break_off(self) -> None:
-        """What follows does not continue what came: predictions from before say nothing of it."""
+        """Mark a discontinuity: predictions made before it do not apply afterwards."""
         with self._lock:
             self._breaks.append(self.ticks)
 
     @property
     def breaks(self) -> list[int]:
-        """Ticks at which the session began anew, as far as they are kept."""
+        """Return the stored samples at which the session restarted."""
         with self._lock:
             return list(self._breaks)
 
@@ -113,18 +113,18 @@ class LiveSession:
             self.ended = why[:MOST_TEXT]
 
     def read(self, first: int, count: int) -> tuple[int, Rows]:
-        """Rows from a tick on, as far as they are there: the first tick and a copy, shape (ticks, width)."""
+        """Return the available rows from a sample: the first sample and a copy, shape (ticks, width)."""
         with self._lock:
             start = min(max(first, self.oldest), self.ticks)
             stop = min(max(first + count, start), self.ticks)
             return start, self._rows[np.arange(start, stop) % len(self._rows)]
 
     def events(self, first: int = 0) -> list[LiveEvent]:
-        """Events from a number on, as far as they are kept."""
+        """Return the stored events from a given number."""
         with self._lock:
             return [event for event in self._events if event.number >= first]
 
     @property
     def event_count(self) -> int:
-        """Of all events, kept or not."""
+        """Number of all events, including discarded ones."""
         return self._counted

@@ -1,4 +1,4 @@
-"""One viewer of a live session, with a queue of its own: whoever is slow loses frames, and nobody else does."""
+"""Viewer of a live session with its own queue: a slow viewer loses frames, the others do not."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Viewer:
             self._ready.set()
 
     def may_ask(self) -> bool:
-        """Whether another request is answered; more than `REQUESTS_PER_S` are not."""
+        """Return whether another request is allowed, at most `REQUESTS_PER_S`."""
         now = asyncio.get_running_loop().time()
         self._budget = min(self._budget + (now - self._asked) * REQUESTS_PER_S, REQUESTS_PER_S)
         self._asked = now
@@ -63,7 +63,7 @@ class Viewer:
         return True
 
     async def send(self) -> None:
-        """Send what waits, in order, for as long as the connection lasts."""
+        """Send the queued data in order while the connection lasts."""
         try:
             while True:
                 await self._ready.wait()

@@ -33,7 +33,7 @@ def recording_of_columns(
     signal_map: SignalMap | None = None,
     repair: Repair | None = None,
 ) -> Recording:
-    """A recording from named columns, as if they were those of a log.
+    """Create a recording from named columns, as if they were the columns of a log.
 
     Args:
         name: the recording's name.
@@ -94,7 +94,7 @@ def _signal(
 
 
 def _kind(column: str, unit: str | None) -> Kind | None:
-    """The kind of a unit that contradicts the vocabulary, or that is no unit of EDP; None where the rules of logs do.
+    """Return the kind of a unit that contradicts the vocabulary or is unknown; None if the rules for logs apply.
 
     A name of the vocabulary alone does not tell what an array holds: its unit is the stronger word.
     """

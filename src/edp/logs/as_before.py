@@ -15,7 +15,7 @@ from edp.signals import SignalMap
 
 
 def read_as_before(source: DataSource, reader: Mapping[str, Any]) -> DataSource:
-    """A source with the map and repairs by which other logs were read, where it states no map of its own.
+    """Return the source with the map and repairs used for other logs, unless the source states its own map.
 
     Only where all of these had one map and the first log of the source has all of its columns; any other source stays
     as it is, and says what it lacks when it is read.
@@ -42,7 +42,10 @@ def read_as_before(source: DataSource, reader: Mapping[str, Any]) -> DataSource:
 
 
 def _one_way(before: DataSource) -> tuple[SignalMap, Repair | None] | None:
-    """The map that all logs of a source have, and the repairs of the first; None where they have none, or several."""
+    """Return the common map of all logs of a source and the repairs of the first.
+
+    None if there is no map, or several.
+    """
     if before.signal_map is not None:
         return before.signal_map, before.repair
     logs = before.logs()

@@ -1,4 +1,4 @@
-"""From the columns of a file to rows of a recording: clocks, one grid, repairs, values piece by piece."""
+"""Assembly of recordings from the columns of a file: clocks, common grid, repairs, values chunk by chunk."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Assembly:
         return any(line.rows is not None for line in self.lines.values())
 
     def recording(self, start: int, stop: int, name: str | None, before: FloatArray | None = None) -> Recording:
-        """The samples ``start <= t < stop``.
+        """Return the samples ``start <= t < stop`` as a recording.
 
         Args:
             start: the first.
@@ -120,7 +120,7 @@ class Assembly:
         return (values if before is None else values[1:]), repairs
 
     def values(self, start: int, stop: int) -> FloatArray:
-        """The samples ``start <= t < stop`` as the file has them, float32, shape ``(time, channel)``."""
+        """Return the unrepaired samples ``start <= t < stop``, float32, shape ``(time, channel)``."""
         return self._values(self.ticks.start + start, self.ticks.start + stop)
 
     def _values(self, first: int, last: int) -> FloatArray:
@@ -155,7 +155,7 @@ class Assembly:
         return values
 
     def _fill(self, values: FloatArray, table: ColumnTable, places: list[int], first: int) -> None:
-        """Columns of one table and one clock, piece by piece."""
+        """Fill in the columns of one table and one clock, chunk by chunk."""
         chosen = [
             (column_index, entry, entry.signal)
             for column_index in places
@@ -233,7 +233,7 @@ def prepare(
 
 
 def _without_empty_start(assembly: Assembly) -> Assembly:
-    """A log from the first tick on at which every channel has had a value: before it, none can be held.
+    """Remove the samples before every channel has its first value, since earlier values cannot be held.
 
     Raises:
         DataError: more than `_MOST_EMPTY` of the log would be left out.
@@ -283,7 +283,7 @@ def assemble(
 
 
 def parts(assembly: Assembly, samples: int, name: str) -> Iterator[Recording]:
-    """The recording in consecutive parts of `samples` (the last one shorter), each named by its samples."""
+    """Yield the recording in consecutive parts of `samples` (the last may be shorter), each named by its samples."""
     before: FloatArray | None = None
     for start in range(0, assembly.samples, samples):
         stop = min(start + samples, assembly.samples)
@@ -355,7 +355,7 @@ def _timelines(
 
 
 def _stated_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Clock | None:
-    """The clock of rows that are uniform because the map or the file says so."""
+    """Return the clock of uniform rows, if the map or the file states a rate or sample time."""
     rate = None
     if signal_map.sample_time_s is not None:
         if not signal_map.sample_time_s > 0:

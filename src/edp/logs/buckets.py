@@ -54,13 +54,13 @@ class RemoteFile:
 
 
 def bucket_address(path: str | Path) -> str:
-    """The address ``SCHEME://BUCKET/KEY`` that a path stands for; empty where it is a path of this machine."""
+    """Return the address ``SCHEME://BUCKET/KEY`` of a path; empty for a local path."""
     match = ADDRESS.fullmatch(str(path))
     return f"{match[1]}://{match[2]}/{match[3] or ''}".rstrip("/") if match else ""
 
 
 class BucketReader:
-    """One bucket, as far as EDP reads it.
+    """Read access to one bucket.
 
     Args:
         address: of anything in it.
@@ -82,7 +82,7 @@ class BucketReader:
         self._files: Any = self._in_time(lambda: _file_system(self.scheme), address)
 
     def objects(self, address: str) -> list[RemoteFile]:
-        """The objects below an address, or the one at it, by name.
+        """Return the objects below an address, or the object at it, sorted by name.
 
         Raises:
             DataError: there is none.
@@ -111,11 +111,11 @@ class BucketReader:
         return sorted(objects, key=lambda file: file.address)
 
     def read(self, address: str, most: int) -> bytes:
-        """A whole object of at most so many bytes."""
+        """Return a whole object of at most `most` bytes."""
         return b"".join(self._pieces(address, most))
 
     def copy(self, file: RemoteFile, target: Path) -> str:
-        """Copy an object to a new file, whole or not at all; the blake2b of what came.
+        """Copy an object to a new file, completely or not at all, and return the BLAKE2b digest of the received bytes.
 
         Raises:
             DataError: it is not there, or has not the bytes that were announced.
@@ -152,7 +152,7 @@ class BucketReader:
         return f"{self.bucket}/{match[3]}" if match[3] else self.bucket
 
     def _in_time(self, step: Callable[[], Result], address: str) -> Result:
-        """What a step gives, within `STEP_S`; its errors in words."""
+        """Run a step with the time limit `STEP_S` and translate its errors."""
         results: list[Result] = []
         errors: list[BaseException] = []
 
@@ -198,7 +198,7 @@ REFUSED = re.compile(
 
 
 def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> Any:
-    """The service of a scheme, by pyarrow, which is imported where a bucket is read and no earlier."""
+    """Return the pyarrow file system of a scheme. Pyarrow is imported when a bucket is read."""
     from pyarrow import fs
 
     if scheme == "s3":
@@ -236,7 +236,7 @@ def _file_system(scheme: str, environment: Mapping[str, str] = os.environ) -> An
 
 @contextmanager
 def copied(file: RemoteFile) -> Iterator[Path]:
-    """An object as a file of this machine, under its own name, gone afterwards.
+    """Yield an object as a local temporary file under its own name.
 
     Raises:
         EdpError: as `BucketReader.copy`.
@@ -251,7 +251,7 @@ def copied(file: RemoteFile) -> Iterator[Path]:
 
 
 def cache_folder() -> Path:
-    """Where copies of stores are kept: ``stores`` below EDP_CACHE, or the user's cache folder."""
+    """Return the folder for copies of stores: ``stores`` in EDP_CACHE, or in the user's cache folder."""
     chosen = os.environ.get("EDP_CACHE")
     base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edp"
     return make_folder(base / "stores")

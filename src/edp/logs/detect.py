@@ -1,4 +1,4 @@
-"""Which format a file holds, by its content, checked against its ending."""
+"""Detection of file formats by content, checked against the file ending."""
 
 from __future__ import annotations
 
@@ -86,12 +86,12 @@ def is_text_log(path: Path) -> bool:
 
 
 def export_advice(suffix: str) -> str:
-    """How a file of an ending that is not read becomes one that is; empty where nothing is known of it."""
+    """Return advice on converting a file with an unsupported ending; empty if there is none."""
     return _EXPORT.get(suffix, "")
 
 
 def format_for(path: Path) -> LogFormat:
-    """The format that a file's ending stands for.
+    """Return the format for a file ending.
 
     Raises:
         DataError: no format has this ending; says which are known and how to export the common others.
@@ -109,7 +109,7 @@ def format_for(path: Path) -> LogFormat:
 
 
 def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
-    """Read a log file as it is, before any map of units and time.
+    """Read a log file without conversion of units and time.
 
     Raises:
         DataError: missing, empty, unreadable or damaged file, or one that is not what its ending says.
@@ -136,7 +136,10 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
 
 
 def _begin(path: Path) -> tuple[bytes, int]:
-    """The first bytes of a regular file, and its size; nothing else is opened, as that may wait or do something."""
+    """Return the first bytes of a regular file and its size.
+
+    Other file types are not opened, since that may block or have effects.
+    """
     # Before opening: to open a pipe waits, and to open a device may do something.
     _check_regular(path, os.stat(path))
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))

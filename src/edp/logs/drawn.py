@@ -1,4 +1,4 @@
-"""Evenly spread stretches of recordings, where a command is to look at some hours of many."""
+"""Evenly spaced segments of recordings, for commands that use only some hours of a large data set."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edp.wording import setting_text, typed
 
 @dataclass(frozen=True)
 class Drawn:
-    """How much was drawn.
+    """Amount of data selected from a data set.
 
     Attributes:
         hours: of the stretches.
@@ -45,13 +45,13 @@ def checked_hours(hours: float) -> float:
 
 
 def drawn_recordings(recordings: Sequence[Recording], hours: float) -> list[Recording]:
-    """Recordings of at most so many hours, about: evenly spread stretches of `STRETCH_S` where there are more."""
+    """Return at most about `hours` of the recordings, as evenly spaced segments of `STRETCH_S` if there are more."""
     most = max(1, round(3600.0 * hours * recordings[0].rate_hz))
     return spread_recordings(recordings, STRETCH_S, most)
 
 
 def findings_of_part(recordings: Sequence[Recording], of_hours: float) -> tuple[Finding, ...]:
-    """What an inspection of these recordings says where they are not all of so many hours."""
+    """Return the inspection finding that states how many of the hours were used; empty if all were."""
     hours = sum(recording.samples / recording.rate_hz for recording in recordings) / 3600.0
     drawn = Drawn(hours, of_hours, len(recordings))
     if drawn.hours == drawn.of_hours:

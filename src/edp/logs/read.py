@@ -1,4 +1,4 @@
-"""Reading one recording or a data set of them."""
+"""Reading of one recording, or of a data set."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def read_parts(
 
 
 def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[ChannelSource]]:
-    """The file and the wanted channels, all of which it has."""
+    """Open the file and return the requested channels, all of which must exist."""
     raw = open_log(path, signal_map)
     sources, problems = resolve(raw, signal_map)
     if problems:
@@ -98,7 +98,7 @@ def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[Chann
 
 
 def read_truth(path: str | Path) -> Recording | None:
-    """What only the simulation knew of a log: from the file beside it or from its own variable; None where unknown.
+    """Return the ground truth of a simulated log, from its separate file or variable; None if unknown.
 
     Args:
         path: the log file.
@@ -116,7 +116,7 @@ def read_truth(path: str | Path) -> Recording | None:
 
 
 def find_recordings(path: str | Path) -> tuple[Path, ...]:
-    """The log files at a path: the file itself, or all files with a known ending in a folder and below, sorted.
+    """Return the log files at a path: the file itself, or all files with a known ending in a folder tree, sorted.
 
     In a folder, files that hold the truth of the log beside them (``NAME.truth.SUFFIX``) are passed over, and text
     files (``.txt``) where there are other logs. A folder that is a ROS 2 bag counts as one log.
@@ -151,14 +151,14 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
 
 
 def _instead(folder: Path) -> str:
-    """How the most frequent files of a folder become logs, where that is known; else empty."""
+    """Return advice on the most frequent unsupported files of a folder; otherwise empty."""
     endings = Counter(entry.suffix.lower() for entry in islice(files_below(folder), _MOST_FILES))
     advised = [(suffix, export_advice(suffix)) for suffix, _ in endings.most_common()]
     return next((f". {endings[suffix]} end in '{suffix}': {advice}" for suffix, advice in advised if advice), "")
 
 
 def _is_truth(path: Path) -> bool:
-    """Whether a file holds the truth of a log that lies beside it."""
+    """Return whether a file holds the ground truth of a log next to it."""
     log = path.with_name(f"{path.stem.removesuffix(f'.{TRUTH}')}{path.suffix}")
     return log != path and is_file_at(log)
 
@@ -192,7 +192,7 @@ def read_data_set(
 
 
 def alike(recordings: list[Recording], files: Sequence[Path], truth_asked: bool = False) -> list[Recording]:
-    """Recordings of one data set: at the rate of the first, with the same channels.
+    """Return recordings of one data set after a check of rates and channels against the first.
 
     Args:
         recordings: with unique names.
@@ -210,7 +210,7 @@ def alike(recordings: list[Recording], files: Sequence[Path], truth_asked: bool 
 
 
 def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
-    """Recordings less the truth that only some of them hold: ground heights exist in soil, not in free air."""
+    """Remove ground truth that only some recordings hold: ground heights exist in soil, not in free air."""
     if len({recording.channel_names for recording in recordings}) == 1:
         return recordings
     common = set.intersection(*(set(recording.channel_names) for recording in recordings))
@@ -223,7 +223,7 @@ def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
 
 
 def common_channels(recordings: Sequence[Recording]) -> list[Recording]:
-    """Recordings less the channels that not all of them hold, in the order of the first.
+    """Reduce recordings to their common channels, in the order of the first.
 
     Raises:
         DataError: no channel is in all of them.
@@ -266,7 +266,7 @@ def _check_same(recordings: Sequence[Recording], files: Sequence[Path]) -> None:
 
 
 def unique_names(names: Sequence[str], files: Sequence[Path]) -> list[str]:
-    """Names as they are where unique, else with the folder in front, else numbered."""
+    """Return unique names: unchanged if unique, otherwise with the folder as prefix, otherwise numbered."""
     better = [f"{file.parent.name}/{name}" if names.count(name) > 1 else name for name, file in zip(names, files)]
     seen: dict[str, int] = {}
     unique = []

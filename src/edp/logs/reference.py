@@ -40,7 +40,7 @@ _MEANING: Mapping[Kind, str] = {
 
 
 def reference_page() -> str:
-    """The page as Markdown."""
+    """Return the reference page of channels, kinds and units as Markdown."""
     return "\n".join(
         [
             "# Channels, kinds and units",

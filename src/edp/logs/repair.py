@@ -1,4 +1,4 @@
-"""Repairs that are made only where asked for; each one made is written into the recording's meta."""
+"""Optional repairs; each repair is recorded in the meta data of the recording."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class Repair:
-    """What may be repaired while reading; by default nothing is.
+    """Repairs allowed while reading; by default there are none.
 
     Attributes:
         nan: missing or infinite values: ``hold`` the last good value, or ``keep`` them as NaN.
@@ -88,14 +88,14 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
 
 
 def _longest_rise(clock: Clock) -> Rows:
-    """The rows of the longest stretch in which time does not go back, shape ``(rows,)``."""
+    """Return the rows of the longest segment in which time does not go back, shape ``(rows,)``."""
     edges = np.concatenate(([0], clock.falling, [len(clock.stamps)]))
     best = int(np.argmax(np.diff(edges)))
     return np.arange(edges[best], edges[best + 1])
 
 
 def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, Any]]]:
-    """The rows to keep and the repairs made, given the ticks in gaps, shape ``(time,)``.
+    """Return the rows to keep and the repairs made, given the samples in gaps, shape ``(time,)``.
 
     Raises:
         DataError: there are gaps and `repair` does not allow them.
@@ -169,13 +169,13 @@ def repair_values(
 
 
 def runs(mask: Mask) -> tuple[Rows, Rows]:
-    """Starts and stops (exclusive) of the runs of True in a mask, shape ``(time,)``."""
+    """Return starts and stops (exclusive) of the runs of True in a mask, shape ``(time,)``."""
     edges = np.diff(np.concatenate(([False], mask, [False])).astype(np.int8))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
 
 def split_at_gaps(recording: Recording, min_samples: int = 2) -> list[Recording]:
-    """The stretches between gaps (rows where every channel is NaN), each a recording of its own.
+    """Return the segments between gaps (rows with NaN in every channel), each as a recording.
 
     Read with ``Repair(gaps="keep")`` to have the gaps as NaN. Stretches shorter than `min_samples` are left out.
     """

@@ -44,7 +44,7 @@ class ChannelSource:
 
 
 def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[ChannelSource], list[EdpError]]:
-    """The wanted channels in order, and what is wrong with the map or the file for those that cannot be had."""
+    """Return the requested channels in order, and the problems of map or file for unavailable channels."""
     sources: list[ChannelSource] = []
     problems: list[EdpError] = []
     if not signal_map.channels and not signal_map.others:
@@ -71,7 +71,7 @@ def _vocabulary_entries(raw: RawLog) -> list[ChannelMap]:
 
 
 def _other_entries(raw: RawLog, signal_map: SignalMap) -> list[ChannelMap]:
-    """Every column of numbers that the map does not name, under its own name."""
+    """Return an entry for every numeric column that the map does not name."""
     columns = {raw.aliases.get(entry.column, entry.column) for entry in signal_map.channels}
     names = {entry.name for entry in signal_map.channels}
     entries = []
@@ -85,7 +85,7 @@ def _other_entries(raw: RawLog, signal_map: SignalMap) -> list[ChannelMap]:
 
 
 def _holds_numbers(signal: RawSignal) -> bool:
-    """Whether the first rows are numbers; text farther down is an error when the column is read."""
+    """Return whether the first rows are numbers. Text in later rows is an error when the column is read."""
     try:
         if signal.table is None:
             signal.load()

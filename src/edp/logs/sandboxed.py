@@ -36,7 +36,7 @@ _KINDS: Mapping[str, type[EdpError]] = {kind.__name__: kind for kind in (DataErr
 
 
 def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) -> RawLog:
-    """Read a log by its format, in a process of its own.
+    """Read a log by its format in a separate process.
 
     Args:
         chosen: a format of `FORMATS`; where it is defined must be a module that can be imported.
@@ -75,7 +75,7 @@ def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) 
 
 
 def plain_map(signal_map: SignalMap) -> Header:
-    """A signal map as JSON."""
+    """Convert a signal map to JSON types."""
     return dataclasses.asdict(signal_map)
 
 
@@ -117,14 +117,14 @@ def _raw_log(path: Path, log: _Log, facts: Header) -> RawLog:
 
 
 def _load(path: Path, table: _Table, key: str, samples: int) -> Column:
-    """One whole column, joined from pieces."""
+    """Return one whole column, joined from chunks."""
     check_memory(path, 2 * _NUMBER_BYTES * samples, f"a column of {samples} values", "read it in parts, or some rows")
     return load_column(table, key, samples)
 
 
 @dataclass
 class _Stream:
-    """Answers that have come for the pieces of a table, and how many are still to come."""
+    """Received chunks of a table, and the number of outstanding ones."""
 
     number: int
     rows: int
@@ -134,7 +134,10 @@ class _Stream:
 
 
 class _Log:
-    """The process that has the log. Requests of several threads and streams take turns; answers come in their order."""
+    """Connection to the process that holds the log.
+
+    Requests of several threads take turns; responses arrive in order.
+    """
 
     def __init__(self, path: Path, channel: WorkerConnection) -> None:
         self.path = path
@@ -145,7 +148,7 @@ class _Log:
         self.opened = 0
 
     def answer(self, most: int = 0) -> Header:
-        """What is said to a request other than ``next``."""
+        """Return the response to a request other than ``next``."""
         header, _ = self.channel.receive(most)
         _raise_refusal(header)
         return header
@@ -169,7 +172,7 @@ class _Log:
             return self.channel.receive(size)[1][0]
 
     def open(self, table: int, keys: Sequence[str], start: int, stop: int) -> _Stream:
-        """Begin to read pieces."""
+        """Begin to read chunks."""
         with self.lock:
             # Both sides would wait for ever: this one to send a long request, the other one to send its answers.
             if sum(map(len, keys)) + _NUMBER_BYTES * len(keys) > SMALL_BYTES // 2:
@@ -180,7 +183,7 @@ class _Log:
             return _Stream(self.opened, int(stop) - int(start), _NUMBER_BYTES * len(keys))
 
     def next(self, stream: _Stream) -> list[NDArray[Any]] | None:
-        """The next piece; None behind the last."""
+        """Return the next chunk; None after the last one."""
         with self.lock:
             while len(stream.came) + stream.awaited < AHEAD:
                 self._send({"do": "next", "stream": stream.number})
@@ -194,7 +197,7 @@ class _Log:
         return None if isinstance(came, dict) else came
 
     def drop(self, stream: _Stream) -> None:
-        """Read no more of it.
+        """Stop reading a stream.
 
         Nothing is sent here, where the interpreter may have come in the midst of sending: the next request says so.
         """
@@ -206,7 +209,7 @@ class _Log:
         self.channel.send(request | {"drop": dropped} if dropped else request)
 
     def _drain(self) -> None:
-        """Take all answers that are still to come, so that a long request finds the other side listening."""
+        """Receive all outstanding responses, so that the other side can accept a long request."""
         while self.awaited:
             self._take()
 

@@ -1,4 +1,4 @@
-"""In the sandbox: one log is read by its format, and its columns are handed over as they are asked for.
+"""Server side in the sandbox: one log is read by its format, and its columns are sent on request.
 
 The messages are those of `edp.sandbox.protocol`. After the order come the layers of the sandbox (for each one why it
 is missing, empty where it holds), the log's facts, then answers to requests:
@@ -44,14 +44,14 @@ _KEPT_MOST = 3 << 29
 
 
 def map_of(plain: Header) -> SignalMap:
-    """The signal map in an order; see `edp.logs.sandboxed.plain_map`."""
+    """Return the signal map of an order; see `edp.logs.sandboxed.plain_map`."""
     entries = [entry | {"kind": Kind(entry["kind"]) if entry["kind"] else None} for entry in plain["channels"]]
     channels = tuple(ChannelMap(**entry) for entry in entries)
     return SignalMap(**plain | {"channels": channels, "columns": tuple(plain["columns"])})
 
 
 def serve(requests: int, answers: int) -> None:
-    """Take an order, read its log, and answer requests until the other side is gone."""
+    """Receive an order, read its log, and respond to requests until the client closes."""
     read_into, write = reader(requests), writer(answers)
     with contextlib.suppress(EOFError, BrokenPipeError):
         order, _ = receive(read_into)
@@ -96,7 +96,7 @@ def _read_oddly_named(chosen: LogFormat, path: Path, signal_map: SignalMap) -> R
 def _answer(
     write: Callable[[Any], None], allowance: Allowance, values: int, work: Callable[[], tuple[Header, Any]]
 ) -> Any:
-    """Do some work within the limits and send what it says first; returns what it made, None where it failed."""
+    """Do work within the limits and send its header; return the result, None on failure."""
     try:
         with allowance.running(allowance.seconds(values)):
             header, result = work()
@@ -110,7 +110,7 @@ def _answer(
 
 
 def refusal(error: Exception, allowance: Allowance) -> Header:
-    """What is wrong with the file, for the other side.
+    """Return the error message about the file for the client.
 
     Libraries meet damaged bytes with any exception there is; every one means the same to the user.
     """
@@ -143,7 +143,7 @@ class _Served:
     streams: dict[int, _Stream] = field(default_factory=dict)
 
     def facts(self) -> Header:
-        """Everything about the log but its numbers."""
+        """Return the description of the log without its values."""
         raw = self.raw
         times: dict[Any, int] = {}
         tables: dict[int, int] = {}
@@ -240,7 +240,7 @@ def _equal(time: Any, other: Any) -> bool:
 
 
 def check_plain(path: Path, arrays: Sequence[NDArray[Any]]) -> None:
-    """Refuse columns of anything but numbers, or of unequal lengths.
+    """Refuse columns that are not numeric or have unequal lengths.
 
     Raises:
         DataError: naming the file.
@@ -259,7 +259,7 @@ def _parts(table: ColumnTable, keys: Sequence[str], start: int, stop: int) -> It
 
 
 def keep_temporary_files_in_memory() -> None:
-    """The library of MDF opens a temporary file for what may be appended to a log, also where nothing is."""
+    """Make the MDF library use memory in place of the temporary file that it opens for appended data."""
     for name in ("asammdf.blocks.mdf_v4", "asammdf.blocks.mdf_v3"):
         if name in sys.modules:
             vars(sys.modules[name])["NamedTemporaryFile"] = lambda *_, **__: io.BytesIO()

@@ -1,4 +1,4 @@
-"""Where recordings come from: a log, a folder of logs, or a data-set file that lists them; maps of their columns."""
+"""Sources of recordings: a log, a folder of logs, or a data-set file; and maps of their columns."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class RecordingEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class DataSetSettings:
-    """A data-set file: its recordings, the map that they share, and allowed repairs."""
+    """Data-set file: its recordings, their common map, and allowed repairs."""
 
     recordings: tuple[RecordingEntry, ...] = ()
     map: str | SignalMap | None = None
@@ -71,7 +71,7 @@ _LONGEST_STEM = 120
 
 @dataclass(frozen=True)
 class DataSource:
-    """Where recordings come from.
+    """Source of recordings.
 
     Attributes:
         path: a log, a folder of logs, a data-set file (``.toml``), or a store; ``s3://``, ``gs://`` or ``az://`` for a
@@ -128,7 +128,7 @@ class DataSource:
 
     @property
     def short_name(self) -> str:
-        """Name for titles and folders: the stem of the path; of several paths with their number and a hash of all."""
+        """Name for titles and folders: the stem of the path; for several paths with their count and a hash."""
         stem = self.path.stem if self.address else full_path(self.path).stem
         stem = stem[:_LONGEST_STEM]
         if not self.more:
@@ -140,20 +140,20 @@ class DataSource:
 
     @property
     def stored(self) -> bool:
-        """Whether it is a store, whose logs were mapped and repaired when it was built."""
+        """Whether the source is a store, whose logs were mapped and repaired when it was built."""
         return is_remote_store(self.address) if self.address else is_store(self.path)
 
     @property
     def address(self) -> str:
-        """Where in a bucket it lies; empty on this machine."""
+        """Address in a bucket; empty on this machine."""
         return bucket_address(self.path)
 
     def store_folder(self) -> Path:
-        """The folder of a store; of one in a bucket that of its copy."""
+        """Folder of the store; for a store in a bucket, the folder of its copy."""
         return local_store(self.address) if self.address else self.path
 
     def to_plain(self) -> dict[str, Any]:
-        """What provenance keeps, to read the same data again."""
+        """Convert to a dictionary for provenance, with which the same data can be read again."""
         plain: dict[str, Any] = {"path": self.address or str(full_path(self.path))}
         if self.signal_map is not None:
             # Kinds that units tell are written out: an entry without one was read by an earlier version.
@@ -168,7 +168,7 @@ class DataSource:
 
     @staticmethod
     def from_plain(plain: dict[str, Any]) -> DataSource:
-        """The source that `to_plain` described."""
+        """Create the source that `to_plain` described."""
         signal_map = without_derived_kinds(build(SignalMap, plain["map"], "provenance map")) if "map" in plain else None
         repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
         more = tuple(Path(path) for path in plain.get("more", ()))
@@ -181,7 +181,7 @@ class DataSource:
         return {"source": self.label, "reader": self.to_plain(), "digest": digest}
 
     def logs(self) -> list[Log]:
-        """The logs of the source, unread, each with the map that belongs to it; a store has none."""
+        """Return the unread logs of the source, each with its map; empty for a store."""
         if self.stored:
             return []
         if self.path.suffix == ".toml":
@@ -210,7 +210,7 @@ class DataSource:
         return recordings
 
     def inspect(self, progress: Progress = SILENT) -> DataQuality:
-        """What is in each log, what is wrong with it, and which repeat each other; nothing is repaired or refused.
+        """Inspect each log and find repeated sessions. Nothing is repaired or refused.
 
         Args:
             progress: receiver of the progress; its units are logs.
@@ -279,7 +279,7 @@ class DataSource:
         return compare(reports, sketches, self.drawn_findings(recordings))
 
     def drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
-        """What an inspection says where these recordings are only a part of the store."""
+        """Return the inspection finding that states which part of the store was used."""
         whole = self.at_most_h is None
         return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
 
@@ -313,7 +313,7 @@ class DataSource:
 
 @dataclass(frozen=True)
 class Log:
-    """One log of a source, with what is needed to read it; see `RecordingEntry`."""
+    """One log of a source, with map and repairs; see `RecordingEntry`."""
 
     path: Path
     signal_map: SignalMap | None = None
@@ -324,7 +324,7 @@ class Log:
     remote: RemoteFile | None = None
 
     def read(self) -> Recording:
-        """The recording."""
+        """Read and return the recording."""
         if self.remote is not None:
             raise ConfigError(
                 f"'{self.remote.address}' lies in a bucket; read the data set once with `edp store build`, and give "
@@ -335,7 +335,7 @@ class Log:
 
 
 def _in_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
-    """The logs below an address of a bucket, or the one at it, by the endings of their names."""
+    """Return the logs below an address of a bucket, or the log at it, selected by file ending."""
     objects = BucketReader(address).objects(address)
     suffixes = known_suffixes()
     chosen = [file for file in objects if Path(file.name).suffix.lower() in suffixes]
@@ -347,7 +347,7 @@ def _in_bucket(address: str, signal_map: SignalMap | None, repair: Repair | None
 
 
 def load_signal_map(path: str | Path) -> SignalMap:
-    """A signal map from a TOML file.
+    """Load a signal map from a TOML file.
 
     Raises:
         ConfigError: unknown keys or wrong values, all at once.
@@ -356,7 +356,7 @@ def load_signal_map(path: str | Path) -> SignalMap:
 
 
 def map_of_table(table: Table, where: str) -> SignalMap:
-    """A signal map from the content of a map file; `where` names it in messages.
+    """Build a signal map from the content of a map file; `where` names it in messages.
 
     Raises:
         ConfigError: unknown keys or wrong values, all at once.
@@ -365,7 +365,7 @@ def map_of_table(table: Table, where: str) -> SignalMap:
 
 
 def load_data_set(path: str | Path) -> DataSetSettings:
-    """A data-set file; `map` entries that name files are left as paths relative to it."""
+    """Load a data-set file; `map` entries that name files remain relative paths."""
     table = read_toml(path)
     listed = table.get("recordings", [])
     if not isinstance(listed, list):
@@ -383,7 +383,7 @@ def load_data_set(path: str | Path) -> DataSetSettings:
 
 
 def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
-    """The logs of a data-set file; paths in it are relative to it; a map given here replaces the shared one."""
+    """Return the logs of a data-set file with resolved paths; a map given here replaces the common map."""
     settings = load_data_set(path)
 
     def resolved(entry: str | SignalMap | None) -> SignalMap | None:
@@ -426,7 +426,7 @@ def _expanded(entry: str, path: Path) -> str:
 
 
 def _map_table(table: Table) -> Table:
-    """The user's form ``[channels.NAME] column = ...`` as a list of entries."""
+    """Convert the user's form ``[channels.NAME] column = ...`` to a list of entries."""
     channels = table.get("channels")
     if not isinstance(channels, dict):
         return table
@@ -438,7 +438,7 @@ def _map_table(table: Table) -> Table:
 
 
 def read_with_truth(source: DataSource) -> Recording:
-    """The one recording of a source, with the truth that lies in or beside its log.
+    """Read the single recording of a source with its ground truth.
 
     Raises:
         DataError: more than one recording, or a log that cannot be used as it is.

@@ -51,7 +51,7 @@ _MIN_ROLLOVERS = 5
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """What the stamps of one time column say.
+    """Time stamps of one time column and their analysis.
 
     Attributes:
         stamps: time of each row in seconds, shape ``(time,)``; the fitted line where rows are uniform.
@@ -75,7 +75,7 @@ class Clock:
 
 
 def uniform_clock(samples: int, rate_hz: float) -> Clock:
-    """The clock of rows that are uniform by decree (a stated rate or sample time)."""
+    """Return the clock of rows that are uniform by a stated rate or sample time."""
     none = np.empty(0, dtype=np.intp)
     return Clock(np.arange(samples) / rate_hz, True, rate_hz, 1.0 / rate_hz, 0.0, none, none, none)
 
@@ -139,7 +139,7 @@ def judge(stamps: Stamps, where: str) -> Clock:
 
 
 def _even(stamps: Stamps) -> tuple[float, float] | None:
-    """Step and rms distance in steps of stamps that are a straight line but for rounding; None for others.
+    """Return step and rms deviation in steps for evenly spaced stamps up to rounding; None for other stamps.
 
     What most logs have, computed without the medians that the general rule takes.
     """
@@ -212,7 +212,7 @@ def _repeated_line(stamps: Stamps, steps: Stamps) -> tuple[float, float] | None:
 
 
 def _printed_digit(stamps: Stamps, floor: float) -> float:
-    """The largest power of ten that divides all stamps; below `floor` it no longer matters."""
+    """Return the largest power of ten that divides all stamps; powers below `floor` are not tried."""
     for power in range(10):
         if 10.0**-power < floor:
             break
@@ -254,7 +254,7 @@ class Grid:
 
 
 def common_grid(clocks: Sequence[Clock], rate_hz: float | None, where: str) -> Grid:
-    """The grid on which every clock has a sample: from the latest start to the earliest end.
+    """Return the grid on which every clock has a sample: from the latest start to the earliest end.
 
     Without a wanted rate the fastest clock's rate is taken.
 
@@ -274,7 +274,7 @@ def common_grid(clocks: Sequence[Clock], rate_hz: float | None, where: str) -> G
 
 
 def hold_rows(clock: Clock, grid: Grid) -> tuple[Rows | None, NDArray[np.bool_]]:
-    """Which row each tick takes, and which ticks lie in a gap.
+    """Return the row used at each sample, and the samples in gaps.
 
     A tick takes the latest row whose stamp is not later than the tick (within a millionth of a tick).
 

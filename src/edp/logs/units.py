@@ -70,7 +70,7 @@ OTHER_UNITS = frozenset(
 
 
 def normalise_unit(text: str | None) -> str | None:
-    """The unit under its usual name; None for an empty text; an unknown unit stays as it is."""
+    """Return the unit in its usual spelling; None for an empty text; unknown units are unchanged."""
     unit = (text or "").strip()
     if not unit:
         return None
@@ -110,7 +110,7 @@ def _closest_units(unit: str, count: int = 3) -> list[str]:
 
 
 def kind_of_unit(stated: str | None) -> Kind:
-    """The first kind that a unit measures; generic where it says nothing."""
+    """Return the first kind that a unit measures; generic if it is unknown."""
     unit = UNITS.get(normalise_unit(stated) or "1")
     return Kind.GENERIC if unit is None or Kind.GENERIC in unit.kinds else unit.kinds[0]
 
@@ -128,12 +128,12 @@ def mapped_channel(entry: ChannelMap) -> Channel:
 
 
 def with_kinds(signal_map: SignalMap) -> SignalMap:
-    """Return a map whose entries state the kinds that their units tell."""
+    """Return a map whose entries state the kinds given by their units."""
     return replace(signal_map, channels=tuple(map(_with_kind, signal_map.channels)))
 
 
 def without_derived_kinds(signal_map: SignalMap) -> SignalMap:
-    """Return a map of an earlier version: it read a channel without a kind as plain numbers, whatever the unit."""
+    """Return a map with the meaning of earlier versions, which read a channel without a kind as plain numbers."""
     entries = (
         replace(entry, kind=Kind.GENERIC) if _with_kind(entry) != entry else entry for entry in signal_map.channels
     )
@@ -147,7 +147,7 @@ def _with_kind(entry: ChannelMap) -> ChannelMap:
 
 
 def unit_for(stated: str | None, kind: Kind, where: str) -> Unit:
-    """The conversion for a unit that a file or a map states; nothing stated means SI.
+    """Return the conversion for a unit stated by file or map; SI if there is none.
 
     A generic channel has no unit of its own: its numbers are taken as they are.
 

@@ -78,6 +78,6 @@ def _write(chosen: LogFormat, recording: Recording, target: Path, options: Write
 
 
 def truth_path(path: str | Path) -> Path:
-    """The file that holds the truth of a log, where the format has no place for it in the log itself."""
+    """Return the path of the ground truth file of a log, for formats without a place for it."""
     log = Path(path)
     return log.with_name(f"{log.stem}.{TRUTH}{log.suffix}")

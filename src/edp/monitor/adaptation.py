@@ -29,7 +29,7 @@ class SlowDrift:
     most: float
 
     def run(self, rows: Array, offset: Array) -> tuple[Array, Array]:
-        """Rows less the offset before each of them, and the offset behind them."""
+        """Subtract the offset before each row; return the rows and the final offset."""
         if self.step == 0.0 or not len(rows):
             return rows - offset, offset
         out = np.empty_like(rows)

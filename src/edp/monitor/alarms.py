@@ -1,4 +1,4 @@
-"""What an alarm says: when, since when, by how much, and by whom it was raised; causes are named by a diagnosis."""
+"""Alarms: time, onset, strength, and the detector that raised them; a diagnosis names causes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class MonitorAlarm:
 
 
 class Raised(Protocol):
-    """What alarms and their facts on a page have in common."""
+    """Interface common to alarms and their data on a page."""
 
     @property
     def recording(self) -> str: ...
@@ -64,8 +64,7 @@ AnyAlarm = TypeVar("AnyAlarm", bound=Raised)
 
 
 def episodes(alarms: Iterable[AnyAlarm]) -> list[list[AnyAlarm]]:
-    """Alarms of one recording that say the same, together: detectors are reset at an alarm, and a fault that stays
-    alarms again.
+    """Group equal alarms of one recording. Detectors are reset at an alarm, so that a lasting fault raises several.
 
     Alarms say the same where their most probable causes sit in one component; without such a cause, where the same
     residual deviates most.

@@ -1,4 +1,4 @@
-"""Limits of detectors for a promised rate of false alarms, from healthy sessions that nothing was fitted to."""
+"""Alarm limits of detectors for a given false alarm rate, from healthy sessions not used for fitting."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_HOURS = above(0.0, 1e6)
 
 @dataclass(frozen=True)
 class AlarmLimit:
-    """A limit and what is known of its false alarms.
+    """Alarm limit and its false alarms.
 
     Attributes:
         limit: that a statistic has to pass.
@@ -65,7 +65,7 @@ def hours_between(count: int, hours: float) -> tuple[float, float]:
 
 
 def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float, promised_hours: float) -> AlarmLimit:
-    """The lowest limit at which new sessions of this kind have at most one false alarm in `promised_hours`.
+    """Return the lowest limit with at most one false alarm in `promised_hours` on new sessions of this kind.
 
     The lowest limit with k alarms here has k + 1 in as many new hours on average, as the largest of n values is passed
     by one new value of n + 1. Where the hours allow k + 1 and a part of one more, the limit lies as far on the way from
@@ -117,7 +117,7 @@ def calibrated(spec: DetectorSpec, sessions: Sequence[Array], rows_per_s: float,
 def _lowest(
     spec: DetectorSpec, sessions: Sequence[Array], ranges: Sequence[tuple[float, float]], allowed: int
 ) -> float:
-    """The lowest limit at which sessions have at most so many alarms; `ranges` are those of their statistics."""
+    """Return the lowest limit with at most `allowed` alarms; `ranges` are the ranges of the sessions' statistics."""
     most = sorted((high for _, high in ranges), reverse=True)
     # Below the largest statistics of one session more than may alarm, each of these does.
     low, high = most[allowed] if len(most) > allowed else min(low for low, _ in ranges), most[0]
@@ -143,7 +143,7 @@ def _range(spec: DetectorSpec, session: Array) -> tuple[float, float]:
 
 
 def _counts(spec: DetectorSpec, sessions: Sequence[Array], limits: Array) -> NDArray[np.int64]:
-    """False alarms of all sessions at each limit."""
+    """Count the false alarms of all sessions at each limit."""
     counts = np.zeros(len(limits), dtype=np.int64)
     for session in sessions:
         detector = spec.build(session.shape[1], len(limits))

@@ -56,7 +56,7 @@ class ChainState:
 
 @dataclass(frozen=True)
 class BlockVerdict:
-    """What one block gave.
+    """Result of one block.
 
     Attributes:
         block: its number from the start.
@@ -112,7 +112,7 @@ class MonitorChain:
     def conditioned(
         self, residuals: NDArray[Any], rows: NDArray[Any], state: ChainState
     ) -> tuple[Array, Array, ChainState]:
-        """Conditioned rows of the blocks that end within a stretch, shape (blocks, summaries), and the state behind it.
+        """Return conditioned rows of the blocks that end in a segment, shape (blocks, summaries), and the next state.
 
         First within the clip and with drift taken off, then as far as they reach.
         """
@@ -126,7 +126,7 @@ class MonitorChain:
     def run(
         self, residuals: NDArray[Any], rows: NDArray[Any], state: ChainState
     ) -> tuple[list[BlockVerdict], ChainState]:
-        """Verdicts of the blocks that end within a stretch of one machine.
+        """Return the verdicts of the blocks that end in a segment of one machine.
 
         Args:
             residuals: shape (ticks, residuals), NaN where not available.

@@ -1,4 +1,4 @@
-"""Summaries at an operating point: less what is usual there, over how widely they usually scatter there."""
+"""Conditioning of summaries on the operating point: subtraction of the usual value, division by the usual scatter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LEAST_WIDTH = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Conditioning:
-    """z = (s - W p) / max(V p, floor), with p the operating point, scaled and limited.
+    """z = (s - W p) / max(V p, floor), where p is the operating point, scaled and limited.
 
     Attributes:
         offset: of the operating point without its 1, shape (points - 1,).
@@ -153,7 +153,7 @@ def _single(values: Array) -> Array:
 
 
 def _ridge(square: Array, product: Array, rows: int) -> Array:
-    """Coefficients from the products of `rows` rows; the constant is not drawn to zero."""
+    """Return ridge coefficients from the products of `rows` rows; the constant is not regularised."""
     penalty = RIDGE * rows * np.eye(len(square))
     penalty[0, 0] = 0.0
     line = np.linalg.solve(square + penalty + 1e-12 * np.eye(len(square)), product)

@@ -237,7 +237,7 @@ def _size_unit(monitor: Monitor, channel: Channel, change: Change) -> tuple[str,
 def _delays(
     monitor: Monitor, segments: Sequence[Recording], name: str, injection: _Injection, size: float
 ) -> list[float]:
-    """Times from the onset to the alarm, of the trials in which the change was found."""
+    """Return the times from onset to alarm of the trials in which the change was found."""
     delays = []
     for segment, sign in itertools.product(segments, injection.signs):
         onset, column = round(ONSET * segment.samples), segment.index(name)

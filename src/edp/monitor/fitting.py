@@ -39,7 +39,7 @@ NO_FOLD = -1
 
 
 def default_watches() -> tuple[WatchSpec, ...]:
-    """One view for shifts of many summaries, one for the shift of a single one, one for what is gross."""
+    """Return the default views: shifts of many summaries, shift of a single summary, gross deviations."""
     return (
         WatchSpec(detector=CusumSpec(slack=0.5), memory_s=40.0),
         WatchSpec(detector=SeparateCusumsSpec(slack=0.25), memory_s=40.0, view="adjusted"),
@@ -98,7 +98,7 @@ class ChainSpec:
 
 @dataclass(frozen=True, eq=False)
 class FittedChain:
-    """What came of it.
+    """Result of a fit.
 
     Attributes:
         chain: on all sessions that were kept.
@@ -200,7 +200,7 @@ def _settle_blocks(spec: ChainSpec, sessions: Sequence[Recording], block: int) -
 
 
 def _left_out(fold: int, sessions: int, folds: int) -> range:
-    """Indices of the sessions that the fold leaves out."""
+    """Return the indices of the sessions left out by the fold."""
     return range(0) if fold == NO_FOLD else range(fold, sessions, folds)
 
 
@@ -214,7 +214,7 @@ def fit_from_blocks(
     progress: Progress = SILENT,
     side_by_side: SideBySide = map,
 ) -> FittedChain:
-    """`fit_chain` from the blocks of the sessions on."""
+    """Fit a chain like `fit_chain`, given the blocks of the sessions."""
     progress.note("conditioning, views and limit")
     remaining, doubtful = _without_doubtful(spec, blocks, settle)
     blocks_per_s = rate_hz / summaries.block
@@ -236,7 +236,7 @@ def fit_from_blocks(
 
 
 def _watches(spec: ChainSpec, sessions: Sequence[tuple[Array, Array]], blocks_per_s: float, settle: int) -> list[Watch]:
-    """Views of healthy sessions, each of the rows that it sees."""
+    """Fit the views to healthy sessions, each to its kind of rows."""
     return [
         fit_watch(watch, [gross if watch.view == "own" else rows for rows, gross in sessions], blocks_per_s, settle)
         for watch in spec.watches
@@ -244,7 +244,7 @@ def _watches(spec: ChainSpec, sessions: Sequence[tuple[Array, Array]], blocks_pe
 
 
 def _as_wide(parts: Sequence[Array], directions: Sequence[int]) -> Array:
-    """Rows of the views of a fold as wide as those of all sessions: a direction that it lacks counts as healthy."""
+    """Extend the rows of a fold's views to the width of the full views; missing directions count as healthy."""
     wide = []
     for part, width in zip(parts, directions, strict=True):
         fitting = part[:, :width]
@@ -271,12 +271,12 @@ class _Part:
 
     @property
     def left_out(self) -> range:
-        """Places of the sessions that it is not fitted to."""
+        """Indices of the left-out sessions."""
         return _left_out(self.fold, len(self.sessions), self.folds)
 
 
 def _fit_part(job: _Part) -> tuple[Conditioning, list[Watch], list[list[Array]]]:
-    """Conditioning, views, and the rows of each view for each session that they were not fitted to."""
+    """Fit conditioning and views, and return the rows of each view for the left-out sessions."""
     out = set(job.left_out)
     others = [session for index, session in enumerate(job.sessions) if index not in out]
     conditioning = _conditioning(job.spec, others, job.settle)
@@ -291,7 +291,7 @@ def _fit_part(job: _Part) -> tuple[Conditioning, list[Watch], list[list[Array]]]
 
 
 def _quiet(bank: BankSpec, sessions: Sequence[Array]) -> float:
-    """The median of the largest statistic on healthy sessions."""
+    """Return the median of the largest statistic on healthy sessions."""
     values = []
     for rows in sessions:
         detector = bank.build(rows.shape[1])
@@ -306,7 +306,7 @@ def _conditioning(spec: ChainSpec, sessions: Sequence[SessionBlocks], settle: in
 def _conditioned(
     conditioning: Conditioning, drift: SlowDrift, session: SessionBlocks, settle: int
 ) -> tuple[Array, Array]:
-    """Rows within the clip and with drift taken off, and as far as they reach."""
+    """Return the conditioned rows with and without clipping, drift removed."""
     gross = conditioning.unclipped(session.summaries, session.points)
     gross[:settle] = np.nan
     z = np.clip(gross, -conditioning.clip, conditioning.clip)
@@ -330,7 +330,7 @@ def doubtful_sessions(
     sessions: Sequence[Recording],
     side_by_side: SideBySide = map,
 ) -> tuple[str, ...]:
-    """Names of further sessions whose means lie far from those that a chain was fitted to, such as of the training."""
+    """Return names of other sessions, such as training sessions, whose means are far from the fitted sessions."""
     chain = fitted.chain
     blocks = list(
         side_by_side(summarised, [BlocksJob(chain.summaries, sources, channels, session) for session in sessions])
@@ -342,7 +342,7 @@ def doubtful_sessions(
 def _doubtful(
     spec: ChainSpec, sessions: Sequence[SessionBlocks], usual: Sequence[SessionBlocks], settle: int
 ) -> NDArray[np.bool_]:
-    """Which sessions have means far from the usual ones."""
+    """Return a mask of the sessions whose means are far from the usual ones."""
     # As they are: what is usual at an operating point would be learned from the doubtful sessions, too.
     means, others = (
         np.stack([np.nan_to_num(session.summaries[settle:]).mean(axis=0) for session in part])

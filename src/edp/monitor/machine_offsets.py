@@ -1,4 +1,4 @@
-"""Whether a log looks like one of another machine of the same kind.
+"""Detection of logs of another machine of the same kind.
 
 Balances of flow know the openings of a valve to less than a hundredth, so that machines of one series lie farther apart
 than many a fault moves them. A fault concerns one axis, with few exceptions; another machine is off in all of them, and
@@ -31,7 +31,7 @@ LEAST_AXES = 2
 
 
 def scatter_of(chain: MonitorChain, sessions: Sequence[SessionBlocks], block_s: float) -> Array:
-    """How far means over the start of healthy sessions scatter about zero, shape (summaries,); zero where unknown."""
+    """Return the scatter of means over the start of healthy sessions, shape (summaries,); zero if unknown."""
     means = []
     for session in sessions:
         rows = chain.conditioning(session.summaries, session.points)
@@ -47,7 +47,7 @@ def scatter_of(chain: MonitorChain, sessions: Sequence[SessionBlocks], block_s: 
 def other_machine(
     sources: Sequence[ResidualSource], chain: MonitorChain, scatter: Array, rows: Array, block_s: float
 ) -> str:
-    """A sentence where balances of flow of all axes are off, both at the start of a log and in all of it; else empty.
+    """Return a message if the flow balances of all axes deviate at the start and over the whole log; otherwise empty.
 
     Args:
         sources: of the monitor.
@@ -77,7 +77,7 @@ def other_machine(
 
 
 def _axes(sources: Sequence[ResidualSource], chain: MonitorChain) -> dict[str, list[int]]:
-    """Columns of the summaries of balances of flow, by the velocity that they judge."""
+    """Return the columns of the flow-balance summaries by monitored velocity."""
     each = chain.summaries.width // chain.summaries.residuals
     axes: dict[str, list[int]] = {}
     index = 0

@@ -56,7 +56,7 @@ class MonitorState:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What one tick of a stream gives.
+    """Result of one sample of a stream.
 
     Attributes:
         alarm: raised at this tick.
@@ -73,7 +73,7 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """What a monitor made of a recording.
+    """Result of a monitor on a recording.
 
     Attributes:
         alarms: in order.
@@ -147,7 +147,7 @@ class Monitor:
         return rows if possible.all() else np.where(possible, rows, np.float32(np.nan))
 
     def residuals(self, rows: Rows, state: MonitorState) -> tuple[Rows, tuple[SourceState, ...]]:
-        """Residuals of a stretch of one machine, shape (ticks, residuals), and the states of the sources behind it."""
+        """Return residuals of a segment of one machine, shape (ticks, residuals), and the next source states."""
         index = {name: i for i, name in enumerate(self.inputs)}
         parts, states = [], []
         for source, before in zip(self.sources, state.sources, strict=True):
@@ -157,7 +157,7 @@ class Monitor:
         return np.concatenate(parts, axis=1), tuple(states)
 
     def advance(self, rows: Rows, state: MonitorState) -> tuple[list[BlockVerdict], MonitorState]:
-        """Verdicts of the blocks that end within a stretch; ticks, chunks and one call give the same.
+        """Return the verdicts of blocks that end in a segment; the division into calls does not matter.
 
         Args:
             rows: raw channels in SI units, shape (ticks, inputs), NaN where missing.
@@ -170,7 +170,7 @@ class Monitor:
         return verdicts, MonitorState(sources, chain, state.ticks + len(rows), missing)
 
     def verdicts(self, recording: Recording) -> Iterator[BlockVerdict]:
-        """Verdicts of a whole recording from its start on.
+        """Yield the verdicts of a whole recording.
 
         Raises:
             DataError: another rate, or a log of another machine.
@@ -227,7 +227,7 @@ class Monitor:
         return self._conditioned(recording)[0]
 
     def _conditioned(self, recording: Recording) -> tuple[Array, Array]:
-        """Those within the clip, and as far as they reach."""
+        """Return the conditioned rows with and without clipping."""
         self.check(recording)
         state, rows, out = self.initial_state(), rows_of(recording, self.inputs), []
         for start in range(0, len(rows), PIECE):
@@ -245,7 +245,7 @@ class Monitor:
         return self.chain.bank.white(*self._conditioned(recording))
 
     def alarm(self, verdict: BlockVerdict, recording: str = "") -> MonitorAlarm:
-        """The alarm of a block's verdict.
+        """Create the alarm of a block's verdict.
 
         Raises:
             DataError: the block raised none.
@@ -268,7 +268,7 @@ class Monitor:
         return replace(alarm, sentence=_sentence(alarm))
 
     def check(self, recording: Recording) -> tuple[str, ...]:
-        """Refuse a recording that this monitor cannot judge; names of channels that it lacks, which stay silent.
+        """Raise an error for an incompatible recording; return the names of missing channels, which stay silent.
 
         Raises:
             DataError: another rate, none of the channels, or values that are not those of this machine.
@@ -294,7 +294,7 @@ class Monitor:
         return tuple(filter(None, (source.unlearned(recording) for source in self.sources)))
 
     def unlike(self, watched: Watched) -> str:
-        """Why a recording looks like one of another machine of the same kind; empty where it does not."""
+        """Return the reason why a recording may be of another machine; empty if it looks like the same machine."""
         if self.scatter is None:
             return ""
         return other_machine(self.sources, self.chain, self.scatter, watched.rows.astype(np.float64), self.block_s)
@@ -321,7 +321,7 @@ class Monitor:
             )
 
     def stream(self) -> MonitorStream:
-        """The monitor tick by tick, from a start on."""
+        """Return the monitor for processing sample by sample."""
         return MonitorStream(self)
 
 
@@ -335,7 +335,7 @@ class MonitorStream:
         self._earlier: deque[tuple[int, int]] = deque(maxlen=MOST_ROWS)
 
     def reset(self) -> None:
-        """Start anew."""
+        """Restart."""
         self.state = self.monitor.initial_state()
         self._statistics = (0.0,) * len(self.monitor.chain.watches)
         self._rows.clear()
@@ -362,7 +362,7 @@ class MonitorStream:
         return Verdict(alarm, silent, self._statistics, bool(verdicts))
 
     def _alarm(self, verdict: BlockVerdict) -> MonitorAlarm:
-        """The alarm with the causes that the rows up to now name."""
+        """Return the alarm with causes from the rows so far."""
         alarm, onset = self.monitor.alarm(verdict), onset_of(verdict.since, tuple(self._earlier))
         self._earlier.append((verdict.since, verdict.block))
         if self.monitor.diagnosis is None:
@@ -389,7 +389,7 @@ class MonitorStream:
 
 
 def _sentence(alarm: MonitorAlarm) -> str:
-    """The alarm without a diagnosis, for a reader."""
+    """Describe an alarm without a diagnosis."""
     name, size = alarm.evidence[0] if alarm.evidence else ("nothing", 0.0)
     where = f"{alarm.recording}: " if alarm.recording else ""
     return (

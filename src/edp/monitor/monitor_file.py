@@ -1,4 +1,4 @@
-"""Monitors on disk: JSON and safetensors, as bundles of networks are; loading one executes nothing."""
+"""Monitors on disk as JSON and safetensors, like network bundles; loading does not execute code."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _kind_of(source: ResidualSource) -> str:
 
 
 def _write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
-    """Write a network beside the header, in a folder that its own header names."""
+    """Write a network next to the header, into a folder named by its own header."""
     kind = "twin" if isinstance(bundle, TwinBundle) else "bundle"
     draft = make_folder(path / NETWORKS / f"{kind}-draft")
     shutil.rmtree(draft)
@@ -118,7 +118,7 @@ def _write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
 
 
 def _remove_old(path: Path, arrays: str, networks: set[str]) -> None:
-    """Remove what an earlier monitor left; a kill before that leaves spare files, not a broken monitor."""
+    """Remove the files of an earlier monitor. A kill before that leaves extra files but a valid monitor."""
     for old in entries_of(path, "monitor-*.safetensors"):
         if old.name != arrays:
             old.unlink(missing_ok=True)
@@ -176,7 +176,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> Monitor:
 
 
 def _scatter(values: Any, chain: MonitorChain) -> NDArray[np.float64] | None:
-    """Of means of healthy sessions; earlier versions wrote none."""
+    """Read the scatter of healthy session means; files of earlier versions have none."""
     if values is None:
         return None
     scatter = np.asarray(values, np.float64)

@@ -1,4 +1,4 @@
-"""Summaries and operating points of sessions, with blocks and scales that are those of healthy ones."""
+"""Summaries and operating points of sessions, with blocks and scales from healthy sessions."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _scaling(sessions: Sequence[Recording]) -> list[Recording]:
 
 
 def drivers_of(channels: Sequence[Channel], session: Recording, judged: Sequence[str]) -> NDArray[np.int64]:
-    """What drives each residual: the velocity and the signed command of the axis that its channel belongs to.
+    """Return the drivers of each residual: velocity and signed command of its channel's axis.
 
     A channel of no axis has those whose sizes go with it most. Shape (drivers, residuals, 2); a driver that no residual
     has is left out.
@@ -106,7 +106,7 @@ def drivers_of(channels: Sequence[Channel], session: Recording, judged: Sequence
 
 
 def _likely_axis(axes: Sequence[Axis], session: Recording, name: str) -> Axis | None:
-    """The axis whose velocity has sizes that go with those of a channel most."""
+    """Return the axis whose velocity magnitude correlates most with that of a channel."""
     if not axes or name not in session.channel_names:
         return None
     sizes = np.abs(session.column(name).astype(np.float64) - float(session.column(name).mean()))
@@ -132,7 +132,7 @@ def _robust_width(values: Array) -> Array:
 def _operating_channels(
     channels: Sequence[Channel], rows: Array, block: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Places of channels whose size, and of those whose level, tells the operating point."""
+    """Return indices of channels whose magnitude, and of channels whose level, defines the operating point."""
     whole = rows[: len(rows) // block * block].reshape(-1, block, rows.shape[1])
     varies = np.nan_to_num(np.nanstd(np.nanmean(whole, axis=1), axis=0)) > 0.0
     moving = [i for i, c in enumerate(channels) if c.kind in MOVING and varies[i]]
@@ -152,7 +152,7 @@ def blocks_of(
 
 @dataclass(frozen=True, eq=False)
 class BlocksJob:
-    """What `blocks_of` is called with."""
+    """Arguments of `blocks_of`."""
 
     summaries: BlockSummaries
     sources: Sequence[ResidualSource]

@@ -1,4 +1,4 @@
-"""A JSON header and its arrays on disk, under one hash: what the diagnosis and a monitor's runs keep."""
+"""JSON header and its arrays on disk under one hash, for diagnoses and monitor runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write_stored(folder: Path, name: str, header: Mapping[str, Any], arrays: Arr
 
 
 def read_stored(folder: Path, name: str, schema: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header and arrays, checked against their hashes; nothing in them is executed.
+    """Read header and arrays after a check of their hashes; nothing in them is executed.
 
     Raises:
         StorageError: missing, damaged, changed, too large, or of another schema.

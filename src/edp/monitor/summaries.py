@@ -1,4 +1,4 @@
-"""From residuals at every tick to few numbers a block: sums in a fixed order, which C repeats bit by bit.
+"""Block summaries of residuals: sums in a fixed order, which C repeats bit for bit.
 
 Only + - * / sqrt and comparisons are used, in double precision, one tick after the other.
 """
@@ -26,7 +26,7 @@ MOST_BLOCK = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class BlockSummaries:
-    """What is taken of each block.
+    """Summaries of a block.
 
     r is a residual times one over its healthy scale, u the channel that it judges less its `centre`, times one over its
     healthy deviation, d the change of u since the tick before, n the ticks of the block at which r is there::
@@ -71,7 +71,7 @@ class BlockSummaries:
 
     @property
     def width(self) -> int:
-        """Numbers of a block: `SUMMARIES` and drivers of the first residual, of the second, and so on."""
+        """Number of values per block: `SUMMARIES` and drivers of the first residual, of the second, and so on."""
         return (len(SUMMARIES) + len(self.drivers)) * self.residuals
 
     @property
@@ -90,7 +90,7 @@ class BlockSummaries:
     def run(
         self, residuals: NDArray[Any], rows: NDArray[Any], state: SummaryState
     ) -> tuple[Array, Array, SummaryState]:
-        """Blocks that end within a stretch.
+        """Return the blocks that end in a segment.
 
         Args:
             residuals: shape (ticks, residuals), NaN where not available.
@@ -122,7 +122,7 @@ class BlockSummaries:
         return (np.concatenate(summaries), np.concatenate(points), state) if summaries else (*none, state)
 
     def _take(self, residuals: NDArray[Any], rows: NDArray[Any], state: SummaryState) -> SummaryState:
-        """The sums after some ticks of several consecutive blocks side by side, shape (blocks, ticks, ...) each."""
+        """Add samples of several consecutive blocks in parallel, shape (blocks, ticks, ...) each."""
         blocks, ticks = residuals.shape[:2]
         there = np.isfinite(residuals)
         r = np.where(there, residuals, 0.0).astype(np.float64) * self.scale
@@ -155,7 +155,7 @@ class BlockSummaries:
         return SummaryState(state.ticks + ticks, flat[-1].copy(), True, sums)
 
     def _closed(self, state: SummaryState) -> tuple[Array, Array]:
-        """Summaries and operating points of blocks that have come to their end."""
+        """Return summaries and operating points of completed blocks."""
         sums = state.sums
         n = np.maximum(sums["n"], 1.0)
         mean = sums["r"] / n
@@ -240,7 +240,7 @@ class SummaryState:
 
 
 def _filled(rows: Array, last: Array) -> Array:
-    """Rows in which the last value stands in for a missing one."""
+    """Return rows with missing values replaced by the last value."""
     there = np.isfinite(rows)
     if there.all():
         return rows

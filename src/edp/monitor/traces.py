@@ -1,4 +1,4 @@
-"""What a monitor's run leaves beside its alarms: statistics against their limits and levels of residual groups."""
+"""Traces of a monitor run in addition to alarms: statistics with their limits, levels of residual groups."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST_RECORDINGS, MOST_COLUMNS = 100_000, 256
 
 @dataclass(frozen=True, eq=False)
 class RecordingTrace:
-    """One recording under the monitor, a row a block.
+    """Trace of one recording under the monitor, one row per block.
 
     Attributes:
         name: of the recording.
@@ -58,7 +58,7 @@ class RunTraces:
 
     @property
     def hours(self) -> float:
-        """Of all recordings."""
+        """Duration of all recordings in hours."""
         return sum(trace.duration_s for trace in self.recordings) / 3600.0
 
 
@@ -135,12 +135,12 @@ def _text(value: Any, where: str) -> str:
 
 
 def _number(value: Any) -> float:
-    """A number as it is; NaN for anything else."""
+    """Return a number unchanged; NaN for anything else."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 
 def pooled(values: FloatArray, most: int) -> tuple[FloatArray, int]:
-    """Rows pooled to at most `most` by their largest value, and how many rows each stands for."""
+    """Reduce rows to at most `most` by their largest value; return them and the number of rows per pooled row."""
     factor = max(1, -(-len(values) // most))
     if factor == 1:
         return values, 1

@@ -1,4 +1,4 @@
-"""What watches conditioned rows: a linear view of them and a detector on it, several side by side under one limit."""
+"""Watches on conditioned rows: a linear view with a detector each, several in parallel under one limit."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Watch:
 
     @property
     def own(self) -> bool:
-        """Whether it sees each summary by itself, in rows that are not clipped."""
+        """Whether each summary is monitored by itself, without clipping."""
         return self.matrix.ndim == 1
 
     def __call__(self, rows: Array) -> Array:
@@ -127,7 +127,7 @@ def _averages(length: int, blocks: int) -> int:
 
 
 def fit_watch(spec: WatchSpec, sessions: Sequence[Array], blocks_per_s: float, settle: int) -> Watch:
-    """A view from conditioned rows of healthy sessions, shape (blocks, summaries) each; not clipped for ``own``.
+    """Fit a view to conditioned rows of healthy sessions, shape (blocks, summaries) each; unclipped for ``own``.
 
     Raises:
         DataError: too few rows.
@@ -170,7 +170,7 @@ def _own(spec: WatchSpec, sessions: Sequence[Array], settle: int) -> Watch:
 
 
 def _averaged(rows: Array, blocks: int) -> Array:
-    """Means of `blocks` rows, every half of that; of a shorter session the mean of all."""
+    """Return means of `blocks` rows with half overlap; for a shorter session the overall mean."""
     if blocks == 1 or not len(rows):
         return rows
     if len(rows) <= blocks:
@@ -204,7 +204,7 @@ class _Bank(Detector):
 
 @dataclass(frozen=True, eq=False)
 class BankSpec(DetectorSpec):
-    """All watches as one detector: its rows are the white rows of each, one behind the other; the largest counts."""
+    """All watches as one detector on the concatenated white rows; the largest statistic counts."""
 
     watches: tuple[Watch, ...]
 
@@ -221,7 +221,7 @@ class BankSpec(DetectorSpec):
 
 
 def scaled_alike(specs: Sequence[WatchSpec], watches: Sequence[Watch], sessions: Sequence[Array]) -> tuple[Watch, ...]:
-    """The watches with scales at which each is as eager: its third largest statistic of all healthy sessions.
+    """Return the watches scaled to equal sensitivity: by the third largest statistic of all healthy sessions.
 
     Args:
         specs: options of the watches; their reserve is a factor of the scale.

@@ -20,11 +20,14 @@ class ActivationSpec(Protocol):
     """Options of an output activation."""
 
     def build(self, outputs: int) -> nn.Module:
-        """A module on ``(..., output)``; ``lower(build, x)`` adds it to a graph, on ``horizon * output`` numbers."""
+        """Build a module on ``(..., output)``.
+
+        ``lower(build, x)`` adds it to a graph, on ``horizon * output`` elements.
+        """
         ...
 
     def bound(self) -> float | None:
-        """The largest magnitude it can reach, None where there is no limit."""
+        """Return the largest possible magnitude; None if there is no limit."""
         ...
 
 
@@ -39,7 +42,7 @@ class Identity:
     """``g(x) = x``."""
 
     def build(self, outputs: int) -> nn.Module:
-        """A module that changes nothing."""
+        """Build the identity module."""
         return _Identity()
 
     def bound(self) -> float | None:
@@ -58,7 +61,7 @@ class Tanh:
     """``g(x) = tanh(x)``: targets beyond one standard deviation cannot be reached."""
 
     def build(self, outputs: int) -> nn.Module:
-        """The hyperbolic tangent."""
+        """Build the hyperbolic tangent."""
         return _Tanh()
 
     def bound(self) -> float | None:
@@ -104,11 +107,11 @@ class ScaledTanh:
             )
 
     def build(self, outputs: int) -> nn.Module:
-        """The activation for `outputs` targets."""
+        """Build the activation for `outputs` targets."""
         return _ScaledTanh(outputs, self)
 
     def bound(self) -> float | None:
-        """The largest amplitude it can learn."""
+        """Return the largest trainable amplitude."""
         return self.high
 
 

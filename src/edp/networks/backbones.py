@@ -45,7 +45,7 @@ class BackboneSpec(Protocol):
     """Options of a backbone."""
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
-        """The backbone and the width of its representation.
+        """Build the backbone and return it with the width of its representation.
 
         Args:
             features: numbers that it reads.
@@ -56,11 +56,14 @@ class BackboneSpec(Protocol):
         ...
 
     def slots(self) -> tuple[BlockSlot, ...]:
-        """The slots that it offers."""
+        """Return the block slots of the backbone."""
         ...
 
     def parts(self) -> tuple[str, ...]:
-        """Sub-modules of what it builds, from the input on, for learning rates that differ; none: it is one piece."""
+        """Return the names of its sub-modules, from the input on, for separate learning rates.
+
+        Empty for a single module.
+        """
         ...
 
 
@@ -100,11 +103,11 @@ class LstmSpec:
         return (BlockSlot.FEATURES,)
 
     def parts(self) -> tuple[str, ...]:
-        """The recurrent layers, then what reads their states."""
+        """Return the recurrent layers, then the modules that read their states."""
         return ("recurrent", "pooling", "extras")
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
-        """The recurrent backbone on the scaled features."""
+        """Build the recurrent backbone on the scaled features."""
         stack = Stack(self.cell, features, self.units, self.layers, self.dropout, self.zoneout)
         net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
         return net, net.width
@@ -138,11 +141,11 @@ class GruSpec:
         return (BlockSlot.FEATURES,)
 
     def parts(self) -> tuple[str, ...]:
-        """The recurrent layers, then what reads their states."""
+        """Return the recurrent layers, then the modules that read their states."""
         return ("recurrent", "pooling", "extras")
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
-        """The recurrent backbone on the scaled features."""
+        """Build the recurrent backbone on the scaled features."""
         stack = Stack(self.cell, features, self.units, self.layers, self.dropout)
         net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
         return net, net.width
@@ -172,11 +175,11 @@ class TcnSpec:
         return (BlockSlot.BRANCHES, BlockSlot.CHANNELS)
 
     def parts(self) -> tuple[str, ...]:
-        """One piece."""
+        """Return an empty tuple, since the backbone is a single module."""
         return ()
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
-        """The convolution stack(s); refused where the receptive field is shorter than the window."""
+        """Build the convolution stacks; raises ConfigError if the receptive field is shorter than the window."""
         reach = receptive_field(len(self.channels), self.kernel)
         if reach < window:
             # 64 levels exceed any window that fits in memory; with kernel 1 the field stays one sample at every depth.
@@ -225,7 +228,7 @@ class HybridSpec:
         return (BlockSlot.BRANCHES, BlockSlot.CHANNELS, BlockSlot.FEATURES)
 
     def parts(self) -> tuple[str, ...]:
-        """The convolutions, the recurrent layers, then what reads their states."""
+        """Return the convolutions, the recurrent layers, then the modules that read their states."""
         return ("encoder", "recurrent", "pooling", "extras")
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
@@ -307,11 +310,11 @@ class CommitteeSpec:
         return ()
 
     def parts(self) -> tuple[str, ...]:
-        """The members and the radial basis functions; changes and trees have no weights that a gradient trains."""
+        """Return the members and the radial basis functions; differences and trees are not trained by gradients."""
         return ("groups", *(["radial"] if self.centres else []), *(["near"] if self.near else []))
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
-        """The bank of changes, and the members and trees on it."""
+        """Build the bank of differences, and the members and trees on it."""
         bank = LagBank(features, self.lags, self.smoothed, self.bounded)
         groups = [
             Members(bank.columns, self.members, self.units, self.layers, name, self.dropout)
@@ -325,7 +328,10 @@ class CommitteeSpec:
 
 
 class RecurrentBackbone(Streaming):
-    """``[attention pooling ; h_t ; further features]`` of recurrent layers on the input or on an encoder's channels."""
+    """``[attention pooling ; h_t .
+
+    Extra features]`` of recurrent layers on the input or on the channels of an encoder.
+    """
 
     def __init__(
         self, encoder: Streaming | None, recurrent: Streaming, units: int, dropout: float, window: int, blocks: Blocks
@@ -371,7 +377,7 @@ class RecurrentBackbone(Streaming):
 
 
 def in_slot(blocks: Blocks, slot: BlockSlot) -> list[object]:
-    """The block specs that sit in `slot`, in order."""
+    """Return the block specs of `slot`, in order."""
     return [block for block in blocks if getattr(block, "slot", None) is slot]
 
 

@@ -40,7 +40,7 @@ class CausalConv(Streaming):
             self.bias.uniform_(-bound, bound)
 
     def weight(self) -> Tensor:
-        """The folded kernel, ``(channels_out, channels_in, kernel)``."""
+        """Return the kernel with its weight norm, ``(channels_out, channels_in, kernel)``."""
         norm = self.direction.flatten(1).norm(dim=1)
         result: Tensor = self.direction * (self.gain / norm)[:, None, None]
         return result

@@ -11,7 +11,7 @@ BACKBONE = "backbone"
 
 @dataclass(frozen=True)
 class Decomposition:
-    """Which parameters belong to what.
+    """Assignment of the parameters to the parts of a network.
 
     Attributes:
         backbone: names of parameters by part of the backbone, from the input on; parts are the beginnings of names.
@@ -30,7 +30,7 @@ class Decomposition:
 
 
 def decompose(predictor: Predictor) -> Decomposition:
-    """The decomposition that the backbone declares (`BackboneSpec.parts`); parts without parameters are left out."""
+    """Return the parts declared by the backbone (`BackboneSpec.parts`); parts without parameters are omitted."""
     names = [name for name, _ in predictor.named_parameters()]
     parts = [f"{BACKBONE}.{part}" for part in predictor.spec.backbone.parts()] or [BACKBONE]
     names_by_part = {part: tuple(name for name in names if name.startswith(f"{part}.")) for part in parts}

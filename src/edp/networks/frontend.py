@@ -34,7 +34,7 @@ class _Span:
 
 
 def _spans(derived: Sequence[Derived], rate_hz: float) -> tuple[_Span, ...]:
-    """Derived channels by what they are means of, those without a span first."""
+    """Group derived channels by the kind and length of their mean, those without a mean first."""
     kinds = [(DERIVATIONS[entry.how].of_changes, entry.ticks(rate_hz)) for entry in derived]
     return tuple(
         _Span(*kind, tuple(number for number, other in enumerate(kinds) if other == kind))
@@ -43,7 +43,7 @@ def _spans(derived: Sequence[Derived], rate_hz: float) -> tuple[_Span, ...]:
 
 
 class FrontEnd(Streaming):
-    """Derived channels and scaling (eq. 3.1, 3.4, 3.5), with its numbers kept as buffers.
+    """Derived channels and scaling (eq. 3.1, 3.4, 3.5), with the parameters stored as buffers.
 
     Maps inputs ``(batch, time, input)`` in SI units to physical features ``(batch, time, feature)``; `scale` gives
     the standardised ones. State: the previous tick's inputs, whether there was one, and what the derived channels'
@@ -96,7 +96,7 @@ class FrontEnd(Streaming):
         return torch.cat(columns, dim=-1), (x[:, -1:], age, rings)
 
     def _derive(self, x: Tensor, change: Tensor, rings: tuple[State, ...]) -> tuple[list[Tensor], tuple[State, ...]]:
-        """Derived channels ``(batch, time, 1)`` each, in order, and what their means need next."""
+        """Return the derived channels, each ``(batch, time, 1)``, in order, and the next states of their means."""
         columns: dict[int, Tensor] = {}
         means, states, after = iter(self._means()), iter(rings), []
         for span in self.spans:
@@ -132,7 +132,7 @@ class FrontEnd(Streaming):
         return build.join("features", *parts)
 
     def _lower_derived(self, build: Builder, x: str) -> str:
-        """Derived channels, in order: differences, the means of these and of values, then gains."""
+        """Add the derived channels in order: differences, means of differences and values, then gains."""
         results: list[str] = []
         order: list[int] = []
         for number, span in enumerate(self.spans):
@@ -176,7 +176,7 @@ class TargetTransform(nn.Module):
         return features[..., self.present].unsqueeze(-2) if self.delta else 0.0
 
     def level(self, features: Tensor) -> Tensor:
-        """What standardised targets are counted from: present values in standard deviations; zero in absolute mode.
+        """Return the reference of standardised targets: present values in standard deviations; zero in absolute mode.
 
         Shape ``(batch, time, horizon, target)``; in absolute mode ``(batch, time, 1, 1)``.
         """

@@ -27,7 +27,7 @@ class HeadSpec(Protocol):
         ...
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
-        """Heads from a representation of `width` to `values` numbers for each output.
+        """Build heads from a representation of `width` to `values` elements per output.
 
         `mix` works on the hidden features of all outputs before the last layer.
         """
@@ -107,11 +107,11 @@ class LinearHead:
 
     @property
     def hidden(self) -> int:
-        """None: what a part sees that asks for the width of hidden features."""
+        """Return 1, since there are no hidden features."""
         return 1
 
     def conflicts(self, model: Any, task: Any) -> str | None:
-        """A block on the hidden features of outputs, of which there are none."""
+        """Return the conflict with a block on hidden features, which this head lacks."""
         if self.dead_band and model.output.values > 1:
             return "a dead band is one of predictions, and this output says more; take model.output = 'point'"
         mixing = [type(block).__name__ for block in model.blocks if getattr(block, "slot", None) == "mix"]
@@ -138,12 +138,12 @@ class OutputBand(nn.Module):
         self.register_buffer("width", torch.zeros(values, outputs))
 
     def forward(self, y: Tensor) -> Tensor:
-        """Of ``(..., value, output)``."""
+        """Apply the dead band to ``(..., value, output)``."""
         b = self.width
         return y - 2.0 * torch.clamp(y, -b, b) + torch.clamp(y, -2.0 * b, 2.0 * b)
 
     def lower(self, build: Builder, y: str) -> str:
-        """Add it to a graph, behind numbers of which values vary slowest; nothing where no width is above 0."""
+        """Add the dead band to a graph, with values varying slowest; nothing is added if all widths are 0."""
         b = self.width.flatten()
         if not bool(b.any()):
             return y
@@ -156,7 +156,7 @@ class OutputBand(nn.Module):
 
 @dataclass(frozen=True)
 class GatedUnit:
-    """A non-linearity behind a linear layer that is `factor` times as wide as what it gives."""
+    """Non-linearity after a linear layer that is `factor` times as wide as its output."""
 
     factor: int
     apply: Callable[[Tensor], Tensor]

@@ -1,4 +1,4 @@
-"""What a recurrent layer's state is after a reset: zero, a learned constant, or learned from the first ticks."""
+"""Initial states of recurrent layers after a reset: zero, a trained constant, or computed from the first samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class InitialSpec(Protocol):
     """Options of an initial state."""
 
     def build(self, recurrent: Streaming, width_in: int) -> Streaming:
-        """The recurrent layers with this initial state; they read ``(batch, time, width_in)``."""
+        """Build the recurrent layers with this initial state; they read ``(batch, time, width_in)``."""
         ...
 
 
@@ -32,7 +32,7 @@ class ZeroState:
     """The state is zero after a reset, as in the thesis."""
 
     def build(self, recurrent: Streaming, width_in: int) -> Streaming:
-        """The recurrent layers as they are."""
+        """Return the recurrent layers unchanged."""
         return recurrent
 
 
@@ -42,7 +42,7 @@ class ConstantState:
     """The state after a reset is a learned constant, the same for all streams."""
 
     def build(self, recurrent: Streaming, width_in: int) -> Streaming:
-        """The recurrent layers with a learned state at reset."""
+        """Build the recurrent layers with a trained state at reset."""
         return LearnedConstant(recurrent)
 
 
@@ -69,7 +69,7 @@ class PrefixState:
         check_bounds("initial prefix", self, ticks=integer(1, MOST_TICKS), hidden=integer(1, MOST_UNITS))
 
     def build(self, recurrent: Streaming, width_in: int) -> Streaming:
-        """The recurrent layers with a network that corrects their state."""
+        """Build the recurrent layers with a network that corrects their state."""
         return LearnedFromPrefix(recurrent, width_in, self.ticks, self.hidden)
 
 
@@ -133,7 +133,7 @@ class LearnedFromPrefix(Streaming):
         return torch.cat(rows, dim=1), state
 
     def _piece(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """A piece in which no prefix ends before the last tick."""
+        """Process a segment in which no prefix ends before the last sample."""
         inner, total, age = state
         y, inner = self.recurrent(x, inner)
         young = age < self.ticks
@@ -173,7 +173,7 @@ class LearnedFromPrefix(Streaming):
 
 
 def spread_over(state: State, rows: Tensor) -> State:
-    """The numbers ``(batch, number)`` in the shape of a state's tensors, one after the other."""
+    """Return the elements of ``(batch, number)`` in the shapes of the tensors of a state, in order."""
     at = 0
 
     def take(part: Tensor) -> Tensor:

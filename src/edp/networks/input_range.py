@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def usual_range(predictor: Predictor) -> tuple[Array, Array]:
-    """Middle and width of each input's usual range in SI units, each ``(input,)``, as the scaler tells them.
+    """Return middle and width of each input's usual range in SI units, each ``(input,)``, from the scaler.
 
     A channel that only a derived one reads has the width of that one's change; one that only a physics base reads has
     what is usual for it.

@@ -1,4 +1,4 @@
-"""A predictor that computes in W8A16: what a controller computes to the last bit, judged like any other."""
+"""Predictor in W8A16 arithmetic, equal to the controller's bit for bit; it is evaluated like any other predictor."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class IntegerPredictor(Predictor):
         self.eval()
 
     def in_float(self) -> Predictor:
-        """The network that it was made of, in single precision: to be counted or trained on."""
+        """Return the network in single precision from which it was quantised, for counting or further training."""
         offset, width = (part.double().numpy() for part in (self.front.offset, self.front.width))
         zero, unit = (part.double().numpy() for part in (self.code.offset, self.code.width))
         float_predictor = Predictor(self.task, self.spec, Scaler(offset, width, zero, unit))
@@ -75,7 +75,10 @@ class IntegerPredictor(Predictor):
         return self._sides(results, x), new
 
     def predict_with_intervals(self, x: Tensor, state: State) -> tuple[Tensor, Tensor | None, State]:
-        """What `predict` and `intervals` give, from one pass; None for the bounds of an output that has none."""
+        """Return the results of `predict` and `intervals` from one pass.
+
+        Bounds are None for outputs without intervals.
+        """
         results, new = self._run(x, state)
         bounds = self._sides(results, x) if self.output.coverages else None
         return self._shaped(results["prediction"], x), bounds, new
@@ -117,7 +120,7 @@ def integer_predictor(predictor: Predictor, series: Sequence[Series], ticks: int
 
 
 def spread(series: Sequence[Series], ticks: int) -> list[Series]:
-    """Some of the series, at even distances, of about so many ticks in all; at least one."""
+    """Return evenly spaced series with about `ticks` samples in total, at least one series."""
     # A stride over recordings keeps the mix of drives; the first recordings alone could be one kind of work.
     every = max(1, round(sum(part.samples for part in series) / ticks))
     return list(series[::every])

@@ -1,4 +1,4 @@
-"""Changes over several time spans: what an autoregressive model reads, as a stream."""
+"""Lag bank: changes over several time spans, the inputs of an autoregressive model, as a stream."""
 
 from __future__ import annotations
 
@@ -96,11 +96,14 @@ class LagBank(Streaming):
 
     @property
     def reach(self) -> int:
-        """Ticks that the oldest value which a column reads lies back."""
+        """Age in samples of the oldest value that a column reads."""
         return max(self.lags[-1], *(2 * span - 1 for span in self.smoothed), 1)
 
     def columns_over(self, span: int) -> list[int]:
-        """Columns of the present values and of their changes over one of `lags`, or of the former alone for span 0."""
+        """Return the columns of the present values and of their changes over one of `lags`.
+
+        Only present values for span 0.
+        """
         present = range(self.width)
         first = 0 if span == 0 else self.width * (1 + self.lags.index(span))
         return [*present, *(range(first, first + self.width) if span else ())]
@@ -136,7 +139,7 @@ class LagBank(Streaming):
         return columns, (x[:, -1:], torch.ones_like(age), tuple(new))
 
     def _smooths(self, span: int) -> int:
-        """Number of the change whose mean the change with the number `span` is."""
+        """Return the index of the change whose mean is the change with index `span`."""
         return self.lags.index(self.spans[span])
 
     def lower(self, build: Builder, x: str) -> str:

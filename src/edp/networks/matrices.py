@@ -1,4 +1,4 @@
-"""Weights of multiply-accumulates in a network: what compression, adapters and probes act on."""
+"""Weight matrices of the multiply-accumulates in a network, the subject of compression, adapters and probes."""
 
 from __future__ import annotations
 

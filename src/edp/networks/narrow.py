@@ -11,13 +11,13 @@ from edp.networks.predictor import ModelSpec
 
 
 def width_of(model: ModelSpec) -> int:
-    """The width by which a network is named: its recurrent units, or the channels of its first level."""
+    """Return the width that names a network: its recurrent units, or the channels of its first level."""
     units = getattr(model.backbone, "units", None)
     return int(units if units is not None else model.backbone.channels[0])  # type: ignore[attr-defined]
 
 
 def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpec:
-    """A network of the same parts, all widths scaled from those of `model` to `units`, with fewer convolution levels.
+    """Return a network of the same parts with all widths scaled to `units` and fewer convolution levels.
 
     The thesis's students (Table 4.9): half or a quarter of the teacher's units, channels and head width, and of three
     convolution levels the first two. A committee keeps one

@@ -1,4 +1,4 @@
-"""What a network says of each target: a point, quantiles, or a law of its error; and calibrated intervals from that."""
+"""Network outputs per target: a point, quantiles or an error distribution; and calibrated intervals."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class OutputSpec(Protocol):
         ...
 
     def build(self, horizons: int, outputs: int) -> Output:
-        """The output layer."""
+        """Build the output layer."""
         ...
 
 
@@ -54,7 +54,7 @@ MOST_PAIRS = 99
 
 
 class Output(nn.Module):
-    """Gives the heads' further numbers their meaning, and makes intervals of them; this one says a point only.
+    """Interpretation of the additional head outputs as intervals; this class has point predictions only.
 
     Args:
         coverages: of its intervals.
@@ -73,7 +73,7 @@ class Output(nn.Module):
             self.register_buffer("stretch", torch.ones(len(self.coverages), horizons, outputs))
 
     def answer(self, center: Tensor, raw: Tensor) -> Prediction:
-        """What the network says, from the prediction and the heads' further numbers ``(..., number, output)``."""
+        """Return the network output from the prediction and the additional head outputs ``(..., number, output)``."""
         return Prediction(center, raw)
 
     def reach(self, answer: Prediction, which: int) -> tuple[Tensor, Tensor]:
@@ -86,7 +86,7 @@ class Output(nn.Module):
         return answer.center - self.stretch[which] * below, answer.center + self.stretch[which] * above
 
     def lower(self, build: Builder, center: str, y: str) -> tuple[str, str] | None:
-        """Lower and upper bounds, ``coverage * horizon * output`` standardised numbers each; None for a point.
+        """Add lower and upper bounds, ``coverage * horizon * output`` standardised elements each; None for a point.
 
         Args:
             build: takes the layers.
@@ -106,16 +106,16 @@ class Output(nn.Module):
             return lower, build.combine("upper", BinaryOperation.ADD, centers, up)
 
     def lower_reach(self, build: Builder, y: str) -> tuple[str, str]:
-        """`reach` of all coverages as layers, ``coverage * horizon * output`` numbers below and above."""
+        """Add `reach` of all coverages as layers, ``coverage * horizon * output`` elements below and above."""
         raise ExportError(f"the output '{type(self).__name__}' has no form as a list of streaming layers")
 
     def rows(self, values: int, numbers: Sequence[int]) -> list[int]:
-        """Where the heads' `numbers` of `values` are, in the order ``number, horizon, output``."""
+        """Return the positions of `numbers` among `values` head outputs, in the order ``number, horizon, output``."""
         _, horizons, outputs = self.stretch.shape
         return [(h * values + v) * outputs + c for v in numbers for h in range(horizons) for c in range(outputs)]
 
     def place(self, coverage: float) -> int:
-        """Which interval has this coverage.
+        """Return the index of the interval with this coverage.
 
         Raises:
             ConfigError: none has.
@@ -129,7 +129,7 @@ class Output(nn.Module):
         raise ConfigError(f"there is no interval of coverage {typed(coverage)}; this network has {listed}")
 
     def calibrate(self, answer: Prediction, target: Tensor) -> None:
-        """Stretch each interval so that it holds its share of these targets (split conformal, multiplicative).
+        """Scale each interval so that it contains its fraction of these targets (split conformal, multiplicative).
 
         The factor is the ``(n + 1) c / n`` quantile of the error in units of the distance to the bound on its side.
 
@@ -162,11 +162,11 @@ class Point:
 
     @property
     def calibrated(self) -> bool:
-        """There is nothing to calibrate."""
+        """Return False, since a point has no intervals to calibrate."""
         return False
 
     def build(self, horizons: int, outputs: int) -> Output:
-        """A layer that passes the prediction on."""
+        """Build a layer that returns the prediction unchanged."""
         return Output((), horizons, outputs)
 
 
@@ -202,16 +202,16 @@ class Quantiles:
 
     @property
     def values(self) -> int:
-        """One number a level."""
+        """Number of raw outputs per target (one per quantile level)."""
         return len(self.levels)
 
     @property
     def coverages(self) -> tuple[float, ...]:
-        """Of each pair of mirrored levels."""
+        """Coverages of the pairs of mirrored levels."""
         return tuple(round(1.0 - 2.0 * level, 9) for level in self.levels if level < 0.5)
 
     def build(self, horizons: int, outputs: int) -> Output:
-        """A layer with ordered quantiles."""
+        """Build a layer with ordered quantiles."""
         return _Quantiles(self, horizons, outputs)
 
 
@@ -282,7 +282,7 @@ class Normal(_Law):
     """The mean and the variance of a normal law."""
 
     def build(self, horizons: int, outputs: int) -> Output:
-        """A layer with a bounded log variance."""
+        """Build a layer with a bounded log variance."""
         # The standard library's law, not a tensor's: sizes are asked for on a device without numbers, too.
         sizes = [NormalDist().inv_cdf((1.0 + c) / 2.0) for c in self.coverages]
         return _Spread("normal", self.coverages, sizes, (horizons, outputs))
@@ -291,10 +291,10 @@ class Normal(_Law):
 @OUTPUTS.register("laplace")
 @dataclass(frozen=True, kw_only=True)
 class Laplace(_Law):
-    """The mean and the variance of a Laplace law, whose tails are heavier than those of a normal one."""
+    """Mean and variance of a Laplace distribution, which has heavier tails than a normal distribution."""
 
     def build(self, horizons: int, outputs: int) -> Output:
-        """A layer with a bounded log variance."""
+        """Build a layer with a bounded log variance."""
         return _Spread(
             "laplace", self.coverages, [-math.log1p(-c) / math.sqrt(2.0) for c in self.coverages], (horizons, outputs)
         )

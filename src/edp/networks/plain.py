@@ -54,13 +54,13 @@ def unknown_parts(plain: Any) -> list[str]:
 
 
 def model_to_plain(spec: ModelSpec) -> Table:
-    """A network spec as JSON values; options that are None are left out."""
+    """Convert a network spec to JSON types; options that are None are omitted."""
     plain: Table = NETWORK.plain(spec)
     return plain
 
 
 def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
-    """A network spec from JSON values; one without ``physics`` has no physics base.
+    """Create a network spec from JSON types; without ``physics`` it has no physics base.
 
     Raises:
         BundleError: a value that this version does not understand.
@@ -73,13 +73,13 @@ def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
 
 
 def task_to_plain(task: Task) -> Table:
-    """A task as JSON values."""
+    """Convert a task to JSON types."""
     plain: Table = plain_tree(task)
     return plain
 
 
 def task_from_plain(plain: Mapping[str, Any]) -> Task:
-    """A task from JSON values.
+    """Create a task from JSON types.
 
     Raises:
         BundleError: a value that this version does not understand.

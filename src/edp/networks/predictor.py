@@ -112,7 +112,7 @@ class Predictor(Streaming):
         self.physics: PhysicsBase | None = spec.physics.build(task) if spec.physics is not None else None
 
     def _block(self, slot: BlockSlot, *sizes: object) -> Streaming | None:
-        """The block in a slot that takes one, built; None where there is none."""
+        """Build the block in a slot with a single block; None if the slot is empty."""
         slot_blocks = in_slot(self.spec.blocks, slot)
         return slot_blocks[0].build(*sizes) if slot_blocks else None  # type: ignore[attr-defined]
 
@@ -135,7 +135,7 @@ class Predictor(Streaming):
 
     @property
     def window(self) -> int:
-        """Ticks after a reset until a prediction rests on all that the network remembers."""
+        """Number of samples after a reset until a prediction uses the full memory of the network."""
         return self.spec.window
 
     @property
@@ -154,12 +154,12 @@ class Predictor(Streaming):
         return answer.center, new
 
     def run(self, x: Tensor, state: State) -> tuple[Prediction, Tensor, State]:
-        """What the network says, standardised; physical features ``(batch, time, feature)``; and the next state."""
+        """Return the standardised output, the physical features ``(batch, time, feature)``, and the next state."""
         answer, features, _, new = self.forward_features(x, state)
         return answer, features, new
 
     def forward_features(self, x: Tensor, state: State) -> tuple[Prediction, Tensor, Tensor, State]:
-        """As `run`, with the backbone's representation ``(batch, time, width)`` before the state."""
+        """Return the results of `run` with the backbone's representation ``(batch, time, width)`` before the state."""
         new: dict[str, State] = {}
         features, new["front"] = self.front(x, state["front"])
         scaled = self.front.scale(features)
@@ -194,7 +194,10 @@ class Predictor(Streaming):
         return self._bounds(answer, features), new
 
     def predict_with_intervals(self, x: Tensor, state: State) -> tuple[Tensor, Tensor | None, State]:
-        """What `predict` and `intervals` give, from one pass; None for the bounds of an output that has none."""
+        """Return the results of `predict` and `intervals` from one pass.
+
+        Bounds are None for outputs without intervals.
+        """
         answer, features, new = self.run(x, state)
         bounds = self._bounds(answer, features) if self.output.coverages else None
         return self.code.decode(answer.center, features), bounds, new
@@ -208,11 +211,11 @@ class Predictor(Streaming):
         return torch.stack(bounds, dim=2)
 
     def lower(self, build: Builder, x: str) -> str:
-        """Predictions in SI units, ``horizon * target`` numbers."""
+        """Add the predictions in SI units, ``horizon * target`` elements."""
         return self._lower(build, x)["prediction"]
 
     def graph(self) -> Graph:
-        """The network as a list of streaming layers with float32 constants, from SI inputs to SI predictions.
+        """Return the network as a graph of streaming layers with float32 constants, from SI inputs to SI predictions.
 
         Raises:
             ExportError: a part of it has no such form; it is named. Or it computes with other numbers than float32.
@@ -243,7 +246,7 @@ class Predictor(Streaming):
         return results
 
     def _lower_center(self, build: Builder, x: str, scaled: str, base: str | None, y: str) -> str:
-        """The standardised prediction, ``horizon * target``."""
+        """Add the standardised prediction, ``horizon * target``."""
         horizons, outputs, values = len(self.task.horizons), len(self.task.targets), self.spec.output.values
         # Of each horizon only the first value is the prediction; the others state its uncertainty.
         first = [(h * values) * outputs + c for h in range(horizons) for c in range(outputs)]
@@ -298,7 +301,7 @@ def _check_size(task: Task, spec: ModelSpec, scaler: Scaler) -> None:
 
 
 def build_model(task: Task, spec: ModelSpec, scaler: Scaler, seed: int) -> Predictor:
-    """A predictor with freshly drawn weights; the same seed gives the same weights."""
+    """Build a predictor with random initial weights; equal seeds give equal weights."""
     # The caller's generator stays as it is: building a network must not change what is drawn after it.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -314,7 +317,10 @@ def trainable(module: nn.Module) -> list[nn.Parameter]:
 
 
 def describe(spec: ModelSpec) -> str:
-    """A short label for tables, for example ``hybrid + temporal_difference``; plain heads, outputs are not named."""
+    """Return a short label for tables, for example ``hybrid + temporal_difference``.
+
+    Default heads and outputs are omitted.
+    """
     physics = [] if spec.physics is None else [f"{PHYSICS.name_of(spec.physics)} physics"]
     ends = [
         f"{registry.name_of(part)} {what}"

@@ -1,4 +1,4 @@
-"""Radial basis functions: how near what is seen now comes to typical situations of the training."""
+"""Radial basis functions: closeness of the present input to typical situations of the training data."""
 
 from __future__ import annotations
 

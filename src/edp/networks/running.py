@@ -34,7 +34,7 @@ def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: in
 
 
 def window_predictions(predictor: Predictor, series: Sequence[Series]) -> list[NDArray[np.float32]]:
-    """As `stream_predictions`, each prediction from reset over the window that ends at its tick (thesis 3.1.4).
+    """Return predictions, each from a reset over the window that ends at its sample (thesis 3.1.4).
 
     W times the work of a stream. The first ticks, which have no whole window, have what there is of it.
     """
@@ -76,7 +76,7 @@ def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int 
 def stream_answers(
     predictor: Predictor, series: Sequence[Series], batch: int = 16, windowed: bool = False
 ) -> list[Prediction]:
-    """All that the network says at every tick, standardised, with a batch of one; double precision, on the CPU.
+    """Return all standardised outputs at every sample, with a batch of one, in double precision on the CPU.
 
     Args:
         predictor: the network.
@@ -98,7 +98,7 @@ def stream_answers(
 
 
 def stream_hidden(predictor: Predictor, series: Sequence[Series], batch: int = 4) -> list[NDArray[np.float32]]:
-    """The backbone's representation at every tick of every series, float32 ``(time, width)``, each from reset."""
+    """Return the backbone's representation at every sample of each series, float32 ``(time, width)``, from a reset."""
 
     def run(x: Tensor, state: State) -> tuple[Tensor, State]:
         _, _, hidden, new = predictor.forward_features(x, state)
@@ -119,7 +119,9 @@ def streamed(
     batch: int = 16,
     groups: Sequence[Sequence[int]] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Number of each series and what `run` gives at every tick of it, ``(time, ...)``; shorter ones come first.
+    """Yield the index of each series and the results of `run` at every sample, ``(time, ...)``.
+
+    Shorter series come first.
 
     Args:
         predictor: the network, which is in the state of evaluation until the last series was given.
@@ -202,7 +204,7 @@ def _run_group(predictor: Predictor, run: Run, group: list[Series]) -> list[NDAr
 def _pieces(
     predictor: Predictor, run: Callable[[Tensor, State], tuple[A, State]], group: Sequence[Series]
 ) -> Iterator[tuple[int, A]]:
-    """First tick and what `run` gives of each piece of streams side by side; state is carried to the end."""
+    """Yield the first sample and the results of `run` for each segment of parallel streams, with carried state."""
     longest = max(part.samples for part in group)
     like = next(predictor.parameters())
     state = predictor.initial_state(len(group), like)
@@ -219,7 +221,7 @@ def _pieces(
 def answered_pieces(
     predictor: Predictor, series: Sequence[Series], batch: int = 16
 ) -> Iterator[tuple[int, int, Prediction, Tensor]]:
-    """What the network says of each series, piece by piece, so that hours of answers need not lie in memory.
+    """Yield the network output of each series segment by segment, so that long outputs need not fit into memory.
 
     Returns:
         number of the series, first tick of the piece, what is said of it and the features that it was said from

@@ -1,4 +1,4 @@
-"""How large a network will be, bounded from its options before it is built."""
+"""Upper bound on the size of a network, computed from its options before it is built."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NO_WIDTHS = (
 
 
 def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
-    """Parameters and numbers of state that a network of these options cannot exceed; quick, and up to ten times more.
+    """Return upper bounds of parameters and state elements of a network, at most ten times too large.
 
     Args:
         spec: a `ModelSpec`.

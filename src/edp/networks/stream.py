@@ -24,7 +24,7 @@ Inputs = Sequence[float] | NDArray[np.floating] | Tensor
 
 
 class StreamStatus(IntEnum):
-    """What a tick of a stream has done; the numbers are those of `edp_status` in the exported C."""
+    """Result code of a stream step, with the values of `edp_status` in the exported C."""
 
     OK = 0
     """A prediction from this tick's inputs."""
@@ -38,7 +38,7 @@ class StreamStatus(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class StreamTick:
-    """What one tick of a stream gives.
+    """Result of one stream step.
 
     Attributes:
         prediction: ``(horizon, target)``, float32, SI units. After `RESTARTED` the last valid one, as in C, where the
@@ -74,7 +74,7 @@ class StreamTick:
 
 
 class Stream:
-    """A predictor run tick by tick, as on the machine: one row of SI inputs in; predictions, intervals and flags out.
+    """Predictor run sample by sample, as on the machine: one row of SI inputs gives predictions, intervals and flags.
 
     The rules are those of the exported C (docs/export.md): inputs with a NaN, an infinite value or one beyond a
     million standard widths are rejected as a whole, counted, and the tick is held: the last accepted inputs are fed
@@ -135,7 +135,7 @@ class Stream:
         return self._tick(self._hold())
 
     def accepts(self, rows: NDArray[np.floating]) -> bool:
-        """Whether none of the inputs in SI units would be rejected; shape (input,) or (ticks, input)."""
+        """Return whether all inputs in SI units are accepted; shape (input,) or (ticks, input)."""
         # A value beyond float32 becomes infinite, and is rejected as such; a comparison with NaN is false.
         with np.errstate(over="ignore"):
             single = rows.astype(np.float32)
@@ -143,7 +143,7 @@ class Stream:
         return bool(inside.all())
 
     def steps(self, inputs: NDArray[np.floating]) -> list[StreamTick]:
-        """Feed ticks that follow each other, ``(ticks, input)``: what `step` gives for each, but for rounding.
+        """Process consecutive samples, ``(ticks, input)``, with the results of `step` for each, up to rounding.
 
         Where all are accepted it is one call of the network, which costs little more than one tick.
 
@@ -167,7 +167,7 @@ class Stream:
         return ticks
 
     def missed(self, ticks: int = 1) -> StreamTick:
-        """Tell that ticks went by without a step; the result is that of the last of them.
+        """Report samples that passed without a step; returns the result of the last of them.
 
         A gap that ends in a restart leaves the prediction as it was before the gap.
 
@@ -237,7 +237,7 @@ class Stream:
         return numbers
 
     def _hold(self) -> StreamStatus:
-        """A tick without inputs of its own."""
+        """Process a sample without new inputs."""
         # A stream without a tick since its reset has nothing to hold.
         if self._age > 0 and self._holding < HOLD_TICKS:
             self._holding += 1
@@ -258,7 +258,7 @@ class Stream:
 
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
-    """PyTorch's threads for what is computed here; those of the caller come back."""
+    """Set PyTorch's number of threads inside the block, and restore the caller's afterwards."""
     before = torch.get_num_threads()
     # Setting the thread count costs a call into the thread pool at every tick; equal counts skip it.
     if before == count:

@@ -20,7 +20,7 @@ State = Any
 
 @dataclass(frozen=True)
 class Cost:
-    """What one part costs, counted analytically.
+    """Analytical cost of one part.
 
     Attributes:
         part: name of the layer.
@@ -49,7 +49,7 @@ class Cost:
 
 
 class Operation(StrEnum):
-    """Primitive operations that networks are made of: what an export target must be able to compute.
+    """Primitive operations of networks, which an export target must support.
 
     Moving numbers (concatenation, slices, ring buffers) and element-wise arithmetic (sums, products, quotients,
     choice by a mask) are understood and not listed.
@@ -179,7 +179,7 @@ def operations_of(module: nn.Module) -> frozenset[Operation]:
 
 
 def parameters_of(module: nn.Module) -> int:
-    """Number of trainable numbers in a module."""
+    """Return the number of trainable parameters of a module."""
     return sum(parameter.numel() for parameter in module.parameters())
 
 
@@ -193,12 +193,12 @@ def map_state(change: Callable[..., Tensor], state: State, *others: State) -> St
 
 
 def detach_state(state: State) -> State:
-    """The same state, cut off from the graph that made it."""
+    """Return the state detached from the autograd graph."""
     return map_state(lambda tensor: tensor.detach(), state)
 
 
 def reset_where(reset: Tensor, initial: State, state: State) -> State:
-    """The initial state for streams where `reset` (batch,) is true, the given state elsewhere."""
+    """Return the initial state for streams where `reset` (batch,) is true, the given state elsewhere."""
 
     def choose(fresh: Tensor, old: Tensor) -> Tensor:
         mask = reset.reshape(-1, *([1] * (old.ndim - 1)))
@@ -208,7 +208,7 @@ def reset_where(reset: Tensor, initial: State, state: State) -> State:
 
 
 def state_numbers(state: State) -> int:
-    """How many numbers a state holds."""
+    """Return the number of elements of a state."""
     if isinstance(state, Tensor):
         return state.numel()
     values = state.values() if isinstance(state, dict) else state

@@ -43,7 +43,7 @@ class StreamingTrailingMean(Streaming):
 
 
 def _sums(history: Tensor, window: int) -> Tensor:
-    """Sums over every `window` neighbouring rows of ``(batch, time, width)``.
+    """Return the sums over every `window` neighbouring rows of ``(batch, time, width)``.
 
     Sums of 1, 2, 4, ... rows are made by doubling, and those that `window` consists of are added up: every sum takes
     the same additions wherever a stream is cut into chunks, and nothing is ever subtracted.

@@ -101,7 +101,7 @@ class Trees(Streaming):
         return build.add(ir.TreeSums, "sums", x, **tables)
 
     def costs(self) -> list[Cost]:
-        """Comparisons only: no multiply-accumulates, and no numbers that are trained."""
+        """Return the costs: comparisons only, without multiply-accumulates and trained parameters."""
         return [
             Cost(
                 f"{self.trees} trees of depth {self.depth} for each of {self.outputs} outputs",
@@ -119,7 +119,7 @@ def _check_loaded(module: Any, incompatible_keys: object) -> None:
 
 
 def _check(trees: Trees, tables: dict[str, Tensor]) -> None:
-    """Refuse tables that are not those of these trees.
+    """Raise an error for tables that do not match these trees.
 
     Raises:
         ValueError: says which and why.

@@ -1,4 +1,4 @@
-"""Processes that read one log each and may do nothing else: what a hostile file does to its library stays there."""
+"""Sandboxed processes that read one log each, so that a hostile file can only harm its own reader."""
 
 from edp.sandbox.layers import SandboxWarning, require_layers
 from edp.sandbox.lockdown import lock_down

@@ -67,7 +67,7 @@ class Allowance:
         limits.listen(self.announce)
 
     def announce(self, memory: int, work: int, parts: int) -> None:
-        """What checked headers promise; see `edp.storage.memory.announce`."""
+        """Raise the limits to the sizes found in checked headers; see `edp.storage.memory.announce`."""
         self.work_s += work / WORK_PER_S + parts * PART_S
         if memory > self.memory:
             self.memory = memory
@@ -81,7 +81,7 @@ class Allowance:
 
     @contextlib.contextmanager
     def running(self, seconds: float) -> Iterator[list[float]]:
-        """Limit the time of what runs inside; what is left of it is found in the list afterwards."""
+        """Limit the run time of the block; the remaining time is in the list afterwards."""
         left = [seconds]
         # Windows: neither timers nor forks.
         if not hasattr(signal, "setitimer"):
@@ -106,7 +106,7 @@ class Allowance:
                     signal.setitimer(timer, min(left + times * more, WALL * MOST_S))
 
     def _limit_memory(self) -> None:
-        """Set the soft limits; the hard ones stay at what the machine has, so that headers may still raise these."""
+        """Set the soft limits. Hard limits stay at the machine's capacity; later headers may raise the soft ones."""
         if resource is None:
             return
         with contextlib.suppress(OSError, ValueError):
@@ -131,7 +131,7 @@ class Allowance:
             resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
     def exhausted(self) -> DataError:
-        """What to say where memory ran out: of the machine, or of what a file of this size may take."""
+        """Return the error for exhausted memory: of the machine, or of the allowance for a file of this size."""
         if self.bound + self.memory >= self.free:
             return DataError(
                 f"'{self.path}': reading it takes more memory than this machine has free ({gigabytes(self.free)} may "

@@ -1,4 +1,4 @@
-"""The layer that every system has: Python itself refuses what a reader of logs never needs.
+"""Audit hook, the layer available on every system: Python itself refuses operations that a reader of logs never needs.
 
 It sees what Python code does, not what a compiled library does by itself; for that there are `edp.sandbox.landlock`
 and `edp.sandbox.syscalls`.
@@ -42,7 +42,7 @@ def restrict(readable: Iterable[Path]) -> None:
 
 
 def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
-    """What is called with every event; raises PermissionError for those refused."""
+    """Return an audit hook that raises PermissionError for refused events."""
     # Real paths: a link below an allowed folder must not lead out of it.
     places = tuple(os.path.realpath(path) for path in readable)
     # With the separator at the end, or /lib would allow /library as well.
@@ -66,7 +66,7 @@ def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
 
 
 def _plain(path: str) -> list[str]:
-    """The paths that a name may stand for: a URI of SQLite is written with escapes by some and without by others."""
+    """Return the paths that a name may denote: SQLite URIs occur with and without escapes."""
     if not path.startswith("file:"):
         return [path]
     name = path.removeprefix("file:").partition("?")[0]

@@ -59,7 +59,7 @@ class Helpers:
     def ordered(
         self, function: Callable[[Job], Result], jobs: Sequence[Job], waiting: Callable[[], None] | None = None
     ) -> Iterator[Result]:
-        """`function` of each job, in the order of the jobs.
+        """Yield the result of `function` for each job, in the order of the jobs.
 
         Args:
             function: that a process can import.

@@ -1,4 +1,4 @@
-"""What a process may no longer do once it reads a log, and which layer sees to it.
+"""Restrictions of a process that reads a log, and the layers that enforce them.
 
 * **File rules** (`edp.sandbox.landlock`, Linux 5.13): opens nothing for writing and, for reading, only the log and the
   folders of Python and its libraries; from 6.7 no TCP, from 6.12 no signals to other processes. Where Landlock is
@@ -42,7 +42,7 @@ _folders: list[Path] = []
 
 
 def note_libraries() -> None:
-    """Look for the folders of the standard library, of installed libraries, and of the packages imported so far.
+    """Find the folders of the standard library, of installed libraries and of the packages imported so far.
 
     A worker does so before it forks, whenever it has imported something.
     """

@@ -1,4 +1,4 @@
-"""Processes that help another one: none of them outlives it, however it ends."""
+"""Helper processes that end with their parent, in whatever way it ends."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _watch(parent: int) -> None:
 
 
 def begin_helper(parent: int) -> None:
-    """What a process of a pool does first: it ends with its parent, and leaves Ctrl-C to it.
+    """Initialise a pool process: it ends with its parent and leaves Ctrl-C to it.
 
     Args:
         parent: id of the parent process, which ends its helpers itself when it is interrupted.

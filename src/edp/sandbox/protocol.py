@@ -1,4 +1,4 @@
-"""What the two sides say to each other: eight bytes of length, JSON, then the numbers of each array.
+"""Message protocol: eight bytes of length, JSON, then the data of each array.
 
 Nothing that arrives is evaluated or unpickled. The receiving side states how many bytes of numbers it awaits; JSON and
 arrays beyond their bounds, and arrays of anything but plain numbers, are refused before memory is taken for them.
@@ -29,7 +29,7 @@ Write = Callable[[Any], None]
 
 
 def is_plain(array: NDArray[Any]) -> bool:
-    """Whether an array can be sent: one dimension, numbers of at most eight bytes."""
+    """Return whether an array can be sent: one dimension, numbers of at most eight bytes."""
     return array.ndim == 1 and _NUMBERS.fullmatch(array.dtype.str) is not None
 
 
@@ -46,7 +46,7 @@ def send(write: Write, header: Header, arrays: Sequence[NDArray[Any]] = ()) -> N
 
 
 def packed(header: Header, arrays: Sequence[NDArray[Any]] = ()) -> bytes:
-    """The bytes of a message before its arrays.
+    """Encode a message without its arrays.
 
     Raises:
         ValueError: more than `HEADER_BYTES`.
@@ -59,7 +59,7 @@ def packed(header: Header, arrays: Sequence[NDArray[Any]] = ()) -> bytes:
 
 
 def receive(read_into: ReadInto, most: int = 0) -> tuple[Header, list[NDArray[Any]]]:
-    """A message.
+    """Receive one message.
 
     Args:
         read_into: fills a buffer; raises EOFError where the other side is gone.
@@ -92,7 +92,7 @@ def receive(read_into: ReadInto, most: int = 0) -> tuple[Header, list[NDArray[An
 
 
 def _arrays(announced: Any, most: int) -> list[NDArray[Any]]:
-    """Room for what is announced, once all of it is known to be within bounds."""
+    """Allocate the announced arrays after checking that all of them are within bounds."""
     kinds: list[tuple[np.dtype[Any], int]] = []
     try:
         for kind, count in announced:
@@ -110,7 +110,7 @@ def _arrays(announced: Any, most: int) -> list[NDArray[Any]]:
 
 
 def reader(handle: int) -> ReadInto:
-    """Fills buffers from a pipe."""
+    """Return a function that fills buffers from a pipe."""
     if hasattr(os, "readv"):
 
         def read_into(view: memoryview) -> None:
@@ -133,7 +133,7 @@ def reader(handle: int) -> ReadInto:
 
 
 def writer(handle: int) -> Write:
-    """Writes all of a buffer to a pipe."""
+    """Return a function that writes a whole buffer to a pipe."""
 
     def write(data: Any) -> None:
         view = memoryview(data)

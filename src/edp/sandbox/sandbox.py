@@ -1,4 +1,4 @@
-"""The side that asks: one worker is kept, from which a process is forked for each log that is opened."""
+"""Client side of the sandbox: one worker process, from which a process is forked for each opened log."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def watch(watcher: Watcher | None) -> None:
 
 
 def end() -> None:
-    """End the workers, if there are any; the next log starts another. What was opened before can be read no more."""
+    """End the workers, if there are any. The next log starts a new worker; logs that are open can no longer be read."""
     with _lock:
         for name in list(_workers):
             _drop(name)
@@ -175,7 +175,7 @@ class _Worker:
         return WorkerConnection(requests, answers, path, lambda: self.ended(number))
 
     def ended(self, number: int) -> tuple[int | None, str]:
-        """How a forked process ended: its exit code, negative for a signal, and what the worker said."""
+        """Return the exit code of a forked process, negative for a signal, and the output of the worker."""
         with _lock:
             try:
                 self.orders.sendall(json.dumps({"ended": number}).encode() + b"\n")
@@ -191,7 +191,7 @@ class _Worker:
             return code, "" if code is not None else self.said()
 
     def last_words(self) -> tuple[int, str]:
-        """The exit code of a worker that is gone, and what it printed."""
+        """Return the exit code of a worker that has ended, and its output."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(_END_S)
         return 1, self.said() or f"the worker ended with exit code {self.process.returncode}"
@@ -214,7 +214,7 @@ class _Worker:
 
 
 def _alone(worker: str, path: Path) -> WorkerConnection:
-    """Where processes cannot be forked: a worker for this one log."""
+    """Start a worker for this log only, on systems without fork."""
     output = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
     process = _start(worker, ("--alone",), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=output)
     if process.stdin is None or process.stdout is None:
@@ -241,7 +241,7 @@ def _reap(process: subprocess.Popen[bytes], output: Any) -> None:
 
 
 class WorkerConnection:
-    """The pipes to the process that serves one log; closed when it is no longer referred to."""
+    """Pipes to the process that serves one log; closed when unreferenced."""
 
     def __init__(self, requests: int, answers: int, path: Path, ended: Callable[[], tuple[int | None, str]]) -> None:
         self.path = path
@@ -264,7 +264,7 @@ class WorkerConnection:
         self._close()
 
     def forget(self) -> None:
-        """In a fork: close what is shared with the process that opened the log."""
+        """Close everything shared with the process that opened the log; called in a fork."""
         self.close("it was opened before this process was forked; open it again")
 
     def send(self, header: Header) -> None:
@@ -285,7 +285,7 @@ class WorkerConnection:
             raise
 
     def receive(self, most: int = 0) -> tuple[Header, list[NDArray[Any]]]:
-        """An answer with at most `most` bytes of numbers.
+        """Receive a response with at most `most` bytes of array data.
 
         Raises:
             DataError: the process is gone, or answers what it may not.
@@ -312,7 +312,7 @@ class WorkerConnection:
             raise DataError(f"'{self.path}' cannot be read: {self.gone}")
 
     def _wait(self, watcher: Watcher) -> None:
-        """Until an answer comes, tell who watches."""
+        """Call the watcher until a response arrives."""
         if not hasattr(select, "poll"):
             return
         poll = select.poll()
@@ -326,7 +326,7 @@ class WorkerConnection:
                 watcher(self.path, now - self.started, self.size)
 
     def lost(self) -> DataError:
-        """What to say about a process that ended."""
+        """Return the error for a process that ended."""
         code, last_words = self._ended()
         error = DataError(_died(self.path, code, last_words))
         self.close("reading it failed before; open it again")

@@ -1,4 +1,4 @@
-"""The process from which readers are forked: libraries are imported once, and each log is read in a fork of its own.
+"""Process from which readers are forked: libraries are imported once, and each log is read in its own fork.
 
 It is a fresh interpreter with a single thread, so forking is safe here, which it is not in a process that trains. It
 never touches a log itself. Orders come as lines of JSON through a socket, each with the ends of two pipes between the
@@ -39,7 +39,7 @@ Serve = Callable[[int, int], None]
 
 @dataclass
 class _Forks:
-    """The forks that run, and how those ended that nobody asked about yet."""
+    """Running forks, and exit codes that were not requested yet."""
 
     pids: dict[int, int] = field(default_factory=dict)
     pipes: dict[int, int] = field(default_factory=dict)
@@ -63,7 +63,7 @@ class _Forks:
         return self.pipes.pop(number)
 
     def code(self, number: int) -> int | None:
-        """How a fork ended whose pipes are closed; None for one that never ran."""
+        """Return the exit code of a fork whose pipes are closed; None for a fork that never ran."""
         if number in self.pids:
             pid, until = self.pids[number], time.monotonic() + END_S
             ended_pid, status = os.waitpid(pid, os.WNOHANG)
@@ -79,7 +79,7 @@ class _Forks:
 
 
 def main(serve: Serve) -> None:
-    """Take orders from the socket that is standard input until it is closed, or nothing comes for long."""
+    """Execute orders from the socket on standard input until it closes or stays idle for long."""
     if "--alone" in sys.argv:
         requests, answers = os.dup(0), os.dup(1)
         # What libraries print must not get into the answers.
@@ -133,7 +133,7 @@ def main(serve: Serve) -> None:
 
 
 def _obey(orders: socket.socket, forks: _Forks, serve: Serve, inherited: list[int], poll: select.poll) -> bool:
-    """Take one order; False where none comes any more."""
+    """Execute one order; return False if there are no more."""
     line, handles = _order(orders)
     if not line:
         return False
@@ -188,7 +188,7 @@ def _order(orders: socket.socket) -> tuple[bytes, list[int]]:
 
 
 def _serve(serve: Serve, pipes: tuple[int, int], inherited: list[int], worker: int) -> None:
-    """In the fork: serve one log and end, whatever happens."""
+    """Serve one log in the fork, then end the process in every case."""
     code = 1
     try:
         die_with_parent(worker)

@@ -1,1 +1,1 @@
-"""The machinery of settings: TOML to dataclasses and back, overrides, and ranges of numbers."""
+"""Settings: convert TOML to dataclasses and back, apply overrides, check ranges."""

@@ -1,4 +1,4 @@
-"""Ranges of settings: every number of a spec has both ends stated, and what lies outside is one error with its name."""
+"""Ranges of settings: every number has a lower and an upper bound; a violation is one error that names the setting."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Bound:
         return bool(over and under)
 
     def rule(self, name: str) -> str:
-        """The rule as a message says it."""
+        """Return the bound as an inequality for error messages."""
         first, second = "<" if self.above else "<=", "<" if self.below else "<="
         kind = "integers, " if self.integer else ""
         return f"{kind}{self.low:,.12g} {first} {name} {second} {self.high:,.12g}"
@@ -119,7 +119,7 @@ WEIGHT = above(0.0, MOST_WEIGHT)
 
 
 def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
-    """Refuse numbers of a spec that lie outside their bounds; None is no number and passes.
+    """Raise ConfigError if numbers of a settings object are outside their bounds. None passes.
 
     Args:
         what: how messages call the spec.
@@ -150,7 +150,7 @@ def check_count(what: str, name: str, entries: Sequence[object], most: int, leas
 
 
 def shown(value: Any) -> str:
-    """A value as a message repeats it: long ones cut, numbers of thousands of digits by their length."""
+    """Return a value as text for error messages: long values are cut, huge integers become their number of digits."""
     # str() of an integer of thousands of digits takes quadratic time, and Python refuses it.
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * MOST_SHOWN:
         return f"a number of about {round(value.bit_length() * 0.30103):,} digits"

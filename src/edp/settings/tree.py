@@ -48,7 +48,7 @@ MOST_LISTED, MOST_KEY = 50, 100
 
 
 def read_toml(path: str | Path) -> Table:
-    """A settings file.
+    """Read a settings file.
 
     Raises:
         ConfigError: it cannot be read, is beyond the bounds of `edp.storage.read_toml`, or is not TOML.
@@ -57,7 +57,7 @@ def read_toml(path: str | Path) -> Table:
 
 
 def parse_toml(text: str, where: str) -> Table:
-    """Settings from a text, which messages call `where`.
+    """Parse settings from a text; error messages call the text `where`.
 
     Raises:
         ConfigError: it is beyond the bounds of `edp.storage.parse_toml`, or is not TOML.
@@ -66,7 +66,7 @@ def parse_toml(text: str, where: str) -> Table:
 
 
 def merged(base: Table, change: Mapping[str, Any]) -> Table:
-    """`base` with `change` laid over it; a table of another kind replaces the old one whole.
+    """Return `base` updated recursively with `change`. A table of another kind replaces the old table as a whole.
 
     A table that names no kind has options of whichever kind is named later.
     """
@@ -83,7 +83,9 @@ def merged(base: Table, change: Mapping[str, Any]) -> Table:
 
 
 def override(change: Change) -> Table:
-    """The table that one ``key.path=value`` stands for; a value that is no TOML is a string. A table stands for itself.
+    """Parse ``key.path=value`` into a table.
+
+    A value that is not valid TOML becomes a string. A table is returned unchanged.
 
     Raises:
         ConfigError: not of this form.
@@ -157,7 +159,7 @@ class SettingsTree:
         return {name: self.plain(value, name) for name, value in values.items() if value is not None}
 
     def build(self, cls: type[T], table: Mapping[str, Any], where: str, path: str = "") -> T:
-        """A spec tree from a table; what the table leaves out has its default.
+        """Build a settings object from a table; missing keys take their defaults.
 
         Args:
             cls: dataclass of the tree's root.
@@ -185,7 +187,7 @@ class SettingsTree:
         of: str,
         options: Table | None = None,
     ) -> T:
-        """A spec tree from a settings file, changed by options of a command, then by overrides.
+        """Load a settings object from a file, then apply command options, then overrides.
 
         Args:
             cls: dataclass of the tree's root.
@@ -206,7 +208,10 @@ class SettingsTree:
     def _build(
         self, cls: type, table: Any, path: str, problems: list[str], beside: Mapping[str, type] | None = None
     ) -> Any:
-        """A spec of a class; `beside` are the parts that a ``kind`` could have named in its place."""
+        """Build one settings object.
+
+        `beside` are the other parts that ``kind`` could select, named in error messages.
+        """
         if not isinstance(table, Mapping):
             problems.append(f"{path}: expected a table, got {shown(table)}")
             return None
@@ -257,7 +262,7 @@ class SettingsTree:
         return _scalar(hint, value, path, problems)
 
     def _row(self, hint: Any, values: list[Any] | tuple[Any, ...], path: str, problems: list[str]) -> Any:
-        """A list of fixed length; each entry is checked by itself, so that messages name the one that is wrong."""
+        """Check and convert a list of fixed length, entry by entry, so that messages name the wrong entry."""
         hints = typing.get_args(hint)
         labels = self.positions.get(hint, tuple(map(str, range(len(hints)))))
         if len(values) != len(hints):
@@ -288,7 +293,7 @@ class SettingsTree:
 
 
 def _kinds_with(key: Any, parts: Mapping[str, type]) -> str:
-    """For the message on a key that is unknown, which kinds of the part have it; empty where none has."""
+    """Return a hint for the message on an unknown key: the kinds that have the key; empty if no kind has it."""
     kinds = [f"'{name}'" for name, part in parts.items() if key in _settings_of(part)]
     return f"; it belongs to kind = {' or '.join(kinds)}" if kinds else ""
 
@@ -303,7 +308,6 @@ class _Setting(typing.NamedTuple):
 # A search builds thousands of experiments, and reading their types each time took nine tenths of the time.
 @cache
 def _settings_of(cls: type) -> Mapping[str, _Setting]:
-    """The fields of a spec by name, in their order."""
     hints = typing.get_type_hints(cls)
     return {
         entry.name: _Setting(hints[entry.name], entry.default is MISSING and entry.default_factory is MISSING)
@@ -312,7 +316,7 @@ def _settings_of(cls: type) -> Mapping[str, _Setting]:
 
 
 class _Form(typing.NamedTuple):
-    """What a type allows beside plain values.
+    """Structure of a type hint: sequence, nested table or plain value.
 
     Attributes:
         sequence: it is a tuple; `endless`: of any length.
@@ -361,13 +365,12 @@ def _adapter(hint: Any) -> pydantic.TypeAdapter[Any]:
 
 @cache
 def _leaves(hint: Any) -> frozenset[Any]:
-    """The types that a hint is made of."""
     inner = typing.get_args(hint)
     return frozenset().union(*map(_leaves, inner)) if inner else frozenset((hint,))
 
 
 def _scalar(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
-    """A value, or a list of any length, by pydantic; what it would coerce without a word is refused first."""
+    """Check and convert a value or a nested list with pydantic; refuse silent coercions first."""
     leaves = _leaves(hint)
     # pydantic takes true for 1 and "3" for 3: a typing error would become a setting.
     if _truth_in(value) and not leaves & {bool, Any}:
@@ -395,14 +398,14 @@ def _text_in(value: Any) -> bool:
 
 
 def _truth_in(value: Any) -> bool:
-    """Whether a value is or holds true or false, which Python counts as numbers."""
+    """Return whether a value is or contains a boolean, which Python also accepts as a number."""
     if isinstance(value, Mapping):
         return any(map(_truth_in, value.values()))
     return any(map(_truth_in, value)) if isinstance(value, list | tuple) else isinstance(value, bool)
 
 
 def _key(name: str) -> str:
-    """A key or name as messages repeat it."""
+    """Return a key or name, shortened for messages."""
     return name if len(name) <= MOST_KEY else f"{name[:MOST_KEY]}..."
 
 

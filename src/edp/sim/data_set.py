@@ -1,4 +1,4 @@
-"""Simulated data sets on disk: what is asked for, room for it, and writing it so that it can go on."""
+"""Simulated data sets on disk: settings, disk space check, and resumable writing."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class SimulationOrder(DataSetSpec):
         overrides: Sequence[str] = (),
         **changes: Any,
     ) -> SimulationOrder:
-        """The order of a scenario file, or the default one; overrides and `changes` replace its values.
+        """Create the order of a scenario file, or the default one; overrides and `changes` replace its values.
 
         Overrides are ``key.path=value`` in the keys of the file; `changes` that are not None go before them.
 
@@ -96,7 +96,7 @@ class SimulationOrder(DataSetSpec):
         return order
 
     def files(self) -> WriteOptions:
-        """How the logs are written.
+        """Return the write options of the logs.
 
         Raises:
             EdpError: an ending without a format, an unknown layout, or one of another format.
@@ -119,7 +119,7 @@ def _flat(values: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
 
 
 def _leave_out(values: dict[str, Any], changes: dict[str, Any]) -> Iterator[str]:
-    """Take out of a file's `values` what those given make void; says what, and why."""
+    """Remove values of a file that the given ones make invalid; yields a message for each."""
     suffix = changes.get("suffix", ".mat")
     if suffix != ".mat" and values.get("layout") and "layout" not in changes:
         yield f"layout '{values.pop('layout')}' is one of MAT files, and format {suffix[1:]} was asked for"
@@ -136,7 +136,7 @@ def suffix_of(form: str) -> str:
 
 
 class Simulated(Protocol):
-    """What is told of a recording that is there: itself, or what it was simulated from."""
+    """Description of a finished recording, or of the scenario of a skipped one."""
 
     @property
     def name(self) -> str:
@@ -160,7 +160,7 @@ def simulate_data_set(
     on_done: Callable[[Simulated, bool], None] | None = None,
     elsewhere: Elsewhere | None = None,
 ) -> list[Path]:
-    """Simulate a data set into a folder, a log each; logs already there from the same order are kept.
+    """Simulate a data set into a folder, one log per recording. Existing logs of the same order are kept.
 
     Args:
         out: folder; it may hold nothing but an earlier part of the same data set.
@@ -213,7 +213,7 @@ def simulate_data_set(
 
 
 def _bound(folder: Path, identity: dict[str, Any]) -> bool:
-    """Whether a folder is bound to an order; False where it is bound to none."""
+    """Return whether a folder belongs to this order; False if it belongs to none."""
     manifest = folder / MANIFEST
     if not is_entry_at(manifest):
         return False
@@ -249,7 +249,7 @@ def find_data_set_limit(
     workers: int = 0,
     on_done: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """The limit of predictability of a simulated data set, written beside its logs as ``limit.json``.
+    """Estimate the predictability limit of a simulated data set, and write it to ``limit.json`` next to its logs.
 
     A limit that is there already from the same order and settings is kept.
 
@@ -291,7 +291,7 @@ def _digest(value: Any) -> str:
 
 
 def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, Any]:
-    """What makes two simulated data sets the same, as JSON gives it back."""
+    """Return the identity of a simulated data set in JSON types."""
     identity: dict[str, Any] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
     # Only what departs from the usual: folders without these options keep their identity.
     if files != WriteOptions():

@@ -50,7 +50,7 @@ AIR = "air"
 
 @dataclass(frozen=True, kw_only=True)
 class DataSetSpec:
-    """A data set to simulate: the same one gives the same bits, whatever the number of workers.
+    """Data set to simulate; equal settings give equal bits, for any number of workers.
 
     Attributes:
         machine: name of a machine, or path of a machine file.
@@ -143,7 +143,7 @@ class DataSetSpec:
         return over_family(plan, self.family, self.seed, self.masses, self.scatter) if self.family else plan
 
     def _soils(self, excitations: Sequence[str]) -> list[str]:
-        """The material of each recording; empty for free air. Each family gets all of them in turn."""
+        """Return the material of each recording; empty for free air. Each family gets all materials in turn."""
         soils = [""] * len(excitations)
         places = [i for i in _by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
         if self.materials:
@@ -153,7 +153,7 @@ class DataSetSpec:
 
 
 def _by_family(excitations: Sequence[str]) -> list[int]:
-    """Places of the recordings, those of one family after another."""
+    """Return the recording indices sorted by family."""
     return sorted(range(len(excitations)), key=lambda i: excitations[i])
 
 
@@ -173,7 +173,7 @@ def plan_data_set(
     mix: Mapping[str, float] | None = None,
     materials: Mapping[str, float] | None = None,
 ) -> tuple[Scenario, ...]:
-    """The scenarios of a `DataSetSpec`.
+    """Return the scenarios of a `DataSetSpec`.
 
     Raises:
         ConfigError: a count or length is not positive, or mix or materials name what is unknown.
@@ -192,7 +192,7 @@ def over_family(
     masses: tuple[float, float] = MASSES_T,
     scatter: float = 1.0,
 ) -> tuple[Scenario, ...]:
-    """The same scenarios on `count` machines of other sizes, which take turns in each excitation; see `machine_family`.
+    """Distribute the scenarios over `count` machines of other sizes, in turn per excitation; see `machine_family`.
 
     Raises:
         ConfigError: the count is not positive.
@@ -212,7 +212,7 @@ def _named(name: str, machine: str) -> str:
 
 
 def hand_out(shares: Mapping[str, float], count: int) -> list[str]:
-    """`count` names in proportion to `shares`, mixed so that the first ones of them are in proportion as well.
+    """Return `count` names in proportion to `shares`, mixed so that any leading part is in proportion, too.
 
     Each has its turn once, the largest share first, and then the one that is farthest behind, by Webster's method.
     """
@@ -242,7 +242,7 @@ def simulate_many(
 
 
 def ordered(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """`function` of each job in `workers` processes, in the order of the jobs.
+    """Yield the result of `function` for each job, computed in `workers` processes, in the order of the jobs.
 
     Raises:
         SimulationError: a worker process died.

@@ -43,7 +43,7 @@ KINDS = ("commands_unknown", "commands_known", "persistence")
 
 @dataclass(frozen=True)
 class LimitSpec:
-    """How the limit is estimated.
+    """Settings for estimating the limit.
 
     Attributes:
         horizons: samples ahead, rising.
@@ -162,7 +162,7 @@ def _measured(simulation: Simulation, log: Array, seed: np.random.SeedSequence) 
 
 
 def plan_limit(scenarios: Sequence[Scenario], spec: LimitSpec) -> list[LimitJob]:
-    """Which moments of which recordings are branched.
+    """Return the samples of the recordings from which branches start.
 
     Raises:
         ConfigError: the recordings are too short for the horizons, or have faults.
@@ -198,7 +198,7 @@ def find_limit(
     workers: int = 1,
     on_done: Callable[[LimitJob], None] | None = None,
 ) -> dict[str, Any]:
-    """The limit of predictability of a data set, as plain data in mm/s; the same for any number of workers.
+    """Return the predictability limit of a data set as plain data in mm/s, equal for any number of workers.
 
     Returns:
         ``commands_unknown``, ``commands_known`` and ``persistence`` (the present value as the guess, at the same

@@ -88,7 +88,7 @@ class Scenario:
             raise ConfigError(f"scenario: start_strokes = {[low, high]} must be shares with 0 <= low <= high <= 1")
 
     def load(self) -> Machine:
-        """The machine, with the scenario's sensors.
+        """Return the machine with the scenario's sensors.
 
         Raises:
             ConfigError: unknown machine or sensor value, or one out of its bounds.
@@ -114,7 +114,7 @@ class Scenario:
 
 
 def plain(scenario: Scenario) -> dict[str, Any]:
-    """A scenario as JSON gives it back; `Scenario(**plain(s)) == s`."""
+    """Convert a scenario to JSON types; `Scenario(**plain(s)) == s`."""
     values = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
     values |= {"start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}
     # Only where there are some: data sets and recordings without faults stay what they were.

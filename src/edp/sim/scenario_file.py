@@ -31,7 +31,7 @@ class LogFileSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioFile(DataSetSpec):
-    """What a scenario file holds: the data set, in ``[files]`` how it is written, in ``[limit]`` how that is found."""
+    """Content of a scenario file: data set, write options in ``[files]``, limit settings in ``[limit]``."""
 
     files: LogFileSettings = field(default_factory=LogFileSettings)
     limit: LimitSpec = field(default_factory=LimitSpec)
@@ -48,7 +48,7 @@ _CHANGES = make_dataclass("ScenarioChanges", [(entry.name, _HINTS[entry.name], N
 
 
 def read_scenario_file(path: str | Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """Values of a scenario file: those of a `DataSetSpec`, and those of its table ``[files]``; only what it states.
+    """Read the stated values of a scenario file: fields of `DataSetSpec`, and the table ``[files]``.
 
     Paths of machine and material files are relative to the scenario file.
 
@@ -71,7 +71,7 @@ def scenario_changes(overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str
 
 
 def limit_settings(path: str | Path | None, overrides: Sequence[str]) -> LimitSpec:
-    """How the limit of predictability is found: the table ``[limit]`` of a scenario file, changed by overrides.
+    """Return the limit settings: the table ``[limit]`` of a scenario file, changed by overrides.
 
     Raises:
         ConfigError: a key or value that cannot be.
@@ -90,13 +90,13 @@ def _merged(overrides: Sequence[str]) -> Table:
 
 
 def _stated(settings: Any, table: Table) -> tuple[dict[str, Any], dict[str, str]]:
-    """What the table states of a data set, and of how it is written."""
+    """Return the stated values of the data set and of the write options."""
     values = {key: getattr(settings, key) for key in table if key not in ("files", "limit")}
     return values, SCENARIO_FILE.plain(settings.files) if settings.files is not None else {}
 
 
 def _resolved(table: Table, folder: Path) -> Table:
-    """The table with paths of machine and material files that do not depend on the current folder."""
+    """Return the table with absolute paths of machine and material files."""
     resolved = dict(table)
     machine, materials = table.get("machine"), table.get("materials")
     if isinstance(machine, str):

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 class Simulation:
-    """A scenario under way: run it for a while, keep a moment of it, go back there, or branch off.
+    """Running simulation of a scenario: run it for some time, take snapshots, restore them, or branch off.
 
     Args:
         scenario: what to simulate.
@@ -52,7 +52,7 @@ class Simulation:
 
     @property
     def log(self) -> Array:
-        """What was logged so far, shape (samples, LOG_COLUMNS)."""
+        """Log so far, shape (samples, LOG_COLUMNS)."""
         return np.concatenate(self._logs) if self._logs else np.zeros((0, at.LOG_COLUMNS))
 
     @property
@@ -98,7 +98,7 @@ class Simulation:
         return rows
 
     def _moved(self, targets: Array) -> Array:
-        """Move the plant, whose numbers follow the faults from tick to tick."""
+        """Advance the plant with parameters that follow the faults sample by sample."""
         run = self.plant.follow if self.operator.by_hand else self.plant.run
         if not self._course.faults:
             return run(targets)
@@ -109,11 +109,11 @@ class Simulation:
         return np.concatenate(rows)
 
     def recording(self) -> Recording:
-        """What the sensors made of the log so far."""
+        """Return the recorded signals of the log so far."""
         return _recording(self.scenario, self.machine, self.log, self.plant.clamps)
 
     def snapshot(self) -> Snapshot:
-        """This moment: plant, operator, random state and log; nothing that follows changes it."""
+        """Return a snapshot of plant, operator, random state and log, independent of later steps."""
         arrays: list[NDArray[Any]] = []
         state = capture({key: getattr(self, key) for key in _CHANGING}, arrays)
         return Snapshot(plain(self.scenario), self.samples, state, tuple(arrays), tuple(self._logs))
@@ -137,13 +137,16 @@ class Simulation:
 
     @staticmethod
     def of(snapshot: Snapshot) -> Simulation:
-        """The simulation that a snapshot was taken of, at that moment."""
+        """Create the simulation of a snapshot, at its time."""
         simulation = Simulation(Scenario(**snapshot.scenario))
         simulation.restore(snapshot)
         return simulation
 
     def branch(self, seed: np.random.SeedSequence) -> None:
-        """Give operator and soil fresh randomness from here on; what the operator does now goes on, see `redraw`."""
+        """Give operator and soil new random numbers from now on.
+
+        The operator's present action continues, see `redraw`.
+        """
         hand, course = seed.spawn(2)
         # In place: all streams of the operator share this generator.
         self._hand.bit_generator.state = np.random.default_rng(hand).bit_generator.state
@@ -153,7 +156,7 @@ class Simulation:
         self.branch_soil(course)
 
     def branch_soil(self, seed: np.random.SeedSequence) -> None:
-        """Give the soil that is still to be met a fresh course of its resistance; commands stay as they are."""
+        """Redraw the resistance of soil not yet reached; commands stay the same."""
         if self.plant.ground is not None:
             self.plant.ground.redraw(np.random.default_rng(seed))
 

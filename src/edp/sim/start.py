@@ -1,4 +1,4 @@
-"""How a scenario begins: its seeds, its ground, and where the machine stands."""
+"""Start of a scenario: seeds, ground, and initial pose of the machine."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def seeds_of(scenario: Scenario) -> list[np.random.SeedSequence]:
 
 
 def start_of(scenario: Scenario, machine: Machine) -> tuple[soil.Ground | None, Array]:
-    """The ground, None in free air, and the strokes (shares of full, shape (3,)) to start from."""
+    """Return the ground (None in free air) and the initial strokes (fractions of full stroke, shape (3,))."""
     start, _, _, course, _ = seeds_of(scenario)
     ground = None
     if scenario.material:
@@ -32,7 +32,7 @@ def start_of(scenario: Scenario, machine: Machine) -> tuple[soil.Ground | None, 
 
 
 def _start_strokes(scenario: Scenario, machine: Machine, ground: soil.Ground | None, rng: np.random.Generator) -> Array:
-    """Strokes (shares of full) near the middle, and with the bucket clear of any ground."""
+    """Return strokes (fractions of full stroke) near the middle with the bucket clear of the ground."""
     strokes = rng.uniform(*scenario.start_strokes, 3)
     if ground is None:
         return strokes

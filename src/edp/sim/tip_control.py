@@ -60,7 +60,7 @@ def inverse_lever(speed: float, speeds: Array, levers: Array, rest: float) -> fl
 
 @compiled
 def reference(leg: Array, time: float, ramp: float, setup: tuple[Any, ...], reached: Array) -> None:
-    """Stroke shares at a time of a leg into `reached[:3]`; `setup` is that of `control`."""
+    """Compute stroke fractions at a time of a motion into `reached[:3]`; `setup` is that of `control`."""
     q = progress(time, leg[LENGTH], ramp)
     for i in range(at.AXES):
         reached[i] = leg[START + i] + q * (leg[GOAL + i] - leg[START + i])

@@ -1,4 +1,4 @@
-"""What an operator sees of the plant: the noise-free present, cheap enough to be taken at every control step."""
+"""Operator's view of the plant: the noise-free present, cheap enough for every control step."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class View(NamedTuple):
 
 
 def view_of(plant: Plant) -> View:
-    """The present view of a plant."""
+    """Return the present view of a plant."""
     look = np.empty(pose.LOOK_VALUES)
     pose.look_at(plant.state, plant.axes, plant.plant, look)
     x, y, attitude = look[pose.TIP :].tolist()

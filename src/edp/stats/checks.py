@@ -1,4 +1,4 @@
-"""What arrays of scores must be before a test reads them; the type of a result that may be many."""
+"""Checks of score arrays before a statistical test, and the type of results that may be arrays."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def finite(values: ArrayLike, what: str, axes: int) -> Array:
 
 
 def tested_mask(tested: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
-    """Which session each run was judged on, ``(run, session)``; None: every one on all.
+    """Return the mask of the sessions on which each run was evaluated, ``(run, session)``.
+
+    None stands for all sessions.
 
     Raises:
         DataError: another shape, or no cell.
@@ -86,5 +88,5 @@ def two_sided_p(statistic: Array, df: float) -> Array:
 
 
 def _below(statistic: Array, df: float) -> Array:
-    """Return the distribution function of Student's t; the normal one for infinite degrees of freedom."""
+    """Return the cumulative distribution of Student's t; the normal distribution for infinite degrees of freedom."""
     return np.asarray(ndtr(statistic) if np.isinf(df) else stdtr(df, statistic))

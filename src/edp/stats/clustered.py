@@ -14,7 +14,7 @@ from edp.stats.checks import Array, lower_p, tested_cells, two_sided_p
 
 @dataclass(frozen=True, eq=False)
 class MeanTest:
-    """One-sided test of ``mean < 0``; fields are arrays over the leading axes of what was tested (0-d for one).
+    """One-sided test of ``mean < 0``; fields are arrays over the leading axes of the tested data (0-d for one test).
 
     Attributes:
         mean: mean difference, in the unit of the scores.

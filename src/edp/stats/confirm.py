@@ -22,7 +22,7 @@ from edp.wording import figure, percent, percent_interval
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """What a module must show.
+    """Acceptance criteria of a module: significance level and minimum improvement.
 
     Attributes:
         alpha: level of the adjusted p-value.
@@ -46,7 +46,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class ModuleEvidence:
-    """What a confirmation found on one module. Negative differences are improvements.
+    """Result of a confirmation for one module. Negative differences are improvements.
 
     Attributes:
         module: name.

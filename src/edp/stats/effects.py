@@ -1,4 +1,4 @@
-"""Sizes of effects: Cohen's d_z with an interval, the share of pairs won, and agreement of rankings."""
+"""Effect sizes: Cohen's d_z with an interval, the fraction of pairs won, and agreement of rankings."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ def effect_interval(d_z: float, splits: int, level: float = 0.95) -> EffectSize:
 
 
 def _noncentrality(statistic: float, df: int, probability: float) -> float:
-    """The noncentrality under which a t-variable falls below `statistic` with `probability`."""
+    """Return the noncentrality for which a t variable is below `statistic` with `probability`."""
     return float(nctdtrinc(df, probability, statistic))
 
 
 def rank_stability(differences: ArrayLike) -> Array:
-    """Share of the paired observations in which the module is better, over the last axis; a tie is no win.
+    """Return the fraction of paired observations in which the module is better, over the last axis; ties do not count.
 
     The thesis's third gate asks for three quarters of the N = J S pairs of runs.
 
@@ -101,7 +101,7 @@ class Concordance:
 
 
 def kendalls_w(scores: ArrayLike) -> Concordance:
-    """Whether splits rank modules alike; equal scores share their mean rank.
+    """Test whether splits rank modules alike; equal scores share their mean rank.
 
     Args:
         scores: ``(split, module)``.

@@ -32,7 +32,7 @@ class SizeScore:
 
 
 def most_efficient(candidates: Sequence[SizeScore], gain: float = GAIN_PER_DOUBLING) -> SizeScore:
-    """The smallest candidate that no larger one repays.
+    """Return the smallest candidate for which no larger one is worth its size.
 
     Candidate c' repays its size over c where ``(S(c) - S(c')) / S(c) > gain * log2(P(c') / P(c))`` and the difference
     exceeds its standard error ``sqrt(e(c)^2 + e(c')^2)``. Candidates are tried in ascending order of size, against

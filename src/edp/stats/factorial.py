@@ -21,7 +21,7 @@ PASSES = 12
 
 @dataclass(frozen=True, eq=False)
 class Factorial:
-    """Which factors are on in which run.
+    """Two-level factorial design: the factors that are on in each run.
 
     Attributes:
         factors: names.
@@ -42,7 +42,7 @@ class Factorial:
 def two_level_design(
     factors: Sequence[str], runs: int | None = None, exclusive: Sequence[Sequence[str]] = ()
 ) -> Factorial:
-    """A design in which no main effect is aliased with an interaction of two factors.
+    """Return a design in which no main effect is aliased with a two-factor interaction.
 
     In N = 2^m runs the columns are products of an odd number of basic ones (the even ones left out, as in a
     fold-over), so a product of two columns is never a third: resolution IV, for up to N / 2 factors. Among the
@@ -79,7 +79,7 @@ def two_level_design(
 
 
 def least_runs(factors: int) -> int:
-    """The smallest power of two in which a design of resolution IV holds so many factors."""
+    """Return the smallest power of two for which a design of resolution IV holds the given number of factors."""
     # Resolution IV in N runs takes at most N / 2 factors.
     return max(4, 1 << (2 * factors - 1).bit_length())
 
@@ -113,7 +113,7 @@ def _regular(factors: int, runs: int) -> Mask:
 
 
 def _repaired(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
-    """Where several of a group are on keep one, the one kept least often so far."""
+    """Repair runs with several active factors of a group: keep the factor that was kept least often so far."""
     fixed = levels.copy()
     for group in groups:
         repairs = dict.fromkeys(group, 0)
@@ -127,7 +127,7 @@ def _repaired(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
 
 
 def _exchanged(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
-    """Flip a level of a run, or hand it on within a group, wherever that lowers the cost most; until nothing does."""
+    """Flip a level of a run, or move it within a group, as long as this lowers the cost."""
     best, cost = levels.copy(), float(_quality(levels, groups)[0])
     moves: list[tuple[int, ...]] = [(factor,) for factor in range(levels.shape[1])]
     moves += sorted(pair for group in groups for pair in combinations(group, 2))
@@ -150,7 +150,7 @@ def _exchanged(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
 
 
 def _quality(levels: Mask, groups: Sequence[tuple[int, ...]]) -> tuple[Array, Array, Array]:
-    """Of designs ``(..., run, factor)``: what the exchange lowers, the largest alias, the largest error of an effect.
+    """Return the exchange cost, the largest alias and the largest effect error of designs ``(..., run, factor)``.
 
     The cost is the mean squared error of a main effect when every interaction has `INTERACTION` times a run's variance.
     """

@@ -1,4 +1,4 @@
-"""Which sessions each run is judged on: repeated grouped folds, and the thesis's repeated splits."""
+"""Assignment of sessions to evaluation runs: repeated grouped folds, and the thesis's repeated splits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from edp.stats.checks import Mask
 
 
 def repeated_folds(sessions: int, folds: int = 5, repeats: int = 1, seed: int = 0) -> Mask:
-    """Repeated grouped k-fold: each repeat deals all sessions anew, one run per fold.
+    """Return repeated grouped k-fold assignments: each repeat distributes all sessions again, one run per fold.
 
     The same seed and a larger number of repeats give the same first runs, so a study can go on where it stopped.
 
@@ -33,7 +33,7 @@ def repeated_folds(sessions: int, folds: int = 5, repeats: int = 1, seed: int = 
 
 
 def repeated_splits(sessions: int, test_sessions: int, splits: int, seed: int = 0) -> Mask:
-    """The thesis's design: `splits` independent random draws of the sessions to judge on.
+    """Return the thesis's design: `splits` independent random draws of the test sessions.
 
     Returns:
         ``(split, session)``.

@@ -18,7 +18,7 @@ confirm any."""
 
 @dataclass(frozen=True)
 class MainEffect:
-    """What turning one factor on does to the score, on average over all others.
+    """Mean effect of one factor on the score, averaged over all other factors.
 
     Attributes:
         factor: name.

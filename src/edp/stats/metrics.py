@@ -39,7 +39,7 @@ class Scores:
     count: int
 
     def to_json(self) -> dict[str, float | int | None]:
-        """The fields by name; all finite or None, so that they fit into JSON."""
+        """Convert to JSON types: the fields by name, all finite or None."""
         return asdict(self)
 
 

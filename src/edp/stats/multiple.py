@@ -12,7 +12,7 @@ from edp.stats.checks import Array, finite
 
 
 def benjamini_hochberg(p: ArrayLike) -> Array:
-    """Adjusted p-values after Benjamini and Hochberg (1995), over the last axis.
+    """Return p-values adjusted after Benjamini and Hochberg (1995), over the last axis.
 
     They control the false discovery rate: the expected share of wrong ones among the confirmed. That is the
     probability of any wrong one only where all are null; `holm` bounds that probability always.
@@ -27,7 +27,7 @@ def benjamini_hochberg(p: ArrayLike) -> Array:
 
 
 def holm(p: ArrayLike) -> Array:
-    """Adjusted p-values after Holm (1979), over the last axis: the probability of any false confirmation.
+    """Return p-values adjusted after Holm (1979), over the last axis: the probability of any false confirmation.
 
     Raises:
         DataError: empty, or values outside 0 to 1.

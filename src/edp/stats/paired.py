@@ -1,4 +1,4 @@
-"""Differences of two arms on the same cells; what is missing or diverged counts as the worst."""
+"""Paired differences of two arms on the same cells; missing or diverged cells count as the worst."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayL
 def paired(
     module: ArrayLike, baseline: ArrayLike, tested: ArrayLike | None = None, worst: ArrayLike | None = None
 ) -> Array:
-    """Module minus baseline in each cell, ``(run, session)``; failed cells of either arm count as the worst.
+    """Return module minus baseline in each cell, ``(run, session)``; failed cells of either arm count as the worst.
 
     With several modules use `fill_worst` on all arms at once, so that all share one worst.
 
@@ -66,7 +66,7 @@ def paired(
 
 
 def run_means(differences: ArrayLike, tested: ArrayLike | None = None) -> Array:
-    """Mean over the tested sessions of each run, ``(..., run)``: what the thesis calls the score of a split.
+    """Return the mean over the tested sessions of each run, ``(..., run)``; the thesis calls it the score of a split.
 
     Raises:
         DataError: a run without a tested session, or a mask that does not fit.

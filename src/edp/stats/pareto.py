@@ -1,4 +1,4 @@
-"""What no other point betters: the front of several objectives that are made small."""
+"""Pareto front: points that no other point dominates, for several objectives to be minimised."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from edp.wording import figure
 
 @dataclass(frozen=True)
 class ConfirmationPlan:
-    """How long a confirmation must be.
+    """Length of a confirmation that reaches the required power.
 
     Attributes:
         runs: training runs of each arm, a whole number of repeats; None where no number suffices.
@@ -127,7 +127,7 @@ def _sessions_needed(delta: float, variance: PairedVariance, folds: int, alpha: 
 def simulate_differences(
     variance: PairedVariance, tested: ArrayLike, mean: ArrayLike, repetitions: int, rng: np.random.Generator
 ) -> Array:
-    """Normal paired differences of these variances on a design, ``(repetition, run, session)``, plus `mean`."""
+    """Return normal paired differences with the given variances and mean, ``(repetition, run, session)``."""
     mask = np.asarray(tested, dtype=bool)
     runs, sessions = mask.shape
     draw = math.sqrt(variance.session) * rng.standard_normal((repetitions, 1, sessions))

@@ -1,4 +1,4 @@
-"""Races: modules without promise are dropped early, which costs power but no alpha."""
+"""Races: unpromising modules are dropped early, which lowers the power but not the significance level."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from edp.stats.variance import PairedVariance
 
 @dataclass(frozen=True)
 class InterimAnalysis:
-    """An interim analysis of the data so far.
+    """Interim analysis of the data so far.
 
     Attributes:
         runs: after which it is taken.
@@ -34,7 +34,7 @@ INTERIM_ANALYSES = (InterimAnalysis(5, 0.35), InterimAnalysis(10, 0.15), Interim
 
 @dataclass(frozen=True, eq=False)
 class RaceResult:
-    """Where each module stands; arrays over the leading axes of the differences.
+    """Result of a race for each module; arrays over the leading axes of the differences.
 
     Attributes:
         dropped_after: runs after which it was dropped; 0 where it went all the way.
@@ -52,7 +52,7 @@ def race(
     tested: ArrayLike | None = None,
     interim_analyses: Sequence[InterimAnalysis] = INTERIM_ANALYSES,
 ) -> RaceResult:
-    """Perform the interim analyses, then test what is left over all runs.
+    """Perform the interim analyses, then test the remaining modules over all runs.
 
     They can only stop for futility. A module that none of them dropped is judged by the same test as without them, so
     under the null the probability of confirming it can only fall: futility analyses spend no alpha.
@@ -83,7 +83,7 @@ def race(
 
 @dataclass(frozen=True)
 class RaceRates:
-    """What a race does with a module of a known effect, over simulated studies.
+    """Operating characteristics of a race for a module of known effect, over simulated studies.
 
     Attributes:
         confirmed: share with p below alpha at the end.

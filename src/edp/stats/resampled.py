@@ -40,7 +40,9 @@ def resampled_t(differences: ArrayLike, test_over_train: float) -> MeanTest:
 
 
 def paired_t(differences: ArrayLike) -> MeanTest:
-    """The plain paired t-test over splits, one-sided; too small p-values where splits overlap, so for comparison only.
+    """Return the plain one-sided paired t-test over splits.
+
+    Its p-values are too small for overlapping splits, so it serves comparison only.
 
     Raises:
         DataError: fewer than two splits or values that are not finite.
@@ -49,7 +51,7 @@ def paired_t(differences: ArrayLike) -> MeanTest:
 
 
 def printed_p(d_z: ArrayLike, splits: int) -> np.ndarray:
-    """The p-value that the thesis prints in Table 4.5: ``Phi(d_z sqrt(J))``.
+    """Return the p-value printed in Table 4.5 of the thesis: ``Phi(d_z sqrt(J))``.
 
     A z-test with a sample standard deviation: not the mixed model of eq. 2.22, not the t-test of the table's
     note, and not adjusted for the number of modules.
@@ -67,7 +69,7 @@ def printed_p(d_z: ArrayLike, splits: int) -> np.ndarray:
 
 
 def _deviation(array: np.ndarray) -> np.ndarray:
-    """Standard deviation (n - 1) over the last axis; zero where the values are equal to rounding."""
+    """Return the standard deviation (n - 1) over the last axis; zero if the values are equal up to rounding."""
     spread = array.std(axis=-1, ddof=1)
     # A spread of rounding is none: the differences are equal.
     return np.where(spread > 1e-14 * np.abs(array).max(axis=-1), spread, 0.0)

@@ -1,4 +1,4 @@
-"""Quantiles of magnitudes of which there are more than memory has room for."""
+"""Quantiles of data that do not fit into memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BINS = 1 << (31 - _SHIFT)
 
 
 class QuantileSketch:
-    """Quantiles of values of at least 0: exact up to `MOST_EXACT` of them, to 0.05 % beyond.
+    """Quantile sketch of non-negative values: exact up to `MOST_EXACT` values, beyond that to 0.05 %.
 
     Bins are those of single precision with a shortened mantissa: two megabytes, however many values come.
     """
@@ -29,7 +29,7 @@ class QuantileSketch:
 
     @property
     def exact(self) -> bool:
-        """Whether quantiles are those of all values themselves."""
+        """Whether quantiles are computed from all single values."""
         return self._bins is None
 
     def update(self, values: ArrayLike) -> None:
@@ -41,7 +41,7 @@ class QuantileSketch:
             self._binned()
 
     def _binned(self) -> NDArray[np.int64]:
-        """The bins, with all values in them that were kept one by one."""
+        """Move the single values into the bins and return the bins."""
         bins = np.zeros(_BINS, dtype=np.int64) if self._bins is None else self._bins
         for part in self._kept:
             bins += np.bincount(_bin_of(part), minlength=_BINS)
@@ -49,7 +49,7 @@ class QuantileSketch:
         return bins
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that it holds, as arrays: values one by one, or the counts of bins."""
+        """Return the state as arrays: single values, or the counts of bins."""
         if self._bins is None:
             return {"values": np.concatenate([np.zeros(0), *self._kept])}
         filled = np.flatnonzero(self._bins)
@@ -64,7 +64,7 @@ class QuantileSketch:
         self.count += int(state["counts"].sum())
 
     def quantiles(self, shares: Sequence[float]) -> list[float]:
-        """The values below which these shares lie; at least one value must have come."""
+        """Return the quantiles at the given probabilities; at least one value is required."""
         if self._bins is None:
             return [float(value) for value in np.quantile(np.concatenate(self._kept), shares)]
         reached = np.cumsum(self._bins)

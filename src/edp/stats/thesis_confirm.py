@@ -52,7 +52,7 @@ class ThesisEvidence:
 def thesis_confirm(
     scores: ArrayLike, modules: Sequence[str], metrics: Sequence[str], alpha: float = 0.05
 ) -> tuple[ThesisEvidence, ...]:
-    """Mixed model by metric, adjusted globally over what was tested, three gates, any metric suffices.
+    """Apply the thesis's confirmation: mixed model per metric, global adjustment, three gates, any metric suffices.
 
     Args:
         scores: ``(metric, 1 + module, split, seed)``, the baseline first; each run's score over its test sessions.

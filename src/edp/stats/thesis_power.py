@@ -85,7 +85,7 @@ def thesis_plan(
     power: float = 0.80,
     seed: int = 0,
 ) -> ThesisPlan:
-    """J after eq. 3.42 for a detectable effect of `share` of the baseline's mean absolute error.
+    """Return J after eq. 3.42 for a detectable effect of `share` (fraction of the baseline's mean absolute error).
 
     Raises:
         ConfigError: a value that is not above zero.

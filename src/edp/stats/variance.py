@@ -1,4 +1,4 @@
-"""Where scores vary: between splits, between seeds, and, for differences, between sessions and runs."""
+"""Variance components of scores: between splits, between seeds, and, for differences, between sessions and runs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SplitVariance:
 
 
 def thesis_variance(scores: ArrayLike) -> SplitVariance:
-    """The thesis's eq. 2.17 and 2.18.
+    """Return the variances of eq. 2.17 and 2.18 of the thesis.
 
     The first holds a part of the seeds' variance too, and the second is a mean of standard deviations, biased low
     by c4(S): 0.886 with three seeds. `split_variance` has neither fault.
@@ -107,7 +107,7 @@ def _difference_interval(first: _MeanSquare, second: _MeanSquare, tail: float) -
 
 
 def seed_correlation(module: ArrayLike, baseline: ArrayLike) -> float:
-    """Correlation of two arms over the seeds of a split: what common random numbers win.
+    """Return the correlation of two arms over the seeds of a split: the benefit of common random numbers.
 
     The variance of a paired difference is ``2 s^2 (1 - rho)``, not ``2 s^2``.
 
@@ -148,7 +148,7 @@ class PairedVariance:
 
 
 def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> PairedVariance:
-    """Estimate the variances by the method of moments (Henderson's first method), none below zero.
+    """Estimate the variances by the method of moments (Henderson's first method), limited to at least zero.
 
     Args:
         differences: ``(run, session)``, module minus baseline.

@@ -1,4 +1,4 @@
-"""Arrays of numbers from JSON files."""
+"""Numeric arrays in JSON files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from edp.errors import StorageError
 
 
 def numbers_in(value: Any, where: str, shape: tuple[int, ...] | None = None) -> NDArray[np.float64]:
-    """Return nested lists of numbers from a JSON file as an array.
+    """Convert nested lists of a JSON file to a numeric array.
 
     Args:
         value: the lists, or one number.

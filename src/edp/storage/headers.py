@@ -1,4 +1,4 @@
-"""Headers of folders with arrays beside them: a hash over the header, and a digest of each file that it names."""
+"""Headers of folders with arrays: a hash of the header, and a digest of each file that it names."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def check_files(files: Mapping[str, str], folder: str | Path, advice: str) -> No
 
 
 def model_digest(path: str | Path) -> str:
-    """Return a hash of a model on disk, which changes with its content: of its header, or of the file itself.
+    """Return a hash of a model on disk that changes with its content: of its header, or of the file itself.
 
     Args:
         path: a run folder, the folder of a network, twin or monitor, or a file such as an FMU.
@@ -66,7 +66,7 @@ def model_digest(path: str | Path) -> str:
 
 
 def is_whole(file: Path) -> bool:
-    """Whether a header and the files that it names are as they were written, as far as digests tell.
+    """Return whether a header and its files are unchanged according to their digests.
 
     Headers from before they had a hash are held to their files alone.
 
@@ -84,7 +84,7 @@ def is_whole(file: Path) -> bool:
 
 
 def _entries(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """What names a file of arrays: in the header, or in one of its parts."""
+    """Yield the entries that name a file of arrays: in the header, or in one of its parts."""
     parts = [value for value in header.values() if isinstance(value, dict)]
     within = [value for part in parts for value in part.values() if isinstance(value, dict)]
     yield from (part for part in (*parts, *within) if part.keys() == _ENTRY)

@@ -1,4 +1,4 @@
-"""Locks: one process at a time writes to a folder; the end of a process, however it comes, frees what it held."""
+"""Locks: one process at a time writes to a folder; a lock is released when its process ends in any way."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def release(path: str | Path, stream: IO[str]) -> None:
 
 
 def check_held(path: str | Path, stream: IO[str]) -> None:
-    """Refuse to go on where the lock file was removed or replaced, so that another process may have locked a new one.
+    """Raise an error if the lock file was removed or replaced, so that another process may hold a new lock.
 
     Raises:
         StorageError: the file at `path` is not the one that is locked.
@@ -125,7 +125,7 @@ def check_held(path: str | Path, stream: IO[str]) -> None:
 
 
 def held_by(path: str | Path) -> str | None:
-    """Who holds a file that `hold` locks, None for nobody; nothing is changed."""
+    """Return the holder of a file locked by `hold`; None if it is free. Nothing is changed."""
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | _OPEN), encoding="utf-8", errors="replace") as stream:
             if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
@@ -140,7 +140,7 @@ def held_by(path: str | Path) -> str | None:
 
 
 def _opened(lock: Path) -> IO[str]:
-    """The lock file, made where there is none, as a stream that appends; nothing in it is changed."""
+    """Open the lock file, created if necessary, for appending; its content is not changed."""
     try:
         handle = os.open(lock, os.O_RDWR | os.O_APPEND | os.O_CREAT | _OPEN, 0o666)
     except OSError as error:
@@ -158,7 +158,7 @@ def _opened(lock: Path) -> IO[str]:
 
 
 def _check_ours(lock: Path, stream: IO[str]) -> None:
-    """Refuse to write into what is not a lock, such as a file that got this name by a hard link."""
+    """Raise an error unless the file is a lock, since a hard link may give another file this name."""
     content, names = _read(stream), os.fstat(stream.fileno()).st_nlink
     # An empty file with a second name is somebody's file by a hard link.
     if OURS.fullmatch(content) is None or (names > 1 and not content):

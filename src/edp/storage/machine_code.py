@@ -1,4 +1,4 @@
-"""Machine code by Numba, kept on disk by the sources that it comes from.
+"""Machine code compiled by Numba, cached on disk by its sources.
 
 Numba's own cache lies beside the sources, where a user may not write. It knows a function by its own file, not by the
 files of the functions it calls: after an edit to one file, callers elsewhere would keep running the old code. The
@@ -40,7 +40,7 @@ class Compiler:
 
     @cached_property
     def folder(self) -> Path | None:
-        """Where code is kept: below NUMBA_CACHE_DIR or the user's cache folder; None where neither is writable."""
+        """Cache folder in NUMBA_CACHE_DIR or the user's cache folder; None if neither is writable."""
         state = hashlib.blake2b(digest_size=8)
         state.update(self.facts.encode())
         for source in (*self.sources(), Path(__file__)):
@@ -60,7 +60,7 @@ class Compiler:
         return self._compile(function, {**self.options})
 
     def inlined(self, function: Function) -> Function:
-        """Like `compiled`, and part of every caller's own code, so that results which a caller drops cost nothing."""
+        """Compile like `compiled`, inlined into every caller, so that unused results cost nothing."""
         return self._compile(function, {**self.options, "forceinline": True})
 
     def inner(self, function: Function) -> Function:
@@ -105,5 +105,5 @@ def _keep_if_possible(fast: Any) -> None:
 
 
 def files_with(folder: Path, line: str) -> tuple[Path, ...]:
-    """Python files of a folder and of those in it that contain a line of code, sorted."""
+    """Return the Python files in a folder tree that contain a line of code, sorted."""
     return tuple(file for file in sorted(folder.rglob("*.py")) if line.encode() in file.read_bytes())

@@ -1,4 +1,4 @@
-"""What a file may ask of this machine's memory: announced sizes are weighed before anything is unpacked."""
+"""Memory checks: announced sizes of a file are compared with the free memory before it is unpacked."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _listener: Listener | None = None
 
 
 def listen(listener: Listener | None) -> None:
-    """Have `announce` call a function: a process that reads one log grows its limits by what the log announces."""
+    """Set the function that `announce` calls: a process that reads one log raises its limits accordingly."""
     global _listener
     _listener = listener
 
 
 def announce(*, memory: int = 0, work: int = 0, parts: int = 0) -> None:
-    """Say what the checked headers of a log promise, so that a sandbox allows it and no more.
+    """Report the sizes in the checked headers of a log, so that a sandbox allows them.
 
     Args:
         memory: bytes that reading takes at one time.
@@ -37,7 +37,7 @@ def announce(*, memory: int = 0, work: int = 0, parts: int = 0) -> None:
 
 
 def free_bytes() -> int:
-    """Memory that this process can have now: the least of what the machine, its control group and its limits leave.
+    """Return the memory available to this process: the minimum for machine, control groups and own limits.
 
     A large number where the system does not tell.
     """
@@ -55,7 +55,7 @@ def _machine() -> int:
 
 
 def _groups(processes: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
-    """What each control group of memory leaves, from this process's own to the outermost (versions 2 and 1)."""
+    """Yield the free memory of each memory control group, from the process's own to the outermost (v2 and v1)."""
     try:
         lines = processes.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError):
@@ -92,7 +92,7 @@ def _group_left(folder: Path, version_2: bool) -> int | None:
 
 
 def _own_limits() -> Iterator[int]:
-    """What this process's limits on address space and data leave; inside a sandbox, its hard limits."""
+    """Yield the free memory within the process's limits on address space and data; in a sandbox, its hard limits."""
     try:
         import resource
 
@@ -131,12 +131,12 @@ def check_memory(path: Path, needed: int, what: str, advice: str) -> None:
 
 
 def gigabytes(count: float) -> str:
-    """A number of bytes for messages."""
+    """Format a number of bytes in GB."""
     return f"{typed(count / 1e9, 3)} GB"
 
 
 def check_setting(needed: float, what: str, advice: str) -> None:
-    """Refuse settings that ask for more memory than this machine can give, before any of it is taken.
+    """Raise an error for settings that need more memory than the machine can give, before it is allocated.
 
     Args:
         needed: bytes.
@@ -152,6 +152,6 @@ def check_setting(needed: float, what: str, advice: str) -> None:
 
 
 def readable(count: float) -> str:
-    """A number of bytes in MB, GB or TB."""
+    """Format a number of bytes in MB, GB or TB."""
     unit, size = ("TB", 1e12) if count >= 1e12 else ("GB", 1e9) if count >= 1e9 else ("MB", 1e6)
     return f"{typed(count / size, 3)} {unit}" if count < 1e15 else f"{count / size:,.0f} {unit}"

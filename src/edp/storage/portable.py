@@ -1,4 +1,4 @@
-"""What systems do differently when files are opened and locked: POSIX by `fcntl`, Windows by `msvcrt`."""
+"""Differences between systems in opening and locking files: POSIX by `fcntl`, Windows by `msvcrt`."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def hold_handle(handle: int) -> None:
 
 
 def lock_region(msvcrt_module: object, stream: IO[str], wait: bool) -> None:
-    """The lock of Windows: one byte far behind the content, whose position the stream then leaves again.
+    """Lock a file on Windows: one byte far after the content; the stream position is restored.
 
     Windows has no shared locks here, so that two processes that only ask who holds a file may meet; the second
     is then told the last holder. `wait` tries for ten seconds at a time.
@@ -86,5 +86,5 @@ def lock_region(msvcrt_module: object, stream: IO[str], wait: bool) -> None:
 
 
 def cores() -> int:
-    """Processors that this process may use, which in a container are fewer than those of the machine."""
+    """Return the number of processors available to this process, which may be fewer in a container."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

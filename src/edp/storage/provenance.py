@@ -22,7 +22,7 @@ RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
 
 
 def environment(threads: int) -> dict[str, str]:
-    """Versions and machine facts that can change a result; flat strings."""
+    """Return versions and machine properties that can change a result, as flat strings."""
     facts = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
     for name in RECORDED:
         try:
@@ -51,7 +51,7 @@ def new_provenance(data: Mapping[str, Any] | None = None, threads: int = 1) -> d
 
 
 def read_provenance(folder: str | Path) -> dict[str, Any]:
-    """Where a run comes from, with all that the commands on a trained run need of it.
+    """Read the provenance of a run, required by commands on a trained run.
 
     Raises:
         StorageError: not a run folder, or its provenance is damaged.
@@ -84,5 +84,5 @@ def recording_names(provenance: Mapping[str, Any], *parts: str) -> set[str]:
 
 
 def command_line() -> str:
-    """The command as a user would type it."""
+    """Return the command line of this process as a user would type it."""
     return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

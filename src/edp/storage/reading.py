@@ -35,7 +35,7 @@ DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*+{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{
 
 
 def read_bytes(path: str | Path, limit: int, where: str = "", error: type[Exception] = StorageError) -> bytes:
-    """The whole content of a regular file, or of a link to one; a pipe or a device is refused, not waited for.
+    """Return the content of a regular file, or of a link to one. Pipes and devices are refused.
 
     Args:
         path: of the file.
@@ -80,7 +80,7 @@ def _too_large(where: str, size: int, limit: int) -> str:
 
 
 def read_text(path: str | Path, limit: int, where: str = "", error: type[Exception] = StorageError) -> str:
-    """The text of a regular file in UTF-8; see `read_bytes`.
+    """Return the text of a regular file in UTF-8; see `read_bytes`.
 
     Raises:
         Exception: `error`; not readable, too large, not UTF-8, or with a byte-order mark in front.
@@ -106,7 +106,7 @@ def read_json(path: str | Path, where: str = "", error: type[Exception] = Storag
 def read_object(
     path: str | Path, keys: Iterable[str] = (), where: str = "", error: type[Exception] = StorageError
 ) -> dict[str, Any]:
-    """A JSON file that holds one object.
+    """Read a JSON file that holds one object.
 
     Args:
         path: of the file.
@@ -137,7 +137,7 @@ def object_with(value: Any, keys: Iterable[str], where: str, error: type[Excepti
 
 
 def parse_json(text: str, where: str, error: type[Exception] = StorageError, finite: bool = True) -> Any:
-    """The value that JSON stands for.
+    """Parse a JSON text.
 
     Args:
         text: the JSON.
@@ -163,7 +163,7 @@ def parse_json(text: str, where: str, error: type[Exception] = StorageError, fin
 def read_toml(
     path: str | Path, where: str = "", error: type[Exception] = StorageError, advice: str = ""
 ) -> dict[str, Any]:
-    """The table of a TOML file; see `parse_toml`.
+    """Read a TOML file; see `parse_toml`.
 
     Args:
         path: of the file.
@@ -183,7 +183,7 @@ def read_toml(
 
 
 def parse_toml(text: str, where: str, error: type[Exception] = StorageError) -> dict[str, Any]:
-    """The table that TOML stands for.
+    """Parse a TOML text.
 
     Raises:
         Exception: `error`; not TOML, nested too deep, or a number beyond all use.
@@ -230,7 +230,7 @@ def _finite(text: str) -> float:
 
 
 def _check_tree(value: Any) -> None:
-    """Refuse what is nested too deep for those who walk through it, and integers that nothing can hold."""
+    """Raise an error for values nested too deeply, and for integers that are too large."""
     level, bound = [value], 10**DIGITS
     for _ in range(DEPTH + 1):
         below: list[Any] = []

@@ -1,4 +1,4 @@
-"""Registry of the kinds of runs: what each leaves on disk, and which command writes it."""
+"""Registry of the kinds of runs: the files of each on disk, and the command that writes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What runs lie below a folder, as far as their files say: read within bounds, whatever is in them."""
+"""Listing of runs below a folder from their files, read within bounds whatever they contain."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class ListedRun:
 
 
 def list_runs(folder: str | Path) -> tuple[list[ListedRun], bool]:
-    """The runs below a folder, the latest first, and whether all folders were looked into.
+    """Return the runs below a folder, the latest first, and whether all folders could be read.
 
     Links are not followed. Files of a run that cannot be read make it ``damaged``, not the list.
 
@@ -83,7 +83,7 @@ def list_runs(folder: str | Path) -> tuple[list[ListedRun], bool]:
 
 
 def _folders(top: Path) -> Iterator[Path]:
-    """A folder and those below it, but none within a run: its parts are not runs of their own."""
+    """Yield a folder and its subfolders, except those inside runs."""
     waiting = [(top, 0)]
     while waiting:
         path, depth = waiting.pop()
@@ -134,7 +134,7 @@ def _run(path: Path) -> ListedRun:
 
 
 def _kind(path: Path, identity: Mapping[str, Any], status: Mapping[str, Any]) -> RunKind:
-    """Return the kind that a run states; one of an earlier version states none and is recognised by its result."""
+    """Return the kind that a run states; runs of earlier versions are recognised by their result."""
     stated = RUN_KINDS.get(str(identity.get("kind") or status.get("kind")))
     results = (kind for kind in RUN_KINDS.values() if is_file_at(path / kind.result))
     return stated or next(results, RUN_KINDS["network"])
@@ -176,7 +176,7 @@ def _damaged_parts(path: Path, finished: RunKind | None) -> list[str]:
 
 
 def _part(file: Path, damaged: list[str]) -> Mapping[str, Any]:
-    """A JSON file of a run; empty where there is none or it is damaged."""
+    """Read a JSON file of a run; empty if it is missing or damaged."""
     if not is_file_at(file):
         return {}
     try:
@@ -191,7 +191,7 @@ def _part(file: Path, damaged: list[str]) -> Mapping[str, Any]:
 
 
 def _touched(path: Path) -> str:
-    """When a folder was last written, in the form of the files."""
+    """Return the time of the last change of a folder, in the form of the files."""
     try:
         return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(status_of(path).st_mtime))
     except (StorageError, OverflowError, ValueError):
@@ -199,7 +199,7 @@ def _touched(path: Path) -> str:
 
 
 def _score(scores: Mapping[str, Any]) -> str:
-    """The network's root-mean-square error at the longest horizon, of the first output where they have no one unit."""
+    """Return the network's RMSE at the longest horizon; for the first output if units differ."""
     if not scores:
         return ""
     horizon = max(int(one) for one in scores["task"]["horizons"])

@@ -1,4 +1,4 @@
-"""Run folders: everything needed to repeat a training and to go on with it after a stop."""
+"""Run folders: everything needed to repeat a training, and to continue it after a stop."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Run:
                 run.finish()
 
     def __enter__(self) -> Run:
-        """The folder itself; leaving the block frees the lock."""
+        """Return the run; leaving the block releases the lock."""
         return self
 
     def __exit__(
@@ -141,7 +141,7 @@ class Run:
         return False
 
     def release(self) -> None:
-        """Free the folder of a run that has written nothing but its identity, settings and state."""
+        """Release the folder of a run that has written only its identity, settings and state."""
         own = {*LEFT, IDENTITY, STATUS}
         if {entry.name for entry in entries_of(self.path)} <= own:
             # The identity last: a kill in between leaves the folder of a run, not of something else.
@@ -153,7 +153,7 @@ class Run:
         write_bytes(self.file("config.toml"), settings.encode())
 
     def write_status(self, status: str, **facts: Any) -> None:
-        """Record the state of the run: ``running``, ``finished`` or ``diverged``, with facts that fit into JSON."""
+        """Record the state of the run: ``running``, ``finished`` or ``diverged``, with additional JSON values."""
         check_held(self.file(".lock"), self._lock)
         write_json(self.file(STATUS), {"status": status, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
 
@@ -164,7 +164,7 @@ class Run:
         self.remove_parts()
 
     def status(self) -> dict[str, Any]:
-        """Return the recorded state of the run with its facts; empty before the first one."""
+        """Return the recorded state of the run with its additional values; empty before the first one."""
         return _status_of(self.path)
 
     def remove_parts(self) -> None:
@@ -179,7 +179,7 @@ class Run:
 
 
 def state_of(folder: str | Path) -> str:
-    """Return the recorded state of a run: ``running``, ``finished`` or ``diverged``; empty if none is recorded.
+    """Return the recorded state of a run: ``running``, ``finished`` or ``diverged``; empty without a record.
 
     Raises:
         StorageError: the record is damaged.
@@ -313,8 +313,9 @@ class KeyedRun:
 
 @contextmanager
 def part_of(run: KeyedRun | None, name: str) -> Iterator[KeyedRun | None]:
-    """A folder in that of a run, for one of several trainings of it, locked while it is open; the run itself where
-    `name` is empty, None without one.
+    """Yield a locked subfolder of a run for one of its trainings.
+
+    The run itself is returned for an empty `name`, None without a run.
     """
     if run is None or not name:
         yield run

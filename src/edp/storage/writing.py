@@ -1,4 +1,4 @@
-"""Writing files so that a kill or a full disk leaves either the old file or the new one, never half of one."""
+"""Atomic writing of files: a kill or a full disk leaves either the old file or the new one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from edp.storage.seals import sealed
 
 
 def storage_error(path: Path, error: OSError, doing: str) -> StorageError:
-    """A message that says what could not be done, where and why."""
+    """Return an error that names the failed operation, the path and the reason."""
     reason = error.strerror or str(error)
     return StorageError(f"cannot {doing} '{path}': {reason}; free space or choose a folder you may write to")
 
@@ -65,7 +65,7 @@ def make_folder(path: str | Path) -> Path:
 
 
 def check_writable(folder: str | Path) -> Path:
-    """Make a folder and see that files can be written there, before a long job begins; nothing is left.
+    """Make a folder and check that files can be written there, before a long job begins. No file remains.
 
     Raises:
         StorageError: it cannot be made or written.
@@ -121,7 +121,7 @@ def _remove_left(folder: Path) -> None:
 
 
 def _temporary(target: Path) -> tuple[int, str]:
-    """A new file beside `target`, with the rights that the user's umask leaves to any new file."""
+    """Create a new file next to `target`, with the permissions that the user's umask gives to new files."""
     while True:
         # Beside the target: a rename is atomic only within a file system. Cut: names have 255 bytes at most.
         name = f"{target.parent}/.{target.name[:80]}.{secrets.token_hex(6)}.tmp"
@@ -150,7 +150,7 @@ def _naming(target: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it is synced and renamed over `path`, else removed.
+    """Yield a temporary path next to `path`; on success it is synced and renamed to `path`, otherwise removed.
 
     Raises:
         StorageError: the disk is full, the folder is read-only, a folder is in the way, or the rename failed.
@@ -185,7 +185,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; on success it is renamed to `path`, else removed with what is in it.
+    """Yield a temporary folder next to `path`; on success it is renamed to `path`, otherwise removed with its content.
 
     Args:
         path: not there yet, or an empty folder.
@@ -215,7 +215,7 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what a process that was killed while it wrote has left; only for who holds the folder."""
+    """Remove temporary files of killed writers. Only the process that holds the folder may call it."""
     for rest in entries_of(folder, ".*.tmp"):
         # A link of this name is not ours.
         if is_file_at(rest) and not is_link_at(rest):

@@ -1,4 +1,4 @@
-"""What EDP relies on of its parts, as functions that a third party can call on its own ones.
+"""Contracts of EDP's parts as functions that third parties can call on their own parts.
 
 ``check_block(MyBlock)`` and its like raise `ContractError`, an `AssertionError`, with what is wrong; they need no test
 runner. A part is registered first, as docs/architecture.md tells. EDP's own tests call the same functions.

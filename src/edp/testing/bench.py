@@ -17,7 +17,7 @@ LOWEST, HIGHEST = (-0.5, 0.0, 0.0, 0.0, 1e6), (0.5, 1.0, 2e7, 2e7, 2e7)
 
 
 def bench_channels(lever: str = "lever", description: str = "") -> TwinChannels:
-    """A cylinder with stroke, both chambers and its pump, moved by one lever."""
+    """Return the channels of a cylinder with stroke, both chambers and its pump, moved by one lever."""
     return TwinChannels(
         (Channel(lever, Kind.RATIO, description),),
         (Channel("speed", Kind.VELOCITY),),
@@ -28,7 +28,7 @@ def bench_channels(lever: str = "lever", description: str = "") -> TwinChannels:
 
 
 def bench_grey_box(**options: Any) -> GreyBox:
-    """Its elements; `options` are those of the grey box beside them."""
+    """Return its grey box with additional `options`."""
     return GreyBox(
         cylinders=(CylinderElement(name="ram", velocity="speed", head="head", rod="rod", bore=0.1, rod_diameter=0.06),),
         valves=(ValveElement(name="valve", actuator="ram", extend="lever", supply="pump"),),

@@ -25,7 +25,7 @@ PULL, CALM = 0.3, 0.2
 
 
 def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:
-    """A twin of one of the floors, fitted to two minutes of a simulated machine in free air.
+    """Return a baseline twin fitted to two minutes of a simulated machine in free air.
 
     Args:
         machine: name or file of the machine.
@@ -37,7 +37,7 @@ def sample_excavator_twin(machine: str = "M22", kind: str = "static") -> Twin:
 
 
 def sample_recurrent_twin(units: int, machine: str = "M22") -> TwinBundle:
-    """A recurrent twin that is pulled to a static map of two minutes; its memory is as drawn, and adds little."""
+    """Return a recurrent twin with a static map fitted to two minutes; its memory is random and has little effect."""
     channels, scales, series = _sample(machine)
     spec = Recurrent(units=units, valve_map=True)
     twin = spec.start(channels, scales, series, 0)
@@ -49,7 +49,7 @@ def sample_recurrent_twin(units: int, machine: str = "M22") -> TwinBundle:
 
 
 def sample_grey_box(machine: str = "M22") -> TwinBundle:
-    """A grey box with the linkage of a machine, as a fit begins with it: nobody fitted its numbers."""
+    """Return an unfitted grey box with the linkage of a machine, as at the start of a fit."""
     channels, scales, series = _sample(machine)
     spec = GreyBox(linkage=machine)
     return TwinBundle(spec, spec.start(channels, scales, series, 0))

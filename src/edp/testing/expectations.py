@@ -1,4 +1,4 @@
-"""How a contract says that it is broken; nothing here needs a test runner."""
+"""Reporting of broken contracts, independent of test runners."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class ContractError(AssertionError):
-    """A part does not do what EDP relies on; test runners count it as a failure."""
+    """Part that violates a contract of EDP; test runners count it as a failure."""
 
 
 def expect(condition: bool, message: str) -> None:

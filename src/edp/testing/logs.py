@@ -1,4 +1,4 @@
-"""The contract of a log format: what it writes it reads to the last bit; damaged files are told, never a crash."""
+"""Contract of a log format: written files are read bit for bit; damaged files give an error, not a crash."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def sample_recording(rate_hz: float = 100.0, ticks: int = 400) -> Recording:
 
 
 def written_log(form: LogFormat, recording: Recording, folder: Path) -> Path:
-    """A file that a format wrote, under its first ending."""
+    """Write a recording with a format, under its first ending, and return the path."""
     path = folder / f"{recording.name}{form.suffixes[0]}"
     form.write(recording, path, WriteOptions())
     return path
 
 
 def read_log(form: LogFormat, path: Path) -> Recording:
-    """A file as a format reads it, in this process; `edp.read` gives each log a process of its own.
+    """Read a file with a format in this process; `edp.read` uses a separate process for each log.
 
     Raises:
         EdpError: the file cannot be used.
@@ -53,7 +53,7 @@ def read_log(form: LogFormat, path: Path) -> Recording:
 
 
 def check_round_trip(form: LogFormat, recording: Recording) -> None:
-    """What is written is read to the last bit, with channels, rate and name.
+    """Check that a written file is read back bit for bit, with channels, rate and name.
 
     Raises:
         ContractError: something of it is lost or changed.
@@ -74,7 +74,7 @@ def check_round_trip(form: LogFormat, recording: Recording) -> None:
 
 
 def check_damage(form: LogFormat) -> None:
-    """Files that are cut off, or hold something else, end in an error for the user and in nothing else.
+    """Check that truncated files and files of other content raise a user error only.
 
     Raises:
         ContractError: another exception, or noise that is read as a log.

@@ -27,7 +27,7 @@ Batch = tuple[Tensor, Tensor, Tensor]
 
 
 def loss_network(output: str, dtype: torch.dtype = torch.float64, task: Task = TASK) -> Predictor:
-    """A small network with an output of the registry, for `task`."""
+    """Return a small network with a registered output, for `task`."""
     shape = (len(task.horizons), len(task.targets))
     rng = np.random.default_rng(3)
     scaler = Scaler(np.zeros(3), rng.uniform(0.5, 2, 3), np.zeros(shape), rng.uniform(0.5, 2, shape))
@@ -36,7 +36,7 @@ def loss_network(output: str, dtype: torch.dtype = torch.float64, task: Task = T
 
 
 def loss_batch(streams: int = 4, ticks: int = 12, seed: int = 0) -> Batch:
-    """Inputs ``(batch, time, input)``, future targets ``(batch, time, horizon, target)`` and which ticks count."""
+    """Return inputs ``(batch, time, input)``, targets ``(batch, time, horizon, target)`` and the valid mask."""
     rng = np.random.default_rng(seed)
     valid = rng.random((streams, ticks)) > 0.2
     # Ticks of a burn-in count for no stream; the others are drawn.
@@ -49,7 +49,7 @@ def loss_batch(streams: int = 4, ticks: int = 12, seed: int = 0) -> Batch:
 
 
 def objective_of(loss: str, **options: Any) -> TrainingSpec:
-    """A training with every term, weight and decay beside the loss."""
+    """Return training settings with every term, weight and decay in addition to the loss."""
     return TrainingSpec(
         loss=LOSSES[loss](),
         terms=tuple(TERMS[name]() for name in TERMS),
@@ -61,14 +61,14 @@ def objective_of(loss: str, **options: Any) -> TrainingSpec:
 
 
 def objective_value(network: Predictor, spec: TrainingSpec, batch: Batch) -> Tensor:
-    """The objective of a batch, a scalar."""
+    """Return the objective of a batch, a scalar."""
     x, future, valid = batch
     answer, features, _ = network.run(x, network.initial_state(len(x), x))
     return Objective(spec, network.code).evaluate(answer, future, features, valid)
 
 
 def check_objective(loss: str, output: str) -> None:
-    """The objective is finite and its gradient reaches every parameter."""
+    """Check that the objective is finite and its gradient reaches every parameter."""
     network = loss_network(output)
     value = objective_value(network, objective_of(loss), loss_batch())
     expect(bool(torch.isfinite(value)), f"the objective is {value.item()}")
@@ -83,7 +83,7 @@ def check_objective(loss: str, output: str) -> None:
 
 
 def check_order_of_streams(loss: str, output: str) -> None:
-    """The order of the streams in a batch does not matter."""
+    """Check that the order of the streams in a batch does not matter."""
     network, batch = loss_network(output), loss_batch()
     x, future, valid = (part[[2, 0, 3, 1]] for part in batch)
     with torch.no_grad():
@@ -105,7 +105,7 @@ def check_masked_ticks(loss: str, output: str) -> None:
 
 
 def check_least_value(loss: str, output: str) -> None:
-    """A perfect prediction has the least loss, and one that is farther off has more; for a point the least is zero."""
+    """Check that a perfect prediction has the least loss and a worse one has more; for a point the least is zero."""
     network, spec = loss_network(output), LOSSES[loss]()
     x, _, _ = loss_batch()
     with torch.no_grad():

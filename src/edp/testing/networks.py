@@ -47,14 +47,14 @@ SMALL_BACKBONES: Mapping[str, BackboneSpec] = {
 
 
 def small_task(model: ModelSpec, horizons: tuple[int, ...] = (1, 4), mode: TargetMode = TargetMode.DELTA) -> Task:
-    """Two targets from six features, one of which is derived from a channel that is no feature."""
+    """Return a task with two targets and six features, one derived from a channel that is not a feature."""
     extra = () if model.physics is None else model.physics.channels()
     physics = tuple(name for name in extra if name not in FEATURES.inputs)
     return Task(FEATURES, TARGETS, horizons, mode, 100.0, physics=physics)
 
 
 def small_network(model: ModelSpec, task: Task, shake: float = 0.2) -> Predictor:
-    """A network with drawn scaling, in single precision and in evaluation mode.
+    """Return a network with random scaling, in single precision and evaluation mode.
 
     Args:
         model: its structure.
@@ -87,14 +87,14 @@ def small_network(model: ModelSpec, task: Task, shake: float = 0.2) -> Predictor
 
 
 def _draw_tables(trees: Trees, rng: np.random.Generator) -> None:
-    """Tables whose every node may go either way: those of a fresh network give zero."""
+    """Set random tables whose nodes can go both ways, since the tables of a new network give zero."""
     feature = rng.integers(0, trees.width, trees.feature.shape)
     threshold, leaf = (rng.normal(size=table.shape).astype(np.float32) for table in (trees.threshold, trees.leaf))
     trees.set_tables(feature, threshold, 0.1 * leaf)
 
 
 def check_spec(registry: Registry[Any], name: str) -> None:
-    """A registered part is a frozen dataclass with defaults for all its options, and survives JSON.
+    """Check that a registered part is a frozen dataclass with defaults for all options, and survives JSON.
 
     Raises:
         ContractError: one of them does not hold.
@@ -118,7 +118,7 @@ def check_spec(registry: Registry[Any], name: str) -> None:
 
 
 def check_space(block: type[Any]) -> None:
-    """A block names its slot, and the search space of its options holds values that it takes.
+    """Check that a block names its slot, and that its search space holds valid option values.
 
     Raises:
         ContractError: no slot, an option that it does not have, or a value that it refuses.

@@ -1,4 +1,4 @@
-"""The contract of declared operations: a part says exactly which primitive operations it computes with."""
+"""Contract of declared operations: a part declares exactly the primitive operations that it uses."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ FREE = {
 
 
 def declaration_errors(network: nn.Module, seen: Trace) -> list[str]:
-    """Where the operations that a trace has seen and those that the modules declare differ."""
+    """Return the differences between traced and declared operations."""
     errors = []
     for name, module in network.named_modules():
         declared: frozenset[Operation] = getattr(module, "operations", frozenset())
@@ -99,7 +99,7 @@ def declaration_errors(network: nn.Module, seen: Trace) -> list[str]:
 
 
 def check_operations(predictor: Predictor) -> None:
-    """Every part declares in `operations` exactly what it computes with, so that an export target can refuse it.
+    """Check that every part declares in `operations` exactly what it uses, so that an export target can refuse it.
 
     Args:
         predictor: in double precision, in evaluation mode.

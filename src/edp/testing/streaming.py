@@ -35,7 +35,7 @@ MACHINE_CONSTANTS = 800
 
 
 def drawn_inputs(predictor: Predictor, batch: int = 2, ticks: int = TICKS, seed: int = 0) -> Tensor:
-    """Inputs drawn at random, ``(batch, time, input)``, of the predictor's type."""
+    """Return random inputs, ``(batch, time, input)``, of the predictor's type."""
     like = next(predictor.parameters())
     draw = torch.Generator().manual_seed(seed)
     return torch.randn(batch, ticks, predictor.front.inputs, generator=draw, dtype=like.dtype)
@@ -90,7 +90,7 @@ def check_causality(predictor: Predictor) -> None:
 
 
 def check_chunks(predictor: Predictor) -> None:
-    """A tick at a time, a chunk with carried state, and a whole window agree at the last sample.
+    """Check that single samples, chunks with carried state, and a whole window agree at the last sample.
 
     Args:
         predictor: in double precision, in evaluation mode.
@@ -114,7 +114,7 @@ def check_chunks(predictor: Predictor) -> None:
 
 
 def check_reset(predictor: Predictor) -> None:
-    """A reset forgets everything in the streams it is asked for, and nothing in the others.
+    """Check that a reset clears the requested streams and leaves the others.
 
     Args:
         predictor: in double precision, in evaluation mode.
@@ -132,7 +132,7 @@ def check_reset(predictor: Predictor) -> None:
 
 
 def check_state_is_left(predictor: Predictor) -> None:
-    """A run does not change the state that it was given."""
+    """Check that a run does not change the state that it was given."""
     _, state = run_network(predictor, drawn_inputs(predictor))
     copies = map_state(torch.clone, state)
     run_network(predictor, drawn_inputs(predictor, seed=3), state)
@@ -145,7 +145,7 @@ def check_state_is_left(predictor: Predictor) -> None:
 
 
 def check_determinism(predictor: Predictor) -> None:
-    """Evaluation has no chance in it; training has where there is dropout.
+    """Check that evaluation is deterministic, and that training is random if there is dropout.
 
     Args:
         predictor: in single precision, in evaluation mode.
@@ -175,7 +175,7 @@ def check_batch(predictor: Predictor) -> None:
 
 
 def check_gradients(predictor: Predictor) -> None:
-    """The error reaches every parameter that learns; only an untrained skip connection may have others.
+    """Check that the error reaches every trainable parameter, except those of an untrained skip connection.
 
     Args:
         predictor: in double precision.
@@ -200,7 +200,7 @@ def check_gradients(predictor: Predictor) -> None:
 
 
 def check_parameters_counted(predictor: Predictor) -> None:
-    """The parts count every parameter once, and those that an inference build folds away."""
+    """Check that the parts count every parameter once, including those that an inference build folds away."""
     rows, named = predictor.costs(), dict(predictor.named_parameters())
     counted, there = sum(row.parameters for row in rows), sum(parameter.numel() for parameter in named.values())
     expect(counted == there, f"the parts count {counted} parameters, the network has {there}")
@@ -213,7 +213,7 @@ def check_parameters_counted(predictor: Predictor) -> None:
 
 
 def check_work_counted(predictor: Predictor) -> None:
-    """The parts count the multiply-accumulates that a tick runs, seen by tracing it.
+    """Check the multiply-accumulates declared by the parts against a trace of one sample.
 
     Raises:
         ContractError: a part counts others than it runs, or hides what it multiplies.
@@ -225,7 +225,7 @@ def check_work_counted(predictor: Predictor) -> None:
 
 
 def check_graph(predictor: Predictor) -> None:
-    """The list of layers that exports read means what the network computes.
+    """Check that the layer graph for exports computes the same as the network.
 
     Args:
         predictor: in double precision, with weights that single precision holds.
@@ -250,7 +250,7 @@ def check_graph(predictor: Predictor) -> None:
 
 
 def check_graph_costs(predictor: Predictor) -> None:
-    """The list of layers counts the multiply-accumulates that the network counts, and carries and holds no more."""
+    """Check that the layer graph has the multiply-accumulates of the network, and no larger state."""
     graph = predictor.graph()
     # A physics base has no weights: its arithmetic is element by element.
     costs = [cost for cost in predictor.costs() if not cost.part.startswith("physics base")]
@@ -301,7 +301,7 @@ def _layout(state: State) -> list[tuple[torch.Size, torch.dtype]]:
 
 
 def _streamed(predictor: Predictor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Inputs ``(time, input)``, predictions and, where there are any, bounds, as PyTorch streams them."""
+    """Return inputs ``(time, input)``, predictions and, if there are any, bounds, as streamed by PyTorch."""
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(1, TICKS, predictor.front.inputs, generator=draw).double()
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The contract of an export target: it writes each network, or refuses it with the reason and leaves nothing behind."""
+"""Contract of an export target: it writes each network, or refuses it with a reason and leaves no files."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Options = Mapping[str, object] | None
 
 
 def bundle_around(predictor: Predictor) -> Bundle:
-    """A bundle of a network, its channels of the vocabulary or generic."""
+    """Return a bundle of a network with channels from the vocabulary or generic ones."""
     task = predictor.task
     inputs = tuple(TABLE_A1.get(name) or Channel(name, Kind.GENERIC, "an input") for name in task.inputs)
     return Bundle(predictor, inputs, (Kind.GENERIC,) * len(task.targets), task.targets)
 
 
 def check_written(target: str, bundle: Bundle, folder: Path, options: Options = None) -> None:
-    """A target writes a bundle: files that are there, in the folder, the first one not empty.
+    """Check that a target writes a bundle: existing files in the folder, the first one not empty.
 
     Raises:
         ContractError: it does not.
@@ -46,7 +46,7 @@ def check_written(target: str, bundle: Bundle, folder: Path, options: Options = 
 
 
 def refusal_of(target: str, bundle: Bundle, folder: Path, options: Options = None) -> str:
-    """The reason for which a target does not write a bundle; empty where it does.
+    """Return the reason why a target refuses a bundle; empty if it writes the bundle.
 
     Raises:
         ContractError: it writes something else than it says, or leaves something behind a refusal.
@@ -62,7 +62,7 @@ def refusal_of(target: str, bundle: Bundle, folder: Path, options: Options = Non
 
 
 def check_names_refused(target: str, bundle: Bundle, folder: Path, options: Options = None) -> None:
-    """Names that no program can carry are refused, and nothing is written.
+    """Check that invalid program names are refused and nothing is written.
 
     Raises:
         ContractError: one is taken, or something is left behind.

@@ -1,4 +1,4 @@
-"""The cell of a recurrent twin written plainly, tick by tick: what the compiled loop is held to, and timed against."""
+"""Plain implementation of the cell of a recurrent twin, sample by sample: reference for the compiled loop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def plain_steps(
     bounds: Bounds,
     mapped: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """What `TwinNetwork.forward` computes, with the same arguments; autograd keeps a graph of every tick."""
+    """Compute `TwinNetwork.forward` with the same arguments; autograd stores a graph of every sample."""
     change, low, high, trapezoid = (torch.from_numpy(values) for values in bounds.arrays)
     n, units, strokes = bounds.velocities, network.units, len(bounds.trapezoid)
     answer, h = start

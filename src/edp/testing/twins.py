@@ -1,4 +1,4 @@
-"""The contract of a twin: what commands, ports and state are to each other, whatever the formulation."""
+"""Contract of a twin: relation between commands, ports and state for any formulation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FRONT_STROKES = (1.26, 1.504, 1.104)
 def sample_actuators(
     ticks: int = 600, seed: int = 0, axes: int = 2, strokes: bool = True, pressures: bool = True
 ) -> Recording:
-    """A recording of actuators with dead band, lag and end stops, each driven by a lever of its own.
+    """Return a recording of actuators with dead band, lag and end stops, each driven by its own lever.
 
     Args:
         ticks: length, at 50 Hz.
@@ -55,7 +55,9 @@ def sample_actuators(
 
 
 def sample_front(ticks: int = 600, seed: int = 0) -> Recording:
-    """A recording with the channels of an excavator front; levers, strokes and pressures drawn apart, at 50 Hz.
+    """Return a recording with the channels of an excavator front.
+
+    Independent random levers, strokes and pressures, 50 Hz.
 
     Args:
         ticks: length.
@@ -79,7 +81,7 @@ def sample_front(ticks: int = 600, seed: int = 0) -> Recording:
 
 
 def sample_twin(spec: TwinSpec, recording: Recording | None = None) -> tuple[Twin, Array, Array]:
-    """A twin of sample actuators, with commands and measured values ``(batch, tick, channel)`` to run it on.
+    """Return a twin of sample actuators with commands and measured values ``(batch, tick, channel)``.
 
     Args:
         spec: the formulation; what needs training keeps the weights that it starts with.
@@ -97,7 +99,7 @@ def sample_twin(spec: TwinSpec, recording: Recording | None = None) -> tuple[Twi
 
 
 def check_twin(name: str, options: TwinSpec | None = None, recordings: Sequence[Recording] = ()) -> None:
-    """Hold a registered formulation to its contract, for two actuators and for one with the least of sensors.
+    """Check the contract of a registered formulation, for two actuators and for one with minimal sensors.
 
     Args:
         name: under which it is registered.
@@ -121,7 +123,7 @@ def check_twin(name: str, options: TwinSpec | None = None, recordings: Sequence[
 
 
 def _chunks(twin: Twin, commands: Array, measured: Array, state: TwinState, where: str) -> None:
-    """Ticks, chunks and a run that goes on from a copied state are the whole run, to the bit, in every mode."""
+    """Check that samples, chunks and continued runs equal the whole run bit for bit, in every mode."""
     mixed = np.where(np.random.default_rng(2).random(measured.shape) < 0.5, measured, np.nan).astype(np.float32)
     none, same = twin.rollout(commands[:, :0], state)
     expect(none.shape[1] == 0 and same is state, f"{where}: a run of no ticks changes the state")
@@ -154,7 +156,7 @@ def _causality(twin: Twin, commands: Array, measured: Array, state: TwinState, w
 
 
 def _ports(twin: Twin, commands: Array, measured: Array, state: TwinState, where: str) -> None:
-    """A free port reads the last answer, and nothing else; a measured one does not."""
+    """Check that a free port reads the last output only, and a measured port does not."""
     free, _ = twin.rollout(commands, state)
     fed = np.concatenate([np.full_like(free[:, :1], np.nan), free[:, :-1]], axis=1)
     again, _ = twin.rollout(commands, state, fed)
@@ -178,7 +180,7 @@ def _lanes(twin: Twin, commands: Array, measured: Array, state: TwinState, where
 
 
 def _branches(twin: Twin, commands: Array, measured: Array, state: TwinState, where: str) -> None:
-    """Runs that branch off one another are runs of their own from the same state."""
+    """Check that branching runs equal separate runs from the same state."""
     first = np.array([0, 0, 5, 9])
     runs = np.repeat(commands[:1], len(first), axis=0)
     for run, tick in enumerate(first[1:], start=1):
@@ -204,7 +206,7 @@ def _branches(twin: Twin, commands: Array, measured: Array, state: TwinState, wh
 
 
 def _bounds(twin: Twin, commands: Array, measured: Array, state: TwinState, where: str) -> None:
-    """Answers stay within the bounds whatever is commanded, and a stroke is the integral of its velocity."""
+    """Check that outputs stay within bounds for any command, and that a stroke is the integral of its velocity."""
     for command in (-1e3, 1e3):
         answers, _ = twin.rollout(np.full_like(commands, command), state)
         slack = 1e-5 * (twin.scales.high - twin.scales.low)
@@ -222,7 +224,7 @@ def _bounds(twin: Twin, commands: Array, measured: Array, state: TwinState, wher
 
 
 def _arrays(spec: TwinSpec, twin: Twin, commands: Array, state: TwinState, where: str) -> None:
-    """What `arrays` gives is what `shapes` announces, and the twin that `build` makes of it is the same one."""
+    """Check that `arrays` matches `shapes`, and that `build` restores an equal twin from it."""
     arrays = twin.arrays()
     shapes = {key: values.shape for key, values in arrays.items() if key not in twin.scales.arrays()}
     expect(shapes == dict(spec.shapes(twin.channels)), f"{where}: its arrays have other shapes than it announces")

@@ -1,4 +1,4 @@
-"""The inner loop: some steps of plain gradient descent on a few pieces, as a function of the weights."""
+"""Inner loop of meta-learning: plain gradient descent on a few segments, as a function of the weights."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Pieces = tuple[Tensor, Tensor, Tensor]
 
 
 class _Exposed(nn.Module):
-    """`Predictor.expose` as the call of a module, which is what can be computed with other weights."""
+    """Wrapper that makes `Predictor.expose` the call of a module, so that it can be evaluated with other weights."""
 
     def __init__(self, net: Predictor) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class _Exposed(nn.Module):
 
 
 def loss_with(net: Predictor, weights: Mapping[str, Tensor], objective: Objective, pieces: Pieces) -> Tensor:
-    """The loss of a network with other weights on pieces from reset.
+    """Return the loss of a network with other weights on segments from reset.
 
     Args:
         net: the network.

@@ -1,4 +1,4 @@
-"""Averages of the weights over training: what is validated and kept."""
+"""Averages of the weights over training, which are validated and stored."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class AverageSpec(Protocol):
         ...
 
     def factor(self, factor: float, update: int, updates: int) -> float:
-        """Share of the base learning rate at an update, from that of the schedule."""
+        """Return the fraction of the base learning rate at an update, from the schedule's fraction."""
         ...
 
     def may_stop(self) -> bool:
-        """Whether a training may end early without losing what the average is for."""
+        """Return whether training may end early without losing the benefit of the average."""
         ...
 
 
@@ -39,7 +39,7 @@ class NoAverage:
         return 1.0
 
     def factor(self, factor: float, update: int, updates: int) -> float:
-        """As the schedule says."""
+        """Return the schedule's fraction."""
         return factor
 
     def may_stop(self) -> bool:
@@ -72,7 +72,7 @@ class Exponential:
         return 1.0 - min(self.decay, (1 + update) / (10 + update))
 
     def factor(self, factor: float, update: int, updates: int) -> float:
-        """As the schedule says."""
+        """Return the schedule's fraction."""
         return factor
 
     def may_stop(self) -> bool:
@@ -106,11 +106,11 @@ class Stochastic:
         return updates - max(1, round(self.share * updates))
 
     def step(self, update: int, updates: int) -> float:
-        """The n-th averaged update moves the mean by ``1 / n``."""
+        """Return the step of the mean: ``1 / n`` for the n-th averaged update."""
         return 1.0 / max(1, update - self._begin(updates))
 
     def factor(self, factor: float, update: int, updates: int) -> float:
-        """The constant rate while averaging."""
+        """Return the constant rate during averaging."""
         return self.rate if self.rate and update > self._begin(updates) else factor
 
     def may_stop(self) -> bool:

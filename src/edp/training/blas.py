@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """One thread for NumPy's linear algebra within, also as a decorator; those of torch stay.
+    """Limit NumPy's linear algebra to one thread inside the block, also as a decorator; torch threads stay.
 
     Matrices here are small. Threads of OpenBLAS wait for one another by spinning, which costs processor time wherever
     another process has a core: docs/findings.md has what it cost trainings.

@@ -1,4 +1,4 @@
-"""Bundles: a trained predictor on disk as safetensors and JSON; loading one executes nothing."""
+"""Bundles: trained predictors on disk as safetensors and JSON; loading does not execute code."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ MOST_RATE_HZ, MOST_BITS = 1e6, 64
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A trained predictor with what a user of it must know.
+    """Trained predictor with its channels, provenance and scores.
 
     Attributes:
         predictor: the network with its scaler, in evaluation mode.
@@ -77,14 +77,14 @@ class Bundle:
 
     @property
     def task(self) -> Task:
-        """What the predictor reads and predicts."""
+        """Task of the predictor: inputs and targets."""
         return self.predictor.task
 
 
 def make_bundle(
     predictor: Predictor, data: Prepared, provenance: Mapping[str, Any], scores: Mapping[str, Any] | None = None
 ) -> Bundle:
-    """A bundle of a predictor trained on `data`."""
+    """Create a bundle of a predictor trained with `data`."""
     return Bundle(predictor, data.inputs, data.target_kinds, data.descriptions, provenance, scores or {})
 
 
@@ -164,7 +164,7 @@ def _integers_bytes(predictor: IntegerPredictor) -> bytes:
 
 
 def write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
-    """Write arrays beside the weights; returns file and digest."""
+    """Write arrays next to the weights; return file name and digest."""
     digest = digest_of_bytes(data)
     file = f"{what}-{digest[:12]}.safetensors"
     write_bytes(path / file, data)
@@ -232,7 +232,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
 
 
 def _reworded(header: Mapping[str, Any]) -> dict[str, Any]:
-    """An earlier header with the keys of this version."""
+    """Convert the keys of an earlier header to this version."""
     reworded = {**header, "provenance": _renamed(header["provenance"], "lesson", "strategy")}
     if "adaptation" in header:
         entry = header["adaptation"]
@@ -259,7 +259,7 @@ def _bundle_folder(folder: str | Path) -> Path:
 
 @contextlib.contextmanager
 def as_damage(path: Path) -> Iterator[None]:
-    """What goes wrong in a file of a bundle, as one message that names the bundle."""
+    """Convert errors in a file of a bundle to one message that names the bundle."""
     # A damaged file can raise any of these deep in a parser; a bug elsewhere keeps its own type.
     kinds = (EdpError, LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError)
     try:
@@ -281,7 +281,7 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 
 def _assembled(header: dict[str, Any], path: Path) -> Bundle:
-    """The bundle that a header and the files that it names stand for."""
+    """Build the bundle from a header and its files."""
     spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
     inputs = tuple(Channel(_text(c["name"]), Kind(c["kind"]), _text(c["description"])) for c in header["inputs"])
     kinds = tuple(Kind(c["kind"]) for c in header["outputs"])
@@ -300,7 +300,7 @@ def _assembled(header: dict[str, Any], path: Path) -> Bundle:
 
 
 def _check_channels(header: Mapping[str, Any], task: Task, inputs: Sequence[Channel]) -> None:
-    """The channels that are listed are those of the task, in its order."""
+    """Check that the listed channels are those of the task, in its order."""
     # Order is meaning: swapped columns would give plausible and wrong predictions.
     if [channel.name for channel in inputs] != list(task.inputs):
         raise ValueError("its inputs are not those of its task")
@@ -330,7 +330,7 @@ def _formats(plain: Any) -> dict[str, int]:
 
 
 def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Put weights into a network: all of them, of its shapes and types, finite, and widths above 0."""
+    """Load weights into a network after a check of names, shapes, types, finiteness and positive widths."""
     expected = predictor.state_dict()
     # Both directions: a missing weight keeps a random start, a spare one belongs to another network.
     other = sorted({*expected} ^ {*tensors})
@@ -386,7 +386,7 @@ def _check_schema(header: Mapping[str, Any], path: Path) -> None:
 
 
 def read_arrays(path: Path, entry: Mapping[str, str]) -> bytes:
-    """A file of arrays that a header names, checked against its digest."""
+    """Read a file of arrays named in a header, and check its digest."""
     file = path / Path(_text(entry["file"])).name  # never a path out of the bundle
     if not is_entry_at(file):
         raise BundleError(f"bundle '{path}' lacks its weights '{file.name}'; restore the bundle")
@@ -397,6 +397,6 @@ def read_arrays(path: Path, entry: Mapping[str, str]) -> bytes:
 
 
 def blank_scaler(task: Task) -> Scaler:
-    """Placeholders of the right shape; the weights file holds the fitted numbers."""
+    """Return a placeholder scaler of the right shape; the weights file holds the fitted values."""
     features, shape = len(task.features.features), (len(task.horizons), len(task.targets))
     return Scaler(np.zeros(features), np.ones(features), np.zeros(shape), np.ones(shape))

@@ -31,7 +31,7 @@ REFIT = "refit.safetensors"
 
 @dataclass
 class TrainingPosition:
-    """Where a training stands after an integer number of epochs."""
+    """Training position after an integer number of epochs."""
 
     epoch: int = 0
     updates: int = 0
@@ -44,7 +44,7 @@ class TrainingPosition:
 
 @dataclass
 class Within:
-    """Where a training stands inside an epoch.
+    """Training position inside an epoch.
 
     Attributes:
         updates: updates of the epoch so far.
@@ -64,7 +64,7 @@ class Within:
 
 @dataclass
 class Weights:
-    """Named tensors of the net itself, its average, and the best so far; and the running errors of its outputs."""
+    """Named tensors of the network, its average and the best so far; and the running errors of its outputs."""
 
     current: dict[str, Tensor]
     average: dict[str, Tensor]
@@ -87,7 +87,7 @@ def save_checkpoint(
 
 
 def load_checkpoint(path: Path, key: str) -> tuple[TrainingPosition, Weights, dict[str, Any]] | None:
-    """Progress, weights and optimiser state of the run `key`, or None where there is no checkpoint yet.
+    """Return progress, weights and optimiser state of the run `key`; None without a checkpoint.
 
     Raises:
         StorageError: the file is damaged, in a single bit, too, or belongs to another run.
@@ -107,7 +107,7 @@ def load_checkpoint(path: Path, key: str) -> tuple[TrainingPosition, Weights, di
 
 
 def damaged(path: Path, error: Exception) -> StorageError:
-    """What is said of a checkpoint that cannot be gone on from; it is left where it is."""
+    """Return the error for a damaged checkpoint, which stays on disk."""
     return StorageError(f"checkpoint '{path}' is damaged ({error}); remove it to train from the start")
 
 
@@ -126,12 +126,12 @@ def _taken_apart(
 
 
 def optimizer_state(plain: dict[str, Any]) -> dict[str, Any]:
-    """What an optimiser loads, from its form with text as keys."""
+    """Return an optimiser state for loading, from its form with text keys."""
     return {**plain, "state": {int(index): value for index, value in plain["state"].items()}}
 
 
 def pack(tree: Any) -> bytes:
-    """A tree of tables, lists, tuples, tensors and plain values as safetensors; keys become text."""
+    """Serialise a tree of tables, lists, tuples, tensors and plain values as safetensors; keys become text."""
     tensors: dict[str, Tensor] = {}
     plain = _strip(tree, "", tensors)
     # Parts of one tensor may share their memory, which the format refuses.
@@ -140,7 +140,7 @@ def pack(tree: Any) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """The tree that `pack` was given, to the bit."""
+    """Restore the tree given to `pack`, bit for bit."""
     return _restore(_header(data), load(data))
 
 

@@ -1,4 +1,4 @@
-"""What a fine-tuning changed in a network, in kilobytes: matrices in few bits, whole or as products of two narrow ones.
+"""Change of a network by fine-tuning in kilobytes: matrices with few bits, whole or as low-rank products.
 
 The change ``W' - W`` of each matrix is kept whole, in as many bits a number (8 to 4, with a scale a row) as there is
 room for. Where 4 are too many it is cut to its largest singular values (Eckart and Young 1936), in 8 bits; which ones
@@ -46,7 +46,7 @@ MOST_BITS, LEAST_BITS = 8, 4
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A matrix of numbers of few bits with a scale a row."""
+    """Matrix of low-bit integers with one scale per row."""
 
     numbers: Eighths
     scales: NDArray[np.float32]
@@ -54,7 +54,7 @@ class Scaled:
 
     @staticmethod
     def of(matrix: NDArray[np.float64], bits: int = MOST_BITS) -> Scaled:
-        """The nearest one to a matrix."""
+        """Return the nearest scaled matrix."""
         steps = 2 ** (bits - 1) - 1
         scales = (np.abs(matrix).max(axis=1) / steps).astype(np.float32)
         # A row of zeros has a scale of zero; dividing by one leaves its zeros.
@@ -62,14 +62,14 @@ class Scaled:
         return Scaled(np.clip(np.rint(divided), -steps, steps).astype(np.int8), scales, bits)
 
     def packed(self) -> NDArray[np.uint8]:
-        """The numbers without the bits that they do not need."""
+        """Return the integers without their unused bits."""
         raised = (self.numbers.astype(np.int16) + 2 ** (self.bits - 1)).astype(np.uint8)
         planes = np.unpackbits(raised.reshape(-1, 1), axis=1)[:, MOST_BITS - self.bits :]
         return np.packbits(planes)
 
     @staticmethod
     def unpacked(data: NDArray[np.uint8], scales: NDArray[np.float32], columns: int, bits: int) -> Scaled:
-        """What `packed` made bytes of."""
+        """Create a scaled matrix from the bytes of `packed`."""
         count = len(scales) * columns
         planes = np.unpackbits(data, count=count * bits).reshape(count, bits)
         raised = np.packbits(np.pad(planes, ((0, 0), (MOST_BITS - bits, 0))), axis=1)[:, 0].astype(np.int16)
@@ -106,7 +106,7 @@ class Delta:
         return max((len(left.scales) for left, _ in self.narrow.values()), default=0)
 
     def to_bytes(self) -> bytes:
-        """The file: safetensors with a header."""
+        """Return the file content: safetensors with a header."""
         arrays: dict[str, NDArray[Any]] = {f"v:{name}": values for name, values in self.vectors.items()}
         parts = [("w", name, part) for name, part in self.whole.items()]
         for name, pair in self.narrow.items():
@@ -123,7 +123,7 @@ class Delta:
 def delta_of(
     base: Predictor, tuned: Predictor, facts: Mapping[str, Any] | None = None, most_bytes: int = DELTA_BYTES
 ) -> Delta:
-    """The change from a network to a fine-tuned one, within a number of bytes.
+    """Return the change from a network to a fine-tuned one, within a number of bytes.
 
     Args:
         base: before.
@@ -163,7 +163,7 @@ def delta_of(
 
 
 def _ranks(matrices: Mapping[str, NDArray[np.float64]], left: int) -> dict[str, int | None]:
-    """How many singular values of each matrix fit into `left` bytes, most energy a byte first; None for all of it."""
+    """Return the number of singular values per matrix that fit into `left` bytes, by energy per byte; None for all."""
     sizes = {
         name: (matrix.shape[0] + matrix.shape[1] + 8, matrix.size + 4 * len(matrix))
         for name, matrix in matrices.items()
@@ -196,7 +196,7 @@ def _factors(matrix: NDArray[np.float64], rank: int) -> tuple[Scaled, Scaled]:
 
 
 def with_delta(base: Predictor, delta: Delta) -> Predictor:
-    """The network of a machine: a copy of the base with the change added.
+    """Return the network of a machine: a copy of the base with the change added.
 
     Raises:
         BundleError: the delta is one of another network.
@@ -234,7 +234,7 @@ def write_delta(path: str | Path, delta: Delta) -> None:
 
 
 def read_delta(path: str | Path) -> Delta:
-    """A delta from its file.
+    """Read a delta from its file.
 
     Raises:
         BundleError: no delta, a damaged one, or one of a later version.
@@ -243,7 +243,7 @@ def read_delta(path: str | Path) -> Delta:
 
 
 def delta_from_bytes(data: bytes, where: str) -> Delta:
-    """A delta from the bytes of its file; `where` names it in messages."""
+    """Parse a delta from the bytes of its file; `where` names it in messages."""
     try:
         arrays = load(data)
         text = arrays.pop(HEADER).tobytes().decode()

@@ -1,4 +1,4 @@
-"""Fitting the numbers of elements to free runs: Gauss-Newton steps with slopes by complex steps, exact to rounding."""
+"""Fit of element parameters to free runs: Gauss-Newton steps with complex-step derivatives, exact to rounding."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ElementsFit:
 
 
 class _Problem:
-    """Free runs from measured starts; levels that are not measured are free at the start of each."""
+    """Free runs from measured starts; unmeasured levels are free parameters at each start."""
 
     def __init__(self, twin: ElementsTwin, train: Sequence[Series]) -> None:
         self.twin, table = twin, twin.table
@@ -85,7 +85,7 @@ class _Problem:
         self.weight = weight
 
     def size(self) -> tuple[int, int]:
-        """Coordinates of the numbers, and of all."""
+        """Number of parameter coordinates, and of all coordinates."""
         return len(self.nominal), len(self.nominal) + self.hidden * len(self.first)
 
     def numbers(self, theta: NDArray[Any]) -> NDArray[Any]:
@@ -98,7 +98,7 @@ class _Problem:
         )
 
     def errors(self, theta: NDArray[Any], levels: NDArray[Any]) -> NDArray[Any]:
-        """Weighted errors ``(run, tick * answer)`` of lanes with coordinates ``(run, number)``."""
+        """Return weighted errors ``(run, tick * answer)`` of runs with coordinates ``(run, number)``."""
         repeats = len(theta) // len(self.first)
         numbers = self.numbers(theta)
         hidden = np.zeros((len(theta), 0))
@@ -138,7 +138,7 @@ class _Problem:
 
 
 def _padded(rows: NDArray[np.float32], ticks: int, by: str) -> Doubles:
-    """Rows as doubles, as many as asked: the last one again ("edge"), or NaN ("nan")."""
+    """Extend rows to the given number of samples as doubles, with the last one ("edge") or NaN ("nan")."""
     short, values = ticks - len(rows), rows.astype(np.float64)
     if by == "edge":
         return np.pad(values, ((0, short), (0, 0)), mode="edge")
@@ -216,7 +216,7 @@ def fit_elements(
 
 
 def _sheet(twin: ElementsTwin, problem: _Problem, covariance: Doubles) -> list[dict[str, Any]]:
-    """A row for each number with unit and interval, as `edp.networks.twin.grey.datasheet` has them."""
+    """Return one row per parameter with unit and interval, like `edp.networks.twin.grey.datasheet`."""
     rows = []
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     for number, value, deviation in zip(twin.table, twin.numbers, deviations, strict=True):

@@ -87,14 +87,14 @@ def fit(
 
 
 def _rows_of_refit(history: list[dict[str, Any]], best: int, spec: TrainingSpec) -> list[dict[str, Any]]:
-    """A row of the first training for each epoch of the refit; the last one stands for those it did not come to."""
+    """Return a history row of the first training for each epoch of the refit; the last one covers additional epochs."""
     if spec.refit == "best":
         return history[:best]
     return history + history[-1:] * (spec.epochs - len(history))
 
 
 class Loop:
-    """One training: the net, its average, the optimiser, and where it stands.
+    """One training: network, average, optimiser, and position.
 
     Where `refitted` holds the rows of an earlier training, all stretches train, for as many epochs as there are rows;
     what the earlier one validated stands for what cannot be validated any more. With `windowed` what validates is
@@ -149,7 +149,7 @@ class Loop:
             self.progress.best_score = self._validate()[0]
 
     def _sampler(self, series: Sequence[Series]) -> Sampler:
-        """Where batches come from: carried chunks or windows, or what the strategy deals out."""
+        """Create the source of batches: carried chunks or windows, or the strategy's own batches."""
         task, spec = self.data.task, self.spec
         if isinstance(self.strategy, EpisodicStrategy):
             return self.strategy.sampler(series, task, spec)
@@ -173,11 +173,11 @@ class Loop:
             on_event(self._event(self.progress.epoch, self.updates, self.rate, time.perf_counter() - began, row))
 
     def finish(self) -> Fitted:
-        """What a training gives whose last epoch was the latest; this one is over with it."""
+        """Return the fitted model after the last epoch; the training cannot continue."""
         return self._fitted()
 
     def _fitted(self) -> Fitted:
-        """The net with the best weights so far."""
+        """Return the network with the best weights so far."""
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.best[name])
@@ -262,7 +262,7 @@ class Loop:
         return seen
 
     def pause(self) -> Fitted:
-        """What a training that ends here gives; this one is over with it."""
+        """End training before the current epoch is complete and return the model with the best weights so far."""
         self.resumed_at, self.rate = self.progress.epoch, 0.0
         self.progress.history.append(self._judge_epoch(self.within.loss))
         return self._fitted()
@@ -314,7 +314,7 @@ class Loop:
             torch._foreach_lerp_(targets, self.all, step)
 
     def _close_epoch(self, loss: float, seconds: float) -> dict[str, Any] | None:
-        """Validate and choose after an epoch, and keep where the training stands; the row of its history."""
+        """Validate and select after an epoch, and store the training position; return the history row."""
         progress = self.progress
         row = None
         if self.refitted is None:
@@ -338,7 +338,7 @@ class Loop:
         return row
 
     def _judge_epoch(self, loss: float) -> dict[str, Any]:
-        """Validate the averaged weights and keep them where they are the best so far."""
+        """Validate the averaged weights and keep them if they are the best so far."""
         progress = self.progress
         score, report, validation_loss = self._validate()
         for what, value in (("score", score), ("loss", validation_loss)):

@@ -1,4 +1,4 @@
-"""Training a twin on what it is for: free runs, from measured starts everywhere in the recordings.
+"""Training of a twin on free runs from measured starts everywhere in the recordings.
 
 One-step networks drift when they are fed back. Here the loss is taken on the run itself, first short and then longer,
 through the compiled loop and its adjoint; ports stay measured by chance, so that one set of weights serves all modes.
@@ -61,7 +61,7 @@ class FreeRunDiverged(NotFiniteError):
 
 @dataclass(frozen=True, kw_only=True)
 class FreeRunSpec:
-    """How a twin is trained.
+    """Training settings of a twin.
 
     Attributes:
         seed: of the weights, the starts and the measured ports.
@@ -185,7 +185,7 @@ class FreeRunSampler:
         self.first = np.cumsum(self.samples) - self.samples
 
     def rows(self, ticks: int, lanes: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Rows ``(tick + 1, lane)`` of stretches drawn at random; the last row is the truth of the last answer."""
+        """Return rows ``(tick + 1, lane)`` of random segments; the last row is the target of the last output."""
         # Each start is equally likely, so long recordings count by their length.
         starts = self.samples - ticks
         ends = np.cumsum(starts)
@@ -196,7 +196,7 @@ class FreeRunSampler:
 
 
 def measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
-    """Which ports are measured ``(tick, lane, answer)``: 1 in the prefix, later by the shares of the settings."""
+    """Return the measured ports ``(tick, lane, answer)``: 1 in the prefix, later by the fractions in the settings."""
     _, lanes, answers = shape
     kind = rng.random(lanes)
     ports = np.zeros(shape, np.float32)
@@ -294,7 +294,7 @@ def _fitted(
 def _resumed(
     run: KeyedRun | None, network: CellWeights, optimizer: torch.optim.Optimizer
 ) -> tuple[TrainingPosition, dict[str, Tensor]]:
-    """Where the run stands and its best weights; network and optimiser are set to where it stopped."""
+    """Return the position and best weights of a run; network and optimiser are restored."""
     checkpoint = None if run is None else load_checkpoint(run.folder.file(FILE), run.key)
     if run is None or checkpoint is None:
         return TrainingPosition(), copy.deepcopy(network.state_dict())
@@ -315,7 +315,7 @@ def _waited_out(progress: TrainingPosition, spec: FreeRunSpec, total: int) -> bo
 
 
 def answer_weights(twin: Twin, spec: FreeRunSpec) -> Array:
-    """Weight of each answer's error in deviations ``(answer,)``."""
+    """Return the weight of each output's error in standard deviations ``(answer,)``."""
     channels = twin.channels
     counts = (len(channels.velocities), len(channels.strokes), len(channels.pressures))
     return np.repeat(np.array([1.0, spec.stroke_weight, spec.pressure_weight], np.float32), counts)
@@ -357,7 +357,7 @@ def _rate(progress: float, warmup: float) -> float:
 
 
 class FreeRunValidation:
-    """Free runs from even starts in the validation stretches.
+    """Free runs from evenly spaced starts in the validation segments.
 
     Args:
         twin: whose answers are judged.

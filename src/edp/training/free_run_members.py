@@ -1,4 +1,4 @@
-"""Training the members of a recurrent twin apart, each from a seed of its own, and averaging them."""
+"""Separate training of the members of a recurrent twin, each with its own seed, and their average."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class MemberTraining:
 
 
 def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], None] | None = None) -> FittedTwin:
-    """The network that a job trains; the same in any process.
+    """Train the network of a job; the result is the same in any process.
 
     Raises:
         EdpError: see `fit_free_runs`.
@@ -70,7 +70,7 @@ def noting_member(job: MemberTraining) -> FittedTwin:
 
 
 def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:
-    """Trainings side by side as one, from what each noted last; None where none has noted anything."""
+    """Combine the latest progress of parallel trainings; None if there is none yet."""
     noted = [_noted(job) for job in jobs]
     events = [event for event in noted if event is not None]
     if not events:
@@ -127,7 +127,7 @@ def fit_members(
     run: KeyedRun | None = None,
     train_all: TrainAll = one_by_one,
 ) -> FittedTwin:
-    """Train each member of a recurrent twin on free runs of its own, and average them.
+    """Train each member of a recurrent twin on its own free runs, and average them.
 
     Args:
         form: its options.

@@ -70,7 +70,7 @@ class GreyFit:
 
 
 class Tie(Protocol):
-    """Fewer coordinates, of which all numbers of a grey box follow; each in plausible deviations from zero.
+    """Parametrisation: fewer coordinates for all grey-box parameters, in prior standard deviations from zero.
 
     Attributes:
         begin: where a fit begins ``(coordinate,)``.
@@ -78,7 +78,7 @@ class Tie(Protocol):
 
     @property
     def begin(self) -> Doubles:
-        """Where a fit begins ``(coordinate,)``."""
+        """Return the initial coordinates of a fit ``(coordinate,)``."""
         ...
 
     def numbers(self, theta: Doubles) -> Doubles:
@@ -91,7 +91,7 @@ class Tie(Protocol):
 
 
 class GreyProblem:
-    """Losses of free runs by the coordinates of the numbers.
+    """Free-run losses as a function of the parameter coordinates.
 
     Args:
         twin: the grey box.
@@ -144,7 +144,7 @@ class GreyProblem:
 
     @property
     def final_memory(self) -> float:
-        """What final rounds remember; no more ticks than there are: those that are drawn twice say nothing new."""
+        """Return the memory of the final rounds, limited by the samples, since repeated ones add nothing."""
         fit = self.twin.spec.fit
         return min(fit.final_memory, max(0.0, 1.0 - fit.final_ticks / self.ticks))
 
@@ -157,12 +157,12 @@ class GreyProblem:
         return np.where(table.positive, grown, self.begin + table.width * theta)[table.leader]
 
     def slope(self, numbers: Doubles) -> Doubles:
-        """Derivative of each number by its own coordinate, or by that of its leader."""
+        """Return the derivative of each parameter by its own coordinate, or by its leader's."""
         table = self.twin.table
         return np.where(table.positive, numbers * self.plausible, table.width)[table.leader]
 
     def losses(self, theta: Doubles, drawn: GreyRound, full: bool) -> tuple[Doubles, Doubles, Doubles]:
-        """Matrix and gradient by the coordinates, and the loss of each lane."""
+        """Return matrix and gradient by the coordinates, and the loss of each run."""
         twin, numbers = self.twin, self.numbers(theta)
         size = len(numbers) if full else 0
         rest = twin.rest(drawn.demands[:, 0], (drawn.measured[:, 0] * twin.units).astype(np.float32))
@@ -181,7 +181,7 @@ class GreyProblem:
 
 
 def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple[Doubles, Doubles]:
-    """What is by a number that always has another one's value is by that one's coordinate; its own does nothing."""
+    """Move derivatives of parameters tied to a leader to the leader's coordinate."""
     for index in np.flatnonzero(leader != np.arange(len(leader))):
         matrix[leader[index]] += matrix[index]
         matrix[:, leader[index]] += matrix[:, index]
@@ -192,7 +192,7 @@ def _led(matrix: Doubles, gradient: Doubles, leader: NDArray[np.int64]) -> tuple
 
 @dataclass(eq=False)
 class _Progress:
-    """Of all rounds of a fit: told after each one."""
+    """Progress over all rounds of a fit, reported after each one."""
 
     total: int
     on_event: Callable[[FreeRunProgress], None] | None
@@ -205,7 +205,7 @@ class _Progress:
         return time.process_time() - self.began
 
     def tell(self, length_s: float, error: float, better: bool) -> None:
-        """A validation of the last round."""
+        """Report the validation of the last round."""
         if self.on_event is not None:
             left = self.seconds * (self.total - self.done) / self.done
             self.on_event(FreeRunProgress(self.done, self.total, length_s, left, error, better))
@@ -220,7 +220,7 @@ def fit_grey_box(
     on_event: Callable[[FreeRunProgress], None] | None = None,
     tie: Tie | None = None,
 ) -> GreyFit:
-    """Fit the numbers of a grey box to free runs; free runs of the validation part choose among the rounds.
+    """Fit the parameters of a grey box to free runs; free runs on the validation data select the best round.
 
     Where the settings leave the stretches of opening curves open, the fewest are fitted first. Then each one is halved,
     which changes no curve, and final rounds follow: as often as the validation part gains by it.
@@ -258,7 +258,7 @@ def fit_grey_box(
 
 
 def _continued(before: GreyFit, stretches: int, how: tuple[float, Any, int], progress: _Progress) -> GreyFit:
-    """Final rounds with as many stretches or more; `how`: share of what was known that counts, parts and seed.
+    """Run the final rounds with a finer curve; `how`: weight of the earlier information, parts and seed.
 
     Rounds that remember one another know several times what one does; the share makes it one round's.
     """
@@ -276,7 +276,7 @@ def _fitted(
     progress: _Progress,
     final: bool = True,
 ) -> GreyFit:
-    """The numbers of one form; `parts` train and choose; `final`: whether final rounds follow the stages."""
+    """Fit the parameters of one form; `parts` train and select; `final`: whether final rounds follow the stages."""
     twin, spec, (_, validation) = problem.twin, problem.twin.spec.fit, parts
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
     rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
@@ -347,7 +347,7 @@ class _Path:
         self.memory = self.memory if far else memory * (self.memory + self.matrix)
 
     def judge(self, error: float) -> bool:
-        """Take in a validation error of where it stands; whether it is the least so far."""
+        """Store a validation error of the present position; return whether it is the least so far."""
         self.error = error
         if error >= self.least:
             return False

@@ -35,7 +35,7 @@ class FittedGround:
     seconds: float
 
     def facts(self) -> dict[str, Any]:
-        """What provenance says of it."""
+        """Return the provenance entries."""
         kind = GROUNDS.name_of(self.law)
         return {"ground": {"kind": kind, "explained": self.explained, "seconds": round(self.seconds, 2)}}
 
@@ -43,7 +43,7 @@ class FittedGround:
 def fit_ground(
     kind: str, twin: GreyTwin, train: Sequence[Series], validation: Sequence[Series], machine: str
 ) -> FittedGround:
-    """The law of the training part.
+    """Fit the law to the training data.
 
     Args:
         kind: name in `GROUNDS`.

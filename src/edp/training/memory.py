@@ -27,7 +27,7 @@ LANE_BYTES = 4_096
 
 
 def check_training_memory(net: Predictor, data: Prepared, spec: TrainingSpec, passes: int = 1) -> None:
-    """Refuse a training that this machine has not the memory for.
+    """Raise an error if the machine has too little memory for a training.
 
     Args:
         net: the network, freshly built.
@@ -51,7 +51,7 @@ def check_training_memory(net: Predictor, data: Prepared, spec: TrainingSpec, pa
 
 
 def training_bytes(net: Predictor, data: Prepared, spec: TrainingSpec) -> float:
-    """Bytes that a training takes at most, beside the recordings and the program."""
+    """Return the upper bound of a training's memory in bytes, without recordings and program."""
     return _weights(net, spec) + _batch(net, spec) + _validation(net, data) + _backward(net, spec)
 
 
@@ -61,7 +61,7 @@ def _weights(net: Predictor, spec: TrainingSpec) -> float:
 
 def _batch(net: Predictor, spec: TrainingSpec) -> float:
     # The meta device tells shapes without memory.
-    """Inputs, future targets and state of all streams of an update."""
+    """Return the memory of inputs, future targets and state of all streams of an update."""
     chunks, task = spec.chunks, net.task
     like = torch.zeros((), device="meta")
     state = state_numbers(net.initial_state(1, like))
@@ -72,13 +72,13 @@ def _batch(net: Predictor, spec: TrainingSpec) -> float:
 
 
 def _validation(net: Predictor, data: Prepared) -> float:
-    """What the network says of ticks that validate, in double precision: of those that judge."""
+    """Return the memory of the network outputs for the validation samples, in double precision."""
     ticks = min(sum(part.samples for part in data.validation), MOST_VALIDATED)
     return 3 * DOUBLE * ticks * len(net.task.horizons) * len(net.task.targets) * (1 + net.spec.output.values)
 
 
 def _backward(net: Predictor, spec: TrainingSpec) -> float:
-    """What the backward pass of an update needs of the forward pass, from two short passes of one stream."""
+    """Return the memory that the backward pass needs, estimated from two short passes of one stream."""
     chunks = spec.chunks
     first, second = (_saved(net, ticks) for ticks in PROBED)
     # The difference of two passes removes what does not grow with the ticks.

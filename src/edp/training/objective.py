@@ -1,4 +1,4 @@
-"""What a training makes small: the main loss with its weights, and further terms."""
+"""Training objective: weighted main loss plus optional penalty terms."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Objective:
         self.running = torch.ones_like(self.weights)
 
     def evaluate(self, answer: Prediction, future: Tensor, features: Tensor, valid: Tensor) -> Tensor:
-        """The loss of a batch.
+        """Return the loss of a batch.
 
         Args:
             answer: what the network says.
@@ -51,7 +51,7 @@ class Objective:
         return loss
 
     def _course(self, predicted: Tensor, target: Tensor, level: Tensor, valid: Tensor) -> Course:
-        """Consecutive predictions: the ticks of a chunk, or the last ticks of windows drawn together."""
+        """Return consecutive predictions: the samples of a chunk, or the last samples of windows drawn together."""
         chunks = self.spec.chunks
         if chunks.regime == "chunk":
             return Course(predicted, target, level, valid)

@@ -20,7 +20,7 @@ class OptimizerSpec(Protocol):
     """Options of an optimiser."""
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
-        """The optimiser on these parameters."""
+        """Create the optimiser of these parameters."""
         ...
 
     def remembers(self, shape: Sequence[int]) -> int:
@@ -55,7 +55,7 @@ class AdamW:
         check_bounds("adamw", self, learning_rate=RATE, weight_decay=DECAY, beta1=BETA, beta2=BETA)
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
-        """The optimiser, with biases and gains free of decay."""
+        """Create the optimiser, without weight decay for biases and gains."""
         matrices, vectors = _decaying(named)
         groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
         # Fused: one pass over the memory instead of one an operation; small networks gain most.
@@ -69,7 +69,7 @@ class AdamW:
 @OPTIMIZERS.register("sgd")
 @dataclass(frozen=True, kw_only=True)
 class Sgd:
-    """Plain gradient descent: what a network was meta-learned for.
+    """Plain gradient descent, for which a network was meta-learned.
 
     Attributes:
         learning_rate: base rate.
@@ -81,7 +81,7 @@ class Sgd:
         check_bounds("sgd", self, learning_rate=RATE)
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
-        """The optimiser on all parameters."""
+        """Create the optimiser of all parameters."""
         return EagerSgd([parameter for _, parameter in named], lr=self.learning_rate)
 
     def remembers(self, shape: Sequence[int]) -> int:
@@ -116,7 +116,7 @@ class Discriminative:
             raise ConfigError(f"discriminative: rates = {shown(self.rates)}; {RATE.rule('rate')} must hold")
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
-        """The optimiser; the first group has `learning_rate`, where any parameter has it."""
+        """Create the optimiser; the first group has `learning_rate`, if any parameter has it."""
         by_rate: dict[float, list[tuple[str, nn.Parameter]]] = {self.learning_rate: []}
         for name, parameter in named:
             by_rate.setdefault(self._rate(name), []).append((name, parameter))
@@ -172,7 +172,7 @@ class Soap:
         )
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
-        """The optimiser on all parameters."""
+        """Create the optimiser of all parameters."""
         from pytorch_optimizer import SOAP  # deferred: only this optimiser needs the library
 
         return SOAP(

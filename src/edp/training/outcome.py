@@ -1,4 +1,4 @@
-"""What a training tells on its way and gives at its end."""
+"""Progress events and results of a training."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edp.networks.predictor import Predictor
 
 
 class TrainingError(EdpError):
-    """Training cannot go on."""
+    """Training cannot continue."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A training in parts: each goes on from what the one before left, to the same bits as without a stop.
+"""Training in parts, each of which continues the previous one with the same bits as without a stop.
 
 One of a single epoch is parted at an update, one of several between two epochs.
 """
@@ -70,7 +70,7 @@ def fit_part(
 
 
 def _epochs(loop: Loop, until: int | None, start: bytes | None) -> tuple[Fitted, bytes | None]:
-    """A part of a training of several epochs; after an early stop later parts have nothing to do."""
+    """Run a part of several epochs; after an early stop later parts are empty."""
     if start is not None:
         _restore_epochs(loop, unpack(start))
     if until is None:
@@ -88,7 +88,10 @@ def _epochs(loop: Loop, until: int | None, start: bytes | None) -> tuple[Fitted,
 
 
 def _state_of_epochs(loop: Loop) -> dict[str, Any]:
-    """What later epochs depend on; every epoch seeds its own chances. No times: equal parts, equal bytes."""
+    """Return the state for later epochs, which seed their own random numbers.
+
+    Without times, equal parts give equal bytes.
+    """
     # Times differ from run to run; without them equal trainings leave equal bytes.
     progress = asdict(loop.progress) | {"seconds": 0.0}
     progress["history"] = [row | {"seconds": 0.0} for row in progress["history"]]
@@ -115,7 +118,10 @@ def _restore_epochs(loop: Loop, state: dict[str, Any]) -> None:
 
 
 def _state(loop: Loop) -> dict[str, Any]:
-    """All that the rest of a training depends on and its settings do not say. No times: equal parts, equal bytes."""
+    """Return the state that the rest of a training depends on besides its settings.
+
+    Without times, equal parts give equal bytes.
+    """
     cuda = loop.device.type == "cuda"
     return {
         "updates": loop.progress.updates,

@@ -1,4 +1,4 @@
-"""Training the network of a residual twin on free runs of it and its grey box, fitted before; kept where it helps."""
+"""Free-run training of the network of a residual twin on a fitted grey box; it is used only if it helps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ResidualFit:
 
     @property
     def helps(self) -> bool:
-        """Whether the network has less error than the grey box alone; else it answers zero."""
+        """Whether the network has less error than the grey box alone; otherwise its output is zero."""
         return self.error < self.grey_error
 
     def facts(self) -> dict[str, Any]:
@@ -42,7 +42,7 @@ class ResidualFit:
 
 
 def residual_spec(form: Residual, training: FreeRunSpec) -> FreeRunSpec:
-    """Settings of the network's training: those of every twin, but for what its own formulation settles."""
+    """Return the training settings of the network: common twin settings with changes for this formulation."""
     return replace(
         training,
         lanes=form.lanes,
@@ -61,7 +61,7 @@ def fit_residual(
     on_event: Callable[[FreeRunProgress], None] | None = None,
     run: KeyedRun | None = None,
 ) -> ResidualFit:
-    """Train the network on top of a grey box whose numbers are fitted and stay.
+    """Train the network on a grey box with fixed, fitted parameters.
 
     Args:
         twin: its network untrained; it is changed.

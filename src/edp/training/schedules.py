@@ -12,7 +12,7 @@ from edp.settings.bounds import MOST_EPOCHS, SHARE, below, check_bounds, integer
 
 @dataclass
 class ScheduleState:
-    """What a schedule remembers between epochs; plain numbers, kept in checkpoints."""
+    """State of a schedule between epochs; plain values, stored in checkpoints."""
 
     factor: float = 1.0
     best: float = math.inf
@@ -63,7 +63,7 @@ class Constant:
 @SCHEDULES.register("cosine")
 @dataclass(frozen=True, kw_only=True)
 class Cosine:
-    """Half a cosine from the base rate to `floor` of it, after a warm-up.
+    """Half a cosine from the base rate to the fraction `floor`, after a warm-up.
 
     Attributes:
         warmup: share of the run in which the rate rises from zero.
@@ -91,7 +91,7 @@ class Cosine:
 @SCHEDULES.register("one_cycle")
 @dataclass(frozen=True, kw_only=True)
 class OneCycle:
-    """Rise from `start` to the base rate over `rise` of the run, then fall to `floor`, both along a cosine.
+    """Rise from fraction `start` to the base rate over `rise` of the run, then fall to `floor`, both along a cosine.
 
     Attributes:
         rise: share of the run that rises.

@@ -1,4 +1,4 @@
-"""How to train: the settings, and which of them contradict one another."""
+"""Training settings, and checks for contradictions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ little data have chunks enough."""
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSpec:
-    """How to train.
+    """Training settings.
 
     Attributes:
         chunks: chunk or window regime, lengths, batch.
@@ -134,7 +134,7 @@ class TrainingSpec:
 
 
 def by_gradient(spec: TrainingSpec) -> TrainingSpec:
-    """How a training on folds is done by gradient instead, in chunks: a teacher or a source of weights knows no folds.
+    """Return the settings of a gradient training in chunks that replaces a training on folds.
 
     Chunks and updates an epoch are those of a committee where the spec leaves its defaults; all else stays.
     """
@@ -186,7 +186,7 @@ def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:
 
 
 def check_fitted_parts(model: ModelSpec, spec: TrainingSpec) -> None:
-    """Refuse parts that only a training on folds fits, where a training from random weights has none.
+    """Raise an error for parts fitted by training on folds only, if the training starts from random weights.
 
     Raises:
         ConfigError: it has trees, which no gradient reaches, or limits that only such a training sets.
@@ -205,7 +205,7 @@ def check_fitted_parts(model: ModelSpec, spec: TrainingSpec) -> None:
 
 
 def _against_bagging(model: ModelSpec, spec: TrainingSpec, bagging: BaggingSpec) -> list[str]:
-    """What stands against training on folds."""
+    """Return the reasons against training on folds."""
     reasons = []
     if not isinstance(model.backbone, CommitteeSpec) or not isinstance(model.head, LinearHead):
         reasons.append(

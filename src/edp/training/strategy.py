@@ -1,4 +1,4 @@
-"""What a training may have besides its data: weights to begin with, and a teacher."""
+"""Training strategies: initial weights and teachers in addition to the data."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class BatchContext:
 
 
 class TrainingStrategy(Protocol):
-    """Weights to begin with, series to learn from, and the loss of a batch of them."""
+    """Initial weights, training series, and the loss of a batch."""
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series with what is taught about them, and further series.
+        """Return the training series with teacher outputs, and additional series.
 
         Either all of them have `strategy_columns` or none; where none has, `loss` is not asked.
         """
@@ -61,20 +61,23 @@ class TrainingStrategy(Protocol):
         ...
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """The loss of a batch; `objective` gives that of the truth."""
+        """Return the loss of a batch; `objective` gives the loss on measured targets."""
         ...
 
     def end(self, net: Predictor) -> None:
-        """Take back what `begin` did to the network beside its weights; it has the best ones now."""
+        """Undo the changes of `begin` to the network except the weights, which are now the best ones."""
         ...
 
 
 @runtime_checkable
 class StreamStrategy(TrainingStrategy, Protocol):
-    """A training strategy that sets what the network is told of each stream before it runs along a chunk."""
+    """Training strategy that conditions the network on each stream before it processes a chunk."""
 
     def tell(self, net: Predictor, strategy_columns: Tensor, reset: Tensor) -> None:
-        """Set it from ``(batch, time, column)`` and from which streams ``(batch,)`` start anew with this chunk."""
+        """Set the condition from ``(batch, time, column)``.
+
+        `reset` ``(batch,)`` marks streams that restart with this chunk.
+        """
         ...
 
 
@@ -95,10 +98,10 @@ class DirectFit(Protocol):
 
 @runtime_checkable
 class EpisodicStrategy(TrainingStrategy, Protocol):
-    """A training strategy that forms its own batches; each update learns from one and judges it."""
+    """Training strategy with its own batches; each update trains on one part of a batch and evaluates the other."""
 
     def sampler(self, series: Sequence[Series], task: Task, spec: TrainingSpec) -> Sampler:
-        """Where the batches come from; all streams of a batch start from reset.
+        """Create the source of batches; all streams of a batch start from reset.
 
         Raises:
             DataError: the series cannot be dealt out so.
@@ -106,9 +109,12 @@ class EpisodicStrategy(TrainingStrategy, Protocol):
         ...
 
     def episode(self, net: Predictor, objective: Objective, batch: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """What a batch costs, a scalar with the gradient to go down; inputs, future targets and validity come in."""
+        """Return the cost of a batch (inputs, future targets and validity), a scalar with the gradient to descend."""
         ...
 
     def judge(self, net: Predictor, objective: Objective, data: Prepared) -> tuple[float, float, float]:
-        """What chooses the best epoch, as `edp.training.validation.validation_scores` gives it; `net` is left as is."""
+        """Return the scores that select the best epoch, like `edp.training.validation.validation_scores`.
+
+        `net` is unchanged.
+        """
         ...

@@ -19,7 +19,7 @@ Tables = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
 
 
 def complete_tables(model: HistGradientBoostingRegressor, depth: int) -> Tables:
-    """The trees of a fitted model, each filled up to one depth.
+    """Return the trees of a fitted model, each extended to a common depth.
 
     Sums of the trees are the model's predictions for inputs in single precision, up to the rounding of the leaves:
     every comparison turns out as in the model. What the model predicts without trees is part of the first tree's
@@ -71,7 +71,7 @@ def _stacked(rows: Sequence[NDArray[_Number]], trees: int, fill: float) -> NDArr
 
 
 def below_or_equal(threshold: float) -> np.float32:
-    """The number t of single precision with ``x > t`` just where ``x > threshold``, for all x of single precision.
+    """Return the single-precision number t with ``x > t`` exactly where ``x > threshold``, for all single-precision x.
 
     Raises:
         ValueError: there is none that is finite.

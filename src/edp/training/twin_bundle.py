@@ -1,4 +1,4 @@
-"""Twins on disk: JSON and safetensors, as bundles of predictors are; loading one executes nothing."""
+"""Twins on disk as JSON and safetensors, like predictor bundles; loading does not execute code."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _Form:
 
 @dataclass(frozen=True, eq=False)
 class TwinBundle:
-    """A twin with what a user of it must know.
+    """Twin with its settings and provenance.
 
     Attributes:
         spec: the formulation and its options.
@@ -88,7 +88,7 @@ class TwinBundle:
 
 
 def plant_bundle(bundle: TwinBundle) -> Bundle:
-    """A twin as exported forms take it: see `TwinPlant`.
+    """Return a twin for export: see `TwinPlant`.
 
     Raises:
         ExportError: it has a ground, of which no exported form knows.
@@ -134,13 +134,13 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
 
 
 def holds_twin(folder: str | Path) -> bool:
-    """Whether a folder, or the run folder around it, is that of a twin."""
+    """Return whether a folder, or the bundle in a run folder, is a twin."""
     path = Path(folder)
     return is_entry_at(path / HEADER) or is_entry_at(path / "twin" / HEADER)
 
 
 def twin_hash(folder: str | Path) -> str:
-    """Hash of the header of a twin, which holds those of its numbers.
+    """Return the hash of the header of a twin, which contains the hashes of its arrays.
 
     Args:
         folder: the twin's own, or the run folder around it.
@@ -211,7 +211,7 @@ def _assembled(header: Mapping[str, Any], path: Path) -> TwinBundle:
 
 
 def _ground(header: Mapping[str, Any], twin: Twin) -> GroundLaw | None:
-    """The law of a header that has one."""
+    """Read the ground law of a header, if it has one."""
     if header["schema"] < GROUNDED:
         return None
     plain = object_with(header["ground"], ("kind",), "its ground")

@@ -1,4 +1,4 @@
-"""A network on series that it was not trained on: scores that choose the best epoch, and calibration of intervals."""
+"""Evaluation of a network on validation series: scores that select the best epoch, calibration of intervals."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def validation_scores(
 
 
 def judged_stretches(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> list[Series]:
-    """What epochs are judged on: the series, or of more than `MOST_VALIDATED` ticks evenly spread stretches of them.
+    """Return the data that evaluate epochs: the series, or evenly spaced segments beyond `MOST_VALIDATED` samples.
 
     Else an epoch of a fixed number of updates would take hours to judge where the store is large.
     """
@@ -54,7 +54,7 @@ def judged_stretches(net: Predictor, series: Sequence[Series], spec: TrainingSpe
 
 
 def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> None:
-    """Stretch the intervals of a network so that they hold their share of `series`."""
+    """Scale the intervals of a network so that they contain their fraction of `series`."""
     answers, targets = [], []
     for _, answer, target in _answers(net, judged_stretches(net, series, spec), spec, windowed=False):
         answers.append(answer)
@@ -70,7 +70,7 @@ def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> N
 def _answers(
     net: Predictor, series: Sequence[Series], spec: TrainingSpec, windowed: bool
 ) -> Iterator[tuple[int, Prediction, Tensor]]:
-    """Number of a series, what the network says of a piece of it, and the standardised targets; no start-up.
+    """Yield the series number, the network output on a segment, and the standardised targets, without the start-up.
 
     Batches of one, double precision.
     """

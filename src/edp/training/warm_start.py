@@ -33,11 +33,11 @@ class WarmStart:
         self._unfrozen: list[nn.Parameter] = []
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series as they are."""
+        """Return the training series unchanged."""
         return list(own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
-        """Copy weights and scaling, freeze the named parameters, and unfreeze the others where that is asked for.
+        """Copy weights and scaling, freeze the named parameters, and unfreeze the others if requested.
 
         Raises:
             ConfigError: the start has other specs, or nothing is left to learn.
@@ -54,7 +54,7 @@ class WarmStart:
         return True
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """The objective on the recorded targets."""
+        """Return the objective on the recorded targets."""
         return objective.evaluate(
             batch_context.answer, batch_context.future, batch_context.features, batch_context.valid
         )
@@ -66,7 +66,7 @@ class WarmStart:
 
 
 def continue_from(net: Predictor, start: Predictor) -> None:
-    """Give a network the weights and the scaling of another one of the same specs.
+    """Copy weights and scaling from another network with the same specs.
 
     Raises:
         ConfigError: the specs differ.

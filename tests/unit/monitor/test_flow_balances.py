@@ -13,6 +13,7 @@ from edp.monitor.residuals.flow_curves import KNOTS, hats, opened, played
 from edp.monitor.residuals.groups import sensed_channels
 from edp.recording import Recording
 from edp.sim import Scenario, simulate
+from edp.wording import figure
 
 SPEC = FlowBalancesSpec(trials=40, rows=20_000)
 
@@ -94,6 +95,7 @@ def test_oil_that_was_not_learned_silences_them_and_is_said(source):
     assert np.isnan(rows[200:]).all()
     assert "67 %" in source.unlearned(hot)
     assert "OilTemperature" in source.unlearned(hot)
+    assert f"to {figure(source.oil.high - 273.15)} degC" in source.unlearned(hot)
     assert source.unlearned(recording) == ""
     # A thermometer that fails is no reason to be blind.
     values[:, column] = np.nan

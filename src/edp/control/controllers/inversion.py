@@ -65,7 +65,7 @@ class ModelInversion:
         )
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
-        """The controller around a predictor, or else a twin.
+        """Build the controller with a predictor, otherwise with a twin.
 
         Raises:
             ConfigError: there is neither, it does not fit, or the plant does not measure what it reads.
@@ -100,7 +100,7 @@ class InversionController(Controller):
         self._offsets = np.concatenate((-steps[::-1], [0.0], steps))
 
     def begin(self, measured: Array, reference: TipReference) -> None:
-        """Form the model's memory at rest, forget integrals."""
+        """Initialise the model memory in steady state and reset the integrals."""
         self._strokes, self._speeds = reference.strokes, reference.speeds()
         self._sum, self._solution, self._row, self._tick = np.zeros(AXES), np.zeros(AXES), None, -1
         self.model.begin(measured[: len(self.model.reads)], self.plant.commands(np.zeros(AXES)))
@@ -123,7 +123,7 @@ class InversionController(Controller):
         return asked
 
     def missed(self, tick: int) -> None:
-        """Where no row came, the last one stands for it in the model's memory."""
+        """Update the model memory with the last row if no row was received."""
         super().missed(tick)
         # A tick at which the solution failed has brought the memory up to date before it failed.
         if self._row is not None and self._tick != tick:

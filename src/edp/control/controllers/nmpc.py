@@ -55,7 +55,7 @@ FAST_TIP_M_S = 0.02
 @CONTROLLERS.register("nmpc")
 @dataclass(frozen=True, kw_only=True)
 class PredictiveControl:
-    """Weights are of squares: of tip errors in m^2, of changes of the asked speeds in (m/s)^2.
+    """Model predictive controller. Weights apply to squares: tip errors in m^2, changes of requested speeds in (m/s)^2.
 
     Attributes:
         blocks: ticks of the blocks of the horizon.
@@ -115,7 +115,7 @@ class PredictiveControl:
         return LOADED_ATTITUDE_M if twin.runner().resistance is not None else ATTITUDE_M
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
-        """The controller, with the twin and the valve map of the plant.
+        """Build the controller with the twin and the valve map of the plant.
 
         Raises:
             ConfigError: one of them is missing or does not fit, or DAQP is not installed.
@@ -167,7 +167,7 @@ class NmpcController(Controller):
         self._tick = -1
 
     def check(self, measured: Array) -> None:
-        """Refuse a plan that ends before the machine has answered, by the twin, from rest at this row.
+        """Raise an error for a plan shorter than the machine's response time, simulated by the twin from steady state.
 
         Raises:
             ConfigError: at its end less than `LEAST_ANSWER` of a speed is there, so that it would run away.
@@ -192,7 +192,7 @@ class NmpcController(Controller):
         )
 
     def begin(self, measured: Array, reference: TipReference) -> None:
-        """Form the twin's memory at rest; forget plan and disturbance."""
+        """Initialise the twin memory in steady state; reset plan and disturbance."""
         self.model.begin(measured)
         # Behind its last row a reference stays, for as long as a horizon.
         rows = reference.rows(0, reference.ticks + self._moves.ticks)
@@ -204,7 +204,7 @@ class NmpcController(Controller):
             self._fallback.begin(measured[self._stroke_columns], reference)
 
     def levers(self, measured: Array, tick: int) -> Array:
-        """Levers of the first block of the plan, or those of the PI loop where there is none."""
+        """Return the levers of the first block of the plan, or of the PI loop if there is no plan."""
         spare = self._followed(measured, tick)
         try:
             self._improve(measured, tick)
@@ -218,7 +218,7 @@ class NmpcController(Controller):
         return self._given_up(self._followed(measured, tick), tick, fault)
 
     def _followed(self, measured: Array, tick: int) -> Array | None:
-        """Bring twin, disturbance and PI loop up to date; levers of the latter, None where it has none."""
+        """Update twin, disturbance and PI loop, and return the levers of the PI loop; None without one."""
         if self._row is not None:
             # After the limits: what was given, not what was asked for.
             self.model.advance(self._row, self.before)
@@ -230,7 +230,7 @@ class NmpcController(Controller):
         return self._fallback.levers(strokes, tick)
 
     def _given_up(self, spare: Array | None, tick: int, fault: ControlFault) -> Array:
-        """Forget the plan; what the PI loop says.
+        """Discard the plan and return the output of the PI loop.
 
         Raises:
             ControlFault: `fault`, where it says nothing.
@@ -243,12 +243,12 @@ class NmpcController(Controller):
 
     @property
     def memory(self) -> Array:
-        """Speeds of the plan (m/s) by block, those asked for last, sums of the PI loop, disturbance, load (N)."""
+        """Speeds of the plan (m/s) by block, the last requested ones, sums of the PI loop, disturbance, load (N)."""
         sums = np.zeros(AXES) if self._fallback is None else self._fallback.memory
         return np.concatenate((self._speeds.ravel(), self._latest, sums, self.model.disturbance, self.model.load))
 
     def missed(self, tick: int) -> None:
-        """Where no row came, the ports of the twin run free."""
+        """Let the twin run free if no row was received."""
         super().missed(tick)
         if self._tick != tick:
             if self._row is not None:
@@ -257,7 +257,7 @@ class NmpcController(Controller):
             self.model.advance(None, self.before)
 
     def _improve(self, measured: Array, tick: int) -> None:
-        """One Gauss-Newton step on the plan, and its first speeds as those that are asked for."""
+        """Apply one Gauss-Newton step to the plan, and request its first speeds."""
         moves, speeds = self._moves, self._speeds
         # Away from the fastest speed, beyond which a lever has no more to give and a step would show no effect.
         steps = np.where(speeds + STEP_M_S > self._valves.fastest, -STEP_M_S, STEP_M_S)
@@ -313,7 +313,7 @@ class NmpcController(Controller):
         return slopes[:rows], low[:rows], high[:rows]
 
     def _solved(self, hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> tuple[Array, int]:
-        """The step of the plan, within the speeds that the levers' ranges give.
+        """Return the step of the plan, within the speeds allowed by the lever ranges.
 
         Raises:
             ControlFault: the program has no solution, or a number in it is not finite.
@@ -358,7 +358,7 @@ def _directions(reference: TipReference, along: float, attitude_m: float) -> Arr
 
 
 def _daqp() -> Any:
-    """The solver's module.
+    """Import the solver.
 
     Raises:
         ConfigError: it is not installed.

@@ -58,7 +58,7 @@ class ProportionalIntegral:
         )
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
-        """The controller, with the map of the plant.
+        """Build the controller with the valve map of the plant.
 
         Raises:
             ConfigError: there is no map, or the plant does not measure its strokes.
@@ -99,5 +99,5 @@ class PiController(Controller):
         return asked
 
     def fallback(self, measured: Array, tick: int, reason: str) -> Array:
-        """It has no model, and goes on."""
+        """Continue to control, since this controller has no model."""
         return self.levers(measured, tick)

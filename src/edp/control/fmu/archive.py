@@ -22,7 +22,7 @@ _LIMITS = ArchiveLimits(MOST_FILE, MOST_UNPACKED, MOST_ENTRIES)
 
 
 class FmuArchive:
-    """An FMU on disk, of which nothing was unpacked yet.
+    """FMU file that is not unpacked yet.
 
     Args:
         path: the file.

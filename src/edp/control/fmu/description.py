@@ -1,4 +1,4 @@
-"""``modelDescription.xml`` of an FMU for co-simulation, versions 2.0 and 3.0, as far as a plant needs it.
+"""Reader of ``modelDescription.xml`` of an FMU for co-simulation, versions 2.0 and 3.0, limited to plant models.
 
 It may be a stranger's: document types, and with them entities, are refused, depth and counts are bounded, and nothing
 outside of the bytes is opened.
@@ -51,7 +51,7 @@ class FmuVariable:
 
 @dataclass(frozen=True, eq=False)
 class FmuDescription:
-    """What a plant needs to know of an FMU.
+    """Properties of an FMU that a plant needs.
 
     Attributes:
         version: of FMI, 2 or 3.
@@ -111,7 +111,7 @@ def read_description(content: bytes, where: str) -> FmuDescription:
 
 
 def _tree(content: bytes, where: str) -> ET.Element:
-    """The elements.
+    """Parse the XML elements.
 
     Raises:
         DataError: it is not well-formed, has a document type, or is too deep.
@@ -186,7 +186,7 @@ def _variables(root: ET.Element, version: int, where: str) -> dict[str, FmuVaria
 
 
 def _units(root: ET.Element) -> dict[str, dict[str, float]]:
-    """Base units by unit, with ``factor`` and ``offset``; those that are not numbers are left out."""
+    """Return the base units by unit, with ``factor`` and ``offset``; non-numeric entries are omitted."""
     units: dict[str, dict[str, float]] = {}
     for unit in root.iterfind("UnitDefinitions/Unit"):
         base = unit.find("BaseUnit")

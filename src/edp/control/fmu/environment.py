@@ -80,7 +80,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode at rest.
+        """Begin an episode in steady state.
 
         Args:
             seed: of the environment's own generator; nothing is drawn.
@@ -122,12 +122,12 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return row, 0.0, False, self._tick >= self._ticks, self._info(row)
 
     def close(self) -> None:
-        """Free the FMU; nothing can be run afterwards."""
+        """Free the FMU; afterwards it cannot run."""
         self._fmu.close()
         self._begun = False
 
     def _fed(self, shares: Any) -> NDArray[np.float32]:
-        """Begin by measured values: a rest, then the prefix in which a twin's memory forms."""
+        """Begin with measured values: a steady phase, then the prefix that initialises a twin's memory."""
         rows = self._rest.rows(shares)
         values, flags = self._ports.measured
         self._fmu.begin()
@@ -174,7 +174,7 @@ class FmuEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def _check_step(description: FmuDescription, rate_hz: float, where: str) -> None:
-    """Refuse a rate that the FMU does not step at.
+    """Raise an error for a rate that differs from the FMU's step.
 
     Raises:
         ConfigError: it does not.

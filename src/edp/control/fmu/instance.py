@@ -97,7 +97,7 @@ class FmuInstance:
         return values
 
     def step(self, at_s: float, size_s: float) -> None:
-        """Step from a time on.
+        """Advance by one step from a given time.
 
         Raises:
             SimulationError: it refuses.
@@ -105,7 +105,7 @@ class FmuInstance:
         self._call("doStep", lambda: self._fmu.doStep(at_s, size_s))
 
     def close(self) -> None:
-        """Free the instance and its files; again is no error."""
+        """Free the instance and its files; repeated calls are allowed."""
         if self._ending.alive:
             self._fmu.freeInstance()
             self._ending()

@@ -1,4 +1,4 @@
-"""Which variables of an FMU are the commands, answers and start of an excavator, by their names and units."""
+"""Mapping of FMU variables to commands, outputs and start values of an excavator, by name and unit."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class FmuPorts:
 
 
 def ports_of(description: FmuDescription, where: str) -> FmuPorts:
-    """The ports of an FMU.
+    """Return the ports of an FMU.
 
     Args:
         description: of it.
@@ -101,7 +101,7 @@ def ports_of(description: FmuDescription, where: str) -> FmuPorts:
 
 
 def _check_unit(channel: Channel, entry: FmuVariable, where: str) -> None:
-    """Refuse a variable that is no real number in the SI unit of its channel.
+    """Raise an error unless a variable is a real number in the SI unit of its channel.
 
     Raises:
         DataError: it is not.

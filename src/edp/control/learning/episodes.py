@@ -1,4 +1,4 @@
-"""Episodes of a task in lanes side by side: what single and vectorised environments share."""
+"""Batched episodes of a task, the common part of single and vectorised environments."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ class TaskEpisodes:
 
     @property
     def spaces(self) -> tuple[Any, Any]:
-        """Of an observation and of an action."""
+        """Return the spaces of observation and action."""
         observations = gymnasium.spaces.Box(-MOST, MOST, (len(self.features.names),), np.float32)
         return observations, gymnasium.spaces.Box(-1.0, 1.0, (AXES,), np.float32)
 
     def begin(self, lane: int, seed: int | None, rng: np.random.Generator) -> dict[str, Any]:
-        """Begin an episode in a lane; returns what began.
+        """Begin an episode of one environment and return its description.
 
         Args:
             lane: which.
@@ -96,7 +96,7 @@ class TaskEpisodes:
         return {"seed": task.seed, "seconds": float(self._ends[lane] / self.plant.rate_hz)}
 
     def _drawn(self, seed: int | None, rng: np.random.Generator) -> ControlTask:
-        """The task of a seed, or of one that is drawn; the last of `DRAWS` says why none can be done."""
+        """Return the task for a seed, or a random feasible task; the last of `DRAWS` raises the reason."""
         low, high = self.spec.seeds
         for _ in range(DRAWS - 1 if seed is None else 0):
             try:
@@ -109,7 +109,7 @@ class TaskEpisodes:
         return draw_task(self._task, self.plant.geometry, self.plant.rate_hz, seed)
 
     def act(self, actions: Array, going: Bools) -> tuple[Array, Bools, Bools]:
-        """Hold actions, shape (lanes, 3), for `hold` ticks.
+        """Hold actions, shape (lanes, 3), for `hold` samples.
 
         Lanes that are not `going` are moved along and not judged: they are reset afterwards.
 
@@ -147,7 +147,7 @@ class TaskEpisodes:
         return np.where(going, self.spec.reward.of_tick(position, attitude, travel, violated), 0.0)
 
     def _measure(self) -> Array:
-        """Position errors now; returns those of the attitude (rad), shape (lanes,)."""
+        """Measure the position errors; return the attitude errors (rad), shape (lanes,)."""
         apart = self._rows.tip(self.tick) - self._lanes.tip
         self.position_m = np.hypot(apart[:, 0], apart[:, 1])
         return np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))
@@ -164,12 +164,12 @@ class TaskEpisodes:
             self._base[lane] = self._bases[lane].step(observed, int(self.tick[lane]))
 
     def observation(self) -> NDArray[np.float32]:
-        """What policies see now, shape (lanes, value)."""
+        """Return the observations, shape (lanes, value)."""
         measured = self._lanes.observed[:, self._reads].astype(float)
         return self.features.values(measured, self._rows.now(self.tick), self._past, self._base)
 
     def score(self, lane: int) -> Mapping[str, float]:
-        """Figures of a lane's episode over its judged ticks so far."""
+        """Return the metrics of an episode over its evaluated samples so far."""
         ticks, squared, attitude, travel, violations = self._sums[lane].tolist()
         count = max(ticks, 1.0)
         return {
@@ -182,7 +182,7 @@ class TaskEpisodes:
 
 
 def _bases(spec: LearningSpec, plant: PlantInterface, limits: LoopLimits, count: int) -> list[Controller]:
-    """A base controller for each lane; none where actions are the levers."""
+    """Return a base controller per environment; empty if actions are the levers."""
     controller = spec.controller
     if controller is None:
         return []
@@ -191,5 +191,5 @@ def _bases(spec: LearningSpec, plant: PlantInterface, limits: LoopLimits, count:
 
 
 def base_models(spec: LearningSpec, plant: PlantInterface) -> ControlModels:
-    """What a base controller knows: a valve map, measured on the plant as `edp control` does."""
+    """Return the models of a base controller: a valve map measured on the plant as in `edp control`."""
     return ControlModels(measure_valve_map(single_plant(spec, RUN_S + 1.0), plant))

@@ -1,4 +1,4 @@
-"""What a policy sees: measured channels, errors, the reference ahead, and levers, in numbers of about one."""
+"""Policy observations: measured channels, errors, future reference and levers, scaled to about one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST = 10.0
 
 @dataclass(frozen=True, eq=False)
 class ReferenceNow:
-    """A reference as a policy sees it at a tick, a row a lane.
+    """Reference data for a policy at one sample, one row per environment.
 
     Attributes:
         strokes: now, m, shape (lanes, 3).
@@ -81,7 +81,7 @@ class TaskFeatures:
         return 0.0, SCALES.get(channel.kind, float(np.abs(KINDS[channel.kind].plausible).max()))
 
     def values(self, measured: Array, now: ReferenceNow, levers: Array, base: Array) -> NDArray[np.float32]:
-        """The observation of each lane, shape (lanes, value).
+        """Return the observation of each environment, shape (lanes, value).
 
         Args:
             measured: channels of `reads`, SI units, shape (lanes, channel).
@@ -107,7 +107,7 @@ class TaskFeatures:
 
 
 class ReferenceRows:
-    """References of some lanes as arrays, so that a tick of all of them is one look-up.
+    """References of a batch as arrays, so that one look-up serves all environments.
 
     Args:
         lanes: how many.
@@ -122,25 +122,25 @@ class ReferenceRows:
         self._judged = np.zeros((lanes, rows), dtype=np.bool_)
 
     def put(self, lane: int, reference: TipReference) -> None:
-        """Lay a reference into a lane; beyond its end it stands still."""
+        """Set the reference of an environment; beyond its end it stays constant."""
         rows = reference.rows(0, self._strokes.shape[1])
         self._strokes[lane], self._tip[lane] = reference.strokes[rows], reference.tip[rows]
         self._speeds[lane], self._judged[lane] = reference.speeds()[rows], reference.judged[rows]
 
     def now(self, ticks: NDArray[np.int64]) -> ReferenceNow:
-        """Rows of each lane at its tick, shape (lanes,)."""
+        """Return the rows of each environment at its sample, shape (lanes,)."""
         ahead = self._speeds[self._lane[:, None], ticks[:, None] + self._preview]
         return ReferenceNow(self._strokes[self._lane, ticks], self._tip[self._lane, ticks], ahead)
 
     def tip(self, ticks: NDArray[np.int64]) -> Array:
-        """Tip poses of each lane at its tick, shape (lanes, 3)."""
+        """Return the tip poses of each environment at its sample, shape (lanes, 3)."""
         return np.asarray(self._tip[self._lane, ticks])
 
     def judged(self, ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether each lane's tick counts, shape (lanes,)."""
+        """Return whether each environment's sample is evaluated, shape (lanes,)."""
         return self._judged[self._lane, ticks]
 
 
 def remembered(levers: Array, applied: Array) -> Array:
-    """Past levers, the latest first, shape (lanes, depth, 3), with those of a tick, shape (lanes, 3), before them."""
+    """Prepend levers, shape (lanes, 3), to the past levers, shape (lanes, depth, 3), latest first."""
     return np.concatenate([applied[:, None], levers[:, :-1]], axis=1)

@@ -1,4 +1,4 @@
-"""Plants side by side, a lane each: the simulator in one compiled call, a twin as a batch, or any environments."""
+"""Batched plants: the simulator in one compiled call, a twin as a batch, or any environments."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class PlantLanes(ABC):
 
     @abstractmethod
     def begin(self, lane: int, seed: int, shares: Sequence[float], material: str) -> None:
-        """Put one machine at rest at strokes (shares of full).
+        """Set one machine to a steady state at the given strokes (fractions of full stroke).
 
         Raises:
             ConfigError: it cannot begin there.
@@ -48,7 +48,7 @@ class PlantLanes(ABC):
 
     @abstractmethod
     def step(self, levers: NDArray[np.float32]) -> None:
-        """Hold levers, shape (lanes, 3), for one tick."""
+        """Hold levers, shape (lanes, 3), for one sample."""
 
 
 class SimulatorLanes(PlantLanes):
@@ -86,7 +86,7 @@ class SimulatorLanes(PlantLanes):
 
 
 class TwinLanes(PlantLanes):
-    """A twin, whose lanes are those of one batch.
+    """Batch of a twin.
 
     Args:
         twin: the plant.
@@ -105,7 +105,7 @@ class TwinLanes(PlantLanes):
         self._show(np.repeat(row[None], count, axis=0))
 
     def begin(self, lane: int, seed: int, shares: Sequence[float], material: str) -> None:
-        """See `PlantLanes`; a twin draws nothing."""
+        """Begin as in `PlantLanes`; a twin uses no random numbers."""
         check_air(material)
         state, row = self._start.begin(shares)
         self._state = {name: values.copy() for name, values in self._state.items()}
@@ -161,7 +161,7 @@ class EnvironmentLanes(PlantLanes):
 
 
 def plant_lanes(spec: LearningSpec, count: int) -> PlantLanes:
-    """The plants of a task: the simulator, a twin or an FMU.
+    """Create the plants of a task: the simulator, a twin or an FMU.
 
     Raises:
         EdpError: the plant cannot be read or run, or has another rate.
@@ -179,7 +179,7 @@ def plant_lanes(spec: LearningSpec, count: int) -> PlantLanes:
 
 
 def single_plant(spec: LearningSpec, duration_s: float) -> Any:
-    """The plant of a task alone, as an environment, for episodes of at most `duration_s`.
+    """Create the plant of a task as a single environment, for episodes of at most `duration_s`.
 
     Raises:
         EdpError: the plant cannot be read or run, or has another rate.
@@ -192,7 +192,7 @@ def single_plant(spec: LearningSpec, duration_s: float) -> Any:
 
 
 def _twin(spec: LearningSpec) -> Twin:
-    """The twin of a task.
+    """Return the twin of a task.
 
     Raises:
         EdpError: it cannot be read, or has another rate.

@@ -1,4 +1,4 @@
-"""A policy as a controller, so that `run_loop` judges it as any other."""
+"""Policy as a controller, so that `run_loop` evaluates it like any other."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class PolicyController(Controller):
             self._inner.reset(self._whole(measured), reference)
 
     def levers(self, measured: Array, tick: int) -> Array:
-        """The policy's action as levers, or as a correction of those of the base controller.
+        """Return the policy's action as levers, or as a correction of the base controller's levers.
 
         Raises:
             ControlFault: the policy failed, or answered something else than three numbers.
@@ -97,12 +97,12 @@ class PolicyController(Controller):
         self._remember(tick)
 
     def _remember(self, tick: int) -> None:
-        """Note the levers of the tick before, once a tick; before the first one there were none."""
+        """Store the levers of the previous sample, once per sample; before the first one there were none."""
         if tick > self._noted:
             self._past, self._noted = remembered(self._past, self.before[None]), tick
 
     def _whole(self, measured: Array) -> Array:
-        """An observation in the order of the plant; NaN where nothing is read."""
+        """Return an observation in the order of the plant, NaN for unread channels."""
         values = np.full(len(self.plant.channels), np.nan)
         values[self._columns] = measured
         return values

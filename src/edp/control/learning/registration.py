@@ -10,7 +10,7 @@ ENTRY, VECTOR_ENTRY = "edp.control.learning:TaskEnvironment", "edp.control.learn
 
 
 def register_tasks() -> None:
-    """Register ``edp/Grade-M22-v0`` and the like, one a task and built-in machine; again is no error."""
+    """Register ``edp/Grade-M22-v0`` etc., one per task and built-in machine; repeated calls are allowed."""
     for task in TASKS:
         for machine in machine_names():
             name = f"edp/{task.title()}-{machine}-v0"

@@ -1,4 +1,4 @@
-"""What a tick of a task is worth: the error to the reference of the same time first, never the path alone."""
+"""Reward of a task sample: mainly the error to the reference at the same time, not the path error alone."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class RewardWeights:
         )
 
     def of_tick(self, position_m: Array, attitude_rad: Array, travel: Array, violated: NDArray[np.bool_]) -> Array:
-        """Reward of a tick: position and attitude errors, lever travel, limits, all of shape (lanes,)."""
+        """Return the reward from position and attitude errors, lever travel and limits, each of shape (lanes,)."""
         near = 1.0 / (1.0 + position_m / self.position_m)
         upright = self.attitude / (1.0 + np.abs(attitude_rad) / self.attitude_rad)
         return np.asarray(near + upright - self.travel * travel - self.limit * violated)

@@ -116,7 +116,7 @@ def check_render(mode: Any) -> None:
 
 
 def check_options(options: dict[str, Any] | None) -> None:
-    """Refuse options of a reset: what an episode is follows from its seed.
+    """Raise an error for options of a reset, since an episode follows from its seed.
 
     Raises:
         ConfigError: there is one.

@@ -1,4 +1,4 @@
-"""What a task's environment is: reference, plant, observation, action and reward, checked before the first step."""
+"""Settings of a task environment: reference, plant, observation, action and reward, checked before the first step."""
 
 from __future__ import annotations
 
@@ -144,14 +144,14 @@ class LearningSpec:
 
     @property
     def plant_settings(self) -> EnvironmentSpec:
-        """Of the simulator, with two ticks more than an episode has: one at which it is reset, one to spare."""
+        """Return the settings of the simulator with two extra samples per episode: for the reset and in reserve."""
         # Soil comes with each reset.
         longest = (self.ticks + self.hold + 2) / self.rate_hz
         return EnvironmentSpec(machine=self.machine, duration_s=longest, rate_hz=self.rate_hz, **self.simulator)
 
 
 def learning_spec(settings: LearningSpec | None, changes: Mapping[str, Any]) -> LearningSpec:
-    """Settings, the usual ones where None, with changes laid over them.
+    """Return the settings (default if None) with the changes applied.
 
     Raises:
         ConfigError: a change names no setting (the closest is offered), or is out of range.

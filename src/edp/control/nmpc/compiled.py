@@ -1,4 +1,4 @@
-"""What a tick of the predictive controller computes beside its model, compiled: a hundred calls of NumPy cost more.
+"""Compiled numerics of the predictive controller outside its model, replacing many small NumPy calls.
 
 All compiled code of the controller is in this file, whose content is the fingerprint of the code that is kept on disk.
 """
@@ -105,7 +105,7 @@ def fill_poses(strokes: Array, angles: Array, full: Array, lengths: Array, tips:
 def fill_normal(
     strokes: Array, steps: Array, tips: Array, jacobians: Array, directions: Array, goals: Array, normal: Array
 ) -> None:
-    """Normal equations of the weighted tip errors over a horizon.
+    """Compute the normal equations of the weighted tip errors over a horizon.
 
     Args:
         strokes: of all runs, the base first, m, shape (variable + 1, tick, axis).

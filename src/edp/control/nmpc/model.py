@@ -1,4 +1,4 @@
-"""A twin as the model of a controller: its memory follows what is measured, and its error is watched on the way."""
+"""Twin as a controller model: its memory follows the measurement, and its error is monitored."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class TwinModel:
         self._past.clear()
 
     def row(self, measured: Array) -> NDArray[np.float32]:
-        """A row of the twin's answers from one of `reads`, NaN where nothing is measured, or not to be trusted."""
+        """Return a row of the twin's outputs from one of `reads`, NaN for unmeasured or untrusted outputs."""
         row = self._free.copy()
         row[self._ports] = measured
         return row
@@ -101,7 +101,7 @@ class TwinModel:
         self.disturbance = self.disturbance + self.smoothing * (speed - self.disturbance)
 
     def predicted(self, levers: Array, measured: Array, first: NDArray[np.int64]) -> tuple[Array, Array]:
-        """What follows levers to come.
+        """Return predictions for future levers.
 
         Args:
             levers: shape (run, tick, 3); those of a run the first one's before it branches off.
@@ -118,7 +118,7 @@ class TwinModel:
         return strokes, answers[..., self._pressures].astype(float)
 
     def advance(self, measured: Array | None, levers: Array) -> None:
-        """Let a tick pass with these levers; `measured` is None where nothing came, and all ports ran free."""
+        """Advance by one sample with these levers; with `measured` None all ports run free."""
         row = self._free if measured is None else self.row(measured)
         command = np.asarray(self.plant.commands(levers)[self._pilots], np.float32)
         self._past.append((self._state, row, command))
@@ -128,14 +128,14 @@ class TwinModel:
 
 
 def _columns(indices: list[int]) -> slice | NDArray[np.int64]:
-    """Columns as a slice where they lie side by side: what it takes is no copy."""
+    """Return a slice for contiguous columns, which avoids a copy; otherwise an index array."""
     if indices and indices == list(range(indices[0], indices[-1] + 1)):
         return slice(indices[0], indices[-1] + 1)
     return np.array(indices, np.int64)
 
 
 def _check(twin: Twin, plant: PlantInterface, answers: list[str], commands: list[str]) -> None:
-    """Refuse a twin that is not one of this plant."""
+    """Raise an error for a twin that does not fit the plant."""
     if twin.channels.rate_hz != plant.rate_hz:
         raise ConfigError(
             f"the twin has {typed(twin.channels.rate_hz)} Hz, {plant.source} {typed(plant.rate_hz)} Hz; train one "

@@ -1,4 +1,4 @@
-"""Moves of a horizon: speeds that are asked for, a few a lever, and the levers that the valve map makes of them."""
+"""Moves over a horizon: requested speeds, a few per lever, and the levers derived by the valve map."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _packed(tables: list[list[tuple[Array, Array]]]) -> tuple[Array, Array, NDAr
 
 
 class Moves:
-    """A horizon in blocks of ticks, in each of which the asked speeds stay.
+    """Horizon in blocks of samples with constant requested speeds.
 
     Args:
         blocks: ticks of each block.
@@ -90,7 +90,7 @@ class Moves:
         self.difference = np.eye(self.count) - np.eye(self.count, k=-AXES)
 
     def runs(self, speeds: Array, steps: Array) -> Array:
-        """The base and, for each variable, a run in which it differs by a step.
+        """Return the base run and one run per variable in which it differs by a step.
 
         Args:
             speeds: of the plan, m/s, shape (block, 3).

@@ -1,4 +1,4 @@
-"""How soon a machine answers its levers, by its twin: what a plan must reach beyond."""
+"""Response time of a machine to its levers, by its twin: the lower limit of a plan's length."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEAST_OF_ASKED = 0.2
 
 
 def response(model: TwinModel, measured: Array, valves: SpeedToLever, slew: Array) -> Array | None:
-    """Speed of each cylinder after its own lever moved to ask for `SPEED_M_S`, over the speed that it comes to.
+    """Return the speed of each cylinder after a lever step for `SPEED_M_S`, relative to its final speed.
 
     Each cylinder moves away from its nearer end, alone, at the slew limit of its lever.
 

@@ -1,4 +1,4 @@
-"""Tasks of a closed loop: reference, limits and score; one file and one registration a task."""
+"""Control tasks: reference, limits and score; one module and one registration per task."""
 
 from edp.control.tasks.base import TASKS, ControlTask, TaskSpec, draw_task
 from edp.control.tasks.corners import CornerPath as CornerPath

@@ -1,4 +1,4 @@
-"""What every task shares: its registry, the drawing of its numbers from a seed, and the check that it can be done."""
+"""Common base of tasks: registry, random parameters from a seed, and the feasibility check."""
 
 from __future__ import annotations
 
@@ -89,20 +89,20 @@ class TaskSpec(ABC):
 
     @abstractmethod
     def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:
-        """A reference of drawn numbers.
+        """Return a reference with random parameters.
 
         Raises:
             ConfigError: it cannot be reached; other numbers are drawn then.
         """
 
     def drawn_speed(self, rng: np.random.Generator) -> float:
-        """The speed of the tip, m/s."""
+        """Return the speed of the tip, m/s."""
         return float(rng.uniform(*SPEED_M_S)) if self.speed_m_s is None else self.speed_m_s
 
     def tip_reference(
         self, name: str, points: Array, speed: float, geometry: TipGeometry, rate_hz: float
     ) -> TipReference:
-        """A reference along straight legs of tip poses, shape (legs + 1, 3), each at a top speed (m/s).
+        """Return a reference along straight segments of tip poses, shape (legs + 1, 3), with the given top speed (m/s).
 
         Raises:
             ConfigError: it cannot be reached.
@@ -131,7 +131,7 @@ TASKS: Registry[type[TaskSpec]] = Registry("task")
 
 
 def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) -> ControlTask:
-    """A task that the machine can do: numbers are drawn until strokes and speeds lie within what it can.
+    """Return a feasible task: parameters are drawn until strokes and speeds are within the machine's limits.
 
     Args:
         spec: options of a registered task.

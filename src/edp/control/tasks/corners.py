@@ -1,4 +1,4 @@
-"""A path with corners: straight legs of the tip at constant attitude, at rest for an instant at each corner."""
+"""Path with corners: straight segments of the tip at constant attitude, with a stop at each corner."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class CornerPath(TaskSpec):
         check_bounds("task 'corners'", self, width_m=positive, height_m=positive, legs=integer(1, 4))
 
     def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:
-        """A rectangle from a pose of drawn strokes, towards the machine or away from it, upwards or downwards."""
+        """Return a rectangle from a random pose, towards or away from the machine, upwards or downwards."""
         start = geometry.tip(rng.uniform(*START, 3) * geometry.full_m)
         along, up = rng.choice([-1.0, 1.0], 2) * (self.width_m, self.height_m)
         steps = np.array([[along, 0.0, 0.0], [0.0, up, 0.0], [-along, 0.0, 0.0], [0.0, -up, 0.0]])[: self.legs]

@@ -1,4 +1,4 @@
-"""A cycle of digging and dumping in soil: lower, penetrate, drag, curl and lift, stretch out, dump."""
+"""Digging cycle in soil: lower, penetrate, drag, curl and lift, stretch out, dump."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class DigCycle(TaskSpec):
         check_order("task 'dig'", depth_m=self.depth_m, length_m=self.length_m)
 
     def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:
-        """Poses of a cycle whose drag lies at a drawn depth below level ground."""
+        """Return the poses of a cycle with a random dragging depth below level ground."""
         ground, reach = geometry.ground_m, geometry.reach_m
         x, depth = rng.uniform(*ENTRY_REACH) * reach, rng.uniform(*self.depth_m)
         end = x - rng.uniform(*self.length_m)

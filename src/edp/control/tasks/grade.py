@@ -52,7 +52,7 @@ class Grade(TaskSpec):
             raise ConfigError(f"task 'grade': direction = '{self.direction}'{closest(self.direction, DIRECTIONS)}")
 
     def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:
-        """A line from a pose of drawn strokes."""
+        """Return a line from a random pose."""
         start = geometry.tip(rng.uniform(*START, 3) * geometry.full_m)
         attitudes = self.attitude_deg or (SOIL_ATTITUDE_DEG if self.material else None)
         if attitudes:

@@ -16,10 +16,10 @@ from edp.control.tasks.time_law import duration_s, timed
 @TASKS.register("level")
 @dataclass(frozen=True, kw_only=True)
 class LevelBucket(TaskSpec):
-    """Boom and arm go from drawn strokes to others in straight lines of the strokes, the attitude stays."""
+    """Straight stroke motion of boom and arm between random strokes at constant bucket attitude."""
 
     def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:
-        """Two poses of drawn strokes; the bucket keeps the attitude of the first."""
+        """Return two random poses with the bucket attitude of the first."""
         start, goal = rng.uniform(*START, (2, 3)) * geometry.full_m
         goal[2] = start[2]
         speed = self.drawn_speed(rng)

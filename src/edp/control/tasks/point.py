@@ -21,7 +21,7 @@ POINTS = (0.15, 0.85)
 @TASKS.register("point")
 @dataclass(frozen=True, kw_only=True)
 class PointToPoint(TaskSpec):
-    """Straight lines of the strokes between drawn points, at rest at each.
+    """Straight stroke motion between random points, with a stop at each.
 
     Attributes:
         points: number of points after the start.
@@ -34,7 +34,7 @@ class PointToPoint(TaskSpec):
         check_bounds("task 'point'", self, points=integer(1, 100))
 
     def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:
-        """Points of drawn strokes, each within `STEP` of the one before."""
+        """Return random points, each within `STEP` of the previous one."""
         shares = [rng.uniform(*POINTS, 3)]
         for _ in range(self.points):
             shares.append(np.clip(shares[-1] + rng.uniform(-STEP, STEP, 3), *POINTS))

@@ -1,4 +1,4 @@
-"""How fast a path is run: speed along it over time, without a step in the speed."""
+"""Time law of a path: speed along the path over time, without steps in speed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def duration_s(length: float, speed: float, ramp_s: float) -> float:
 def timed(
     points: Array, seconds: Sequence[float], rate_hz: float, ramp_s: float, law: str, lead_s: float, hold_s: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Rows along straight legs from point to point, at rest at each, with rests before and after.
+    """Return rows along straight segments with a stop at each point, with waiting times before and after.
 
     Args:
         points: shape (legs + 1, values).

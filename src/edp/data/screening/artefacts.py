@@ -1,4 +1,4 @@
-"""Channels whose relation to anything is made by how the recordings were cut: they tell the file, not the machine."""
+"""Channels whose relations are artefacts of how the recordings were cut: they identify the file, not the machine."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ VISIBLE, ABSENT = 0.8, 0.3
 
 
 def dead_flags(table: CandidateTable) -> list[Flag]:
-    """Channels that never change, or change between recordings only; and those with missing values."""
+    """Flag channels that are constant, change between recordings only, or have missing values."""
     flags = [
         Flag(name, FlagKind.MISSING, value=1.0, evidence=f"{count} values are missing or infinite")
         for name, count in table.missing.items()
@@ -73,7 +73,7 @@ def clock_flags(table: CandidateTable, live: Sequence[int]) -> list[Flag]:
 def changing_flags(
     names: Sequence[str], lagged: Lagged, judged: Sequence[int], trusted: Sequence[int], support: Array
 ) -> list[Flag]:
-    """Channels that follow another one closely in every piece, but not with the same sign or gain.
+    """Flag channels that follow another channel closely in every segment, but with changing sign or gain.
 
     Args:
         names: channels.
@@ -120,7 +120,7 @@ def changing_flags(
 def broken_flags(
     table: CandidateTable, live: Sequence[int], judged: Sequence[int], trusted: Sequence[int]
 ) -> list[Flag]:
-    """Channels that show another one with one gain in some recordings, elsewhere with the other sign or not at all.
+    """Flag channels that follow another with one gain in some recordings, but with another sign or not in others.
 
     Pieces may join recordings with different relations, so every stretch is looked at for itself, at lag 0. Natural
     relations change their gain where they change their sign or fade; a plug turned round or left out does not. A
@@ -177,7 +177,7 @@ def _broken(relation: Array, slope: Array, squares: Array) -> tuple[float, str] 
 
 
 def _moments(stretches: Sequence[np.ndarray]) -> tuple[Array, Array, Array]:
-    """Correlations ``[i, j]`` and slopes of i on j, 0 where one of them stands still; and variances ``(channel,)``."""
+    """Return correlations ``[i, j]``, slopes of i on j (0 for constant channels) and variances ``(channel,)``."""
     count = sum(len(stretch) for stretch in stretches)
     mean = sum(stretch.sum(axis=0, dtype=np.float64) for stretch in stretches) / count
     products = np.zeros((len(mean), len(mean)))
@@ -194,7 +194,10 @@ def _moments(stretches: Sequence[np.ndarray]) -> tuple[Array, Array, Array]:
 
 
 def lonely(values: Array, chance: float) -> int | None:
-    """The only piece in which a correlation is strong, given one value a piece; None where there is no such."""
+    """Return the only segment with a strong correlation, given one value per segment.
+
+    None if there is no such segment.
+    """
     order = np.argsort(-np.abs(values))
     first, second = float(abs(values[order[0]])), float(abs(values[order[1]]))
     # Strong in itself, against the next piece, and against chance.

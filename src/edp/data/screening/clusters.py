@@ -12,7 +12,9 @@ from edp.data.screening.result import Array
 
 
 def clusters_of(spearman: Array, least: float) -> list[list[int]]:
-    """Groups in which every two channels have an absolute rank correlation of `least` or more (complete linkage).
+    """Return groups in which every pair of channels has an absolute rank correlation of at least `least`.
+
+    Complete linkage is used.
 
     Args:
         spearman: ``(channel, channel)``, finite.

@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 
 
 def sources() -> tuple[Path, ...]:
-    """The source files that compiled code comes from, and this one."""
+    """Return the source files that the compiled code depends on."""
     return (*files_with(Path(__file__).parent, "from edp.data.screening.compiled import compiled"), Path(__file__))
 
 
@@ -35,7 +35,9 @@ def threads() -> int:
 def spread(
     work: Callable[[Item], Result], items: Iterable[Item], on_share: Callable[[float], None] | None = None
 ) -> list[Result]:
-    """`work` on every item by all processors, results in order; `on_share` hears the share that is done.
+    """Apply `work` to every item on all processors and return the results in order.
+
+    `on_share` receives the finished fraction.
 
     The threads of the linear algebra library are held to one meanwhile: they would wait for each other.
     """

@@ -1,4 +1,4 @@
-"""Channels that add nothing since they are copies of another, and channels that know the future.
+"""Channels that are copies of another channel, and channels that contain future values.
 
 A *copy* is a channel that equals another one, delayed, scaled and with noise of its own: what is left of it is related
 to nothing in a linear way, so that whoever has the past of the original gains nothing. A *leak of the future* is a
@@ -141,7 +141,7 @@ def _leak(
 
 
 def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
-    """Pairs of which each may be the copy: what is left of the one is unrelated to anything, at any lag.
+    """Return pairs in which one channel may be a copy: its remainder is unrelated to all channels, at all lags.
 
     Args:
         correlations: ``[reach + lag, i, j]``, over all pieces.
@@ -189,7 +189,9 @@ def rest_related(correlations: Array, i: int, j: int, lag: int, value: float) ->
 def copy_flags(
     names: Sequence[str], pairs: Sequence[CopiedChannel], trusted: set[int], innovation: Array, settled: set[int]
 ) -> list[Flag]:
-    """Of each pair, flag the copy; the original is the trusted one, else the earlier, else the smoother one.
+    """Flag the copy of each pair.
+
+    The original is the trusted channel, otherwise the earlier one, otherwise the smoother one.
 
     Args:
         names: channels.

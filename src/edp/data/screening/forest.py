@@ -27,7 +27,7 @@ TreeArrays = tuple[Ints, Ints, Ints, Array]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows to learn from or to judge on.
+    """Rows for training or evaluation.
 
     Attributes:
         inputs: channels at t, float32 ``(row, channel)``.
@@ -42,7 +42,10 @@ class Rows:
 
 
 def rows_of(table: CandidateTable, pieces: Sequence[int], columns: Ints, count: int, horizon: int) -> Rows:
-    """Evenly spread rows of some pieces; channels have deviation 1, for which a tree's float32 splits suffice."""
+    """Return evenly spaced rows of some segments.
+
+    Channels have deviation 1, for which float32 splits of trees suffice.
+    """
     inputs, changes, places = [], [], []
     total = sum(table.pieces[p].samples for p in pieces)
     for p in pieces:
@@ -81,7 +84,7 @@ def _leaves(
 
 @compiled
 def _marks(inputs: FloatArray, tree: TreeArrays, groups: Ints, out: NDArray[np.int8]) -> None:
-    """Which groups each row's way tests: ``out[row, group] = 1``."""
+    """Mark the groups that are tested on the decision path of each row: ``out[row, group] = 1``."""
     left, right, feature, threshold = tree
     for row in range(len(inputs)):
         node = 0
@@ -116,7 +119,7 @@ class Permuted:
         self.predicted = np.sum(values, axis=0)
 
     def errors(self, group: int | None, order: Ints) -> Array:
-        """Squared error of each row and target, `group` being read from the rows of `order`; none for None."""
+        """Return the squared error of each row and target with the columns of `group` read from the rows of `order`."""
         total = self.predicted
         if group is not None:
             total = self.predicted.copy()
@@ -131,7 +134,7 @@ class Permuted:
 
 
 def _arrays(tree: object) -> tuple[TreeArrays, Array]:
-    """Nodes of a fitted tree, and the value of each, ``(node, target)``."""
+    """Return the nodes of a fitted tree and the value of each node, ``(node, target)``."""
     inner = tree.tree_  # type: ignore[attr-defined]
     nodes = (
         inner.children_left.astype(np.int64),
@@ -150,7 +153,7 @@ def importances(
     spec: ScreeningSpec,
     on_share: Callable[[float], None] | None = None,
 ) -> list[GroupImportance]:
-    """Fit a forest on the pieces that are not held out and permute each group on those that are.
+    """Fit a random forest on the training segments and permute each group of channels on the left-out segments.
 
     Args:
         table: the data.
@@ -184,7 +187,7 @@ def importances(
     orders = [_shuffled(tests.pieces, spec.seed + r) for r in range(forest.repeats)]
 
     def of_group(g: int) -> Array:
-        """Mean increase in each held-out piece, ``(piece, target)``."""
+        """Return the mean error increase in each left-out segment, ``(piece, target)``."""
         more = np.mean([permuted.errors(g, order) for order in orders], axis=0) - plain
         return np.stack([more[tests.pieces == p].mean(axis=0) for p in held_out])
 
@@ -197,7 +200,7 @@ def importances(
 
 
 def _shuffled(pieces: Ints, seed: int) -> Ints:
-    """A permutation of the rows within each piece: a channel keeps its distribution there."""
+    """Return a permutation of the rows within each segment, which keeps the distribution of each channel there."""
     rng = np.random.default_rng(seed)
     order = np.arange(len(pieces))
     for piece in np.unique(pieces):
@@ -207,7 +210,10 @@ def _shuffled(pieces: Ints, seed: int) -> Ints:
 
 
 def _listed(increases: Array, members: Sequence[Sequence[str]], targets: Sequence[str]) -> list[GroupImportance]:
-    """Entries for every group, each target and all; `increases` is ``(group, piece, target)``."""
+    """Return the entries for every group, for each target and for all targets.
+
+    The increases are ``(group, piece, target)``.
+    """
     columns = [("all", increases.mean(axis=2)), *((name, increases[:, :, j]) for j, name in enumerate(targets))]
     importances = []
     for name, values in columns:

@@ -93,7 +93,10 @@ def _radius(x: Array, y: Array, row: int, nearest: Array) -> tuple[float, int]:
 
 @compiled
 def _information(x_sorted: Array, y_along_x: Array, y_sorted: Array, places: Orders, psi: Array, k: int) -> float:
-    """KSG estimate; `places[i]` is where ``y_along_x[i]`` lies in `y_sorted`, `psi` holds digamma of 0 to n."""
+    """Return the KSG estimate.
+
+    `places[i]` is the index of ``y_along_x[i]`` in `y_sorted`, `psi` is digamma of 0 to n.
+    """
     n = len(x_sorted)
     nearest = np.empty(k)
     total = 0.0
@@ -130,7 +133,7 @@ class Information:
         self._ties = (np.diff(self._sorted, axis=1) < 1e-6).sum(axis=1)
 
     def of(self, i: int, j: int) -> float:
-        """Of two columns, never negative."""
+        """Return the mutual information of two columns, at least 0."""
         if self._ties[i] > self._ties[j]:
             i, j = j, i
         order = self._orders[i]
@@ -148,11 +151,11 @@ class Information:
     def pairs(
         self, column_pairs: Iterable[tuple[int, int]], on_share: Callable[[float], None] | None = None
     ) -> list[float]:
-        """Of several pairs of columns."""
+        """Return the mutual information of several pairs of columns."""
         return spread(lambda pair: self.of(*pair), column_pairs, on_share)
 
     def matrix(self, on_share: Callable[[float], None] | None = None) -> Array:
-        """Of all pairs, ``(channel, channel)``; NaN on the diagonal, where it has no finite value."""
+        """Return the mutual information of all pairs, ``(channel, channel)``, with NaN on the diagonal."""
         count = len(self._values)
         information = np.full((count, count), np.nan)
         rows = spread(lambda i: [self.of(i, j) for j in range(i)], range(1, count), on_share)

@@ -1,4 +1,4 @@
-"""Covariances of all channels with each other at all lags, piece by piece, in the frequency domain.
+"""Covariances of all channels with each other at all lags, computed per segment in the frequency domain.
 
 A stretch is cut into blocks. The spectrum of a block, padded by the largest lag, times that of the stretch around it
 gives exactly the sums over its rows at all lags; blocks are added up before the way back. So all pairs at all lags cost
@@ -25,7 +25,7 @@ _SEGMENTS = 128
 
 @dataclass(frozen=True, eq=False)
 class Lagged:
-    """Covariances of live channels, each centred on its piece and scaled to deviation 1 within pieces.
+    """Covariances of the live channels, each centred per segment and scaled to deviation 1 within segments.
 
     Attributes:
         live: columns of the table that the channels here are, ``(channel,)``.
@@ -47,7 +47,7 @@ class Lagged:
         return np.arange(-self.reach, self.reach + 1)
 
     def pooled(self) -> Array:
-        """Correlation over all pieces, ``(lag, channel, channel)``: sums over the root of the sums of squares."""
+        """Return the correlation over all segments, ``(lag, channel, channel)``."""
         sums = self.sums.sum(axis=0, dtype=np.float64)
         deviation = np.sqrt(np.diagonal(sums[self.reach]))
         sums /= np.outer(deviation, deviation)
@@ -55,7 +55,7 @@ class Lagged:
         return result
 
     def by_piece(self, columns: NDArray[np.int64]) -> FloatArray:
-        """Correlation of all channels with some, in each piece, ``(piece, lag, channel, column)``."""
+        """Return the correlation of all channels with some in each segment, ``(piece, lag, channel, column)``."""
         squares = self.squares()
         scale = np.sqrt(squares[:, None, :, None] * squares[:, None, None, columns])
         shown = self.sums[:, :, :, columns]
@@ -63,12 +63,12 @@ class Lagged:
         return result
 
     def squares(self) -> FloatArray:
-        """Sums of squares in each piece, ``(piece, channel)``."""
+        """Return the sums of squares in each segment, ``(piece, channel)``."""
         return np.ascontiguousarray(np.diagonal(self.sums[:, self.reach], axis1=1, axis2=2))
 
 
 class _Spectra:
-    """Spectra of the blocks of one piece: of blocks alone, and with the rows around them."""
+    """Spectra of the blocks of one segment: of the blocks alone, and with the neighbouring rows."""
 
     def __init__(self, table: CandidateTable, reach: int, live: NDArray[np.int64]) -> None:
         self.table, self.reach, self.live = table, reach, live
@@ -79,7 +79,7 @@ class _Spectra:
         self.block = self.size - 2 * reach
 
     def scaled(self, piece_index: int) -> Iterator[FloatArray]:
-        """The stretches of a piece, centred and scaled, ``(time, channel)``."""
+        """Yield the parts of a segment, centred and scaled, ``(time, channel)``."""
         mean = self.table.sums[0][piece_index, self.live]
         deviation = self.table.within[self.live]
         for stretch in self.table.pieces[piece_index].stretches:
@@ -87,7 +87,7 @@ class _Spectra:
             yield ((stretch[:, self.live] - mean) / deviation).astype(np.float32)
 
     def blocks(self, piece_index: int, columns: NDArray[np.int64] | None, around: bool) -> NDArray[np.complex64]:
-        """Spectra of all blocks of a piece, ``(frequency, block, channel)``."""
+        """Return the spectra of all blocks of a segment, ``(frequency, block, channel)``."""
         cut = []
         for values in self.scaled(piece_index):
             chosen = values if columns is None else values[:, columns]
@@ -115,7 +115,7 @@ class _Spectra:
 def lagged_covariances(
     table: CandidateTable, reach: int, shifts: int = 4, on_share: Callable[[float], None] | None = None
 ) -> Lagged:
-    """All pairs at all lags up to `reach`, and what chance gives between channels and targets of different pieces.
+    """Return the covariances of all pairs up to lag `reach`, and the level that chance produces between segments.
 
     Args:
         table: the data.
@@ -163,7 +163,7 @@ def _product(left: NDArray[np.complex64], right: NDArray[np.complex64]) -> NDArr
 
 
 def _squares(table: CandidateTable, piece_index: int, live: NDArray[np.int64]) -> Array:
-    """Sums of squares of the scaled channels of a piece, ``(channel,)``."""
+    """Return the sums of squares of the scaled channels of a segment, ``(channel,)``."""
     piece: Piece = table.pieces[piece_index]
     squares: Array = table.sums[1][piece_index, live] / np.square(table.within[live]) * piece.samples
     return squares

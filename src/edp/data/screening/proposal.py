@@ -1,4 +1,4 @@
-"""From figures to a feature set: what is kept, what is dropped, in which order and why; and the memory needed."""
+"""Proposal of a feature set: channels kept and dropped with reasons and order, and the memory length needed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ STEP = 5
 
 @dataclass(frozen=True, eq=False)
 class ScreeningEvidence:
-    """What the verdicts rest on; arrays of `relations` are over `live`.
+    """Evidence for the proposal; arrays of `relations` are indexed like `live`.
 
     Attributes:
         table: the data.
@@ -63,7 +63,10 @@ class ScreeningEvidence:
     history: tuple[int, Mapping[int, float]]
 
     def gain(self, name: str) -> tuple[float, float]:
-        """Largest linear value of a channel over the targets, and the lower end of its interval; NaN if not judged."""
+        """Return the largest Granger gain of a channel over the targets and its lower confidence bound.
+
+        NaN if not evaluated.
+        """
         channel_values = [value for value in self.values if value.channel == name]
         if not channel_values:
             return math.nan, math.nan
@@ -71,7 +74,7 @@ class ScreeningEvidence:
         return best.gain, best.low
 
     def importance_of(self, name: str) -> GroupImportance | None:
-        """The entry over all targets of the group that holds a channel."""
+        """Return the importance, over all targets, of the group that contains a channel."""
         of_channel = (entry for entry in self.importance if entry.target == "all" and name in entry.members)
         return next(of_channel, None)
 
@@ -123,7 +126,7 @@ def _noise(evidence: ScreeningEvidence, live_index: int, name: str) -> Flag:
 
 
 def redundant_flags(evidence: ScreeningEvidence, judged: Sequence[str], free: Sequence[str]) -> list[Flag]:
-    """Channels that add nothing beside others: members of a cluster, and what the pasts of others make up.
+    """Flag channels that add nothing to the others: members of a cluster, and channels predicted by other pasts.
 
     Args:
         evidence: figures.
@@ -217,7 +220,7 @@ def _scores(evidence: ScreeningEvidence) -> dict[str, float]:
 
 
 def _steadiness(t: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """``m / (m + s)`` from mean over standard error, of `count` pieces."""
+    """Return ``m / (m + s)``, given the mean over standard error of `count` segments."""
     return t / (t + math.sqrt(count))
 
 
@@ -254,7 +257,7 @@ def _reason(evidence: ScreeningEvidence, name: str, target: bool, flags: tuple[F
 
 
 def _window(evidence: ScreeningEvidence, proposed: set[str], targets: Sequence[str], horizon: int) -> tuple[int, str]:
-    """The longer of two: from the present back to the earliest cause, and what a linear prediction makes use of."""
+    """Return the proposed memory: the earliest useful lead or the range of useful lags, whichever is longer."""
     leads = [
         curve
         for curve in evidence.curves

@@ -45,7 +45,7 @@ def rank_columns(values: FloatArray) -> FloatArray:
 
 @compiled
 def _dense(values: FloatArray, order: Orders, dense: NDArray[np.int32]) -> float:
-    """Number the distinct values upwards; returns the pairs of equal values."""
+    """Number the distinct values in ascending order and return the number of pairs of equal values."""
     level, run, tied = 0, 1, 0.0
     dense[order[0]] = 0
     for row in range(1, len(values)):
@@ -61,7 +61,7 @@ def _dense(values: FloatArray, order: Orders, dense: NDArray[np.int32]) -> float
 
 @compiled
 def _swaps(keys: NDArray[np.int32], spare: NDArray[np.int32]) -> float:
-    """Pairs out of order, by merging runs upwards; `keys` is sorted in the end or lies in `spare`."""
+    """Count the pairs out of order by merge sort. The sorted keys end in `keys` or `spare`."""
     n = len(keys)
     swaps = 0.0
     # Runs of eight are sorted by insertion, which is faster than merging for so few.
@@ -139,11 +139,11 @@ class Kendall:
             self._dense.append(dense)
 
     def tau(self, i: int, j: int) -> float:
-        """Of two columns; NaN where one is constant."""
+        """Return Kendall's tau of two columns; NaN if one is constant."""
         return float(_tau(self._orders[i], self._dense[i], self._dense[j], self._tied[i], self._tied[j]))
 
     def matrix(self, on_share: Callable[[float], None] | None = None) -> Array:
-        """Of all pairs, ``(channel, channel)``."""
+        """Return Kendall's tau of all pairs, ``(channel, channel)``."""
         count = len(self._orders)
         taus = np.eye(count)
         rows = spread(lambda i: [self.tau(i, j) for j in range(i)], range(1, count), on_share)

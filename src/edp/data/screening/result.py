@@ -1,4 +1,4 @@
-"""What a screening found: plain tables and arrays, ready for a page, a picture or JSON.
+"""Results of a screening: plain tables and arrays for pages, plots and JSON.
 
 Lags are in samples, in the sense of Table 4.2: a lag of -15 means that the channel *leads*: the target at t goes best
 with the channel at t - 15. A positive lag means that the channel follows the target.
@@ -21,7 +21,7 @@ OnProgress = Callable[[str, float], None]
 
 
 class FlagKind(StrEnum):
-    """What is wrong with a channel."""
+    """Type of problem found in a channel."""
 
     CONSTANT = "constant"
     LEAK = "leak of the future"
@@ -107,7 +107,7 @@ class LagCurve:
 
 @dataclass(frozen=True)
 class LagRange:
-    """A row of Table 4.2: where the best lags of a group of channels lie, each with the target it goes best with.
+    """Row of Table 4.2: range of the best lags of a group of channels, each with its most strongly related target.
 
     Attributes:
         group: kind of signal.
@@ -125,7 +125,7 @@ class LagRange:
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """One metric of a channel at t and a target at t + horizon, in each piece of the data.
+    """One metric between a channel at t and a target at t + horizon, in each segment of the data.
 
     Attributes:
         metric: ``pearson``, ``spearman``, ``kendall``, ``information`` or ``lag``.
@@ -169,7 +169,9 @@ class GroupImportance:
 
 @dataclass(frozen=True)
 class Value:
-    """What a channel's past adds to a linear prediction from the pasts of all other usable channels, held out.
+    """Granger gain: what the past of a channel adds to a linear prediction from the pasts of all other usable channels.
+
+    Evaluated on left-out data.
 
     Attributes:
         channel, target: names.
@@ -292,7 +294,7 @@ class ScreeningResult:
     seconds: dict[str, float]
 
     def curve(self, channel: str, target: str) -> LagCurve:
-        """The lag curve of a channel and a target."""
+        """Return the lag curve of a channel and a target."""
         return next(c for c in self.lags if (c.channel, c.target) == (channel, target))
 
     def lag_table(self) -> tuple[LagRange, ...]:

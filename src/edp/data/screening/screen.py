@@ -64,7 +64,7 @@ class _Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[OnProgress]:
-        """Time a stage; yields what hears the share of it that is done."""
+        """Time a stage; yield a function that receives the finished fraction."""
         began = time.perf_counter()
 
         def on_share(stage: str, share: float) -> None:
@@ -80,7 +80,7 @@ class _Clock:
 def screen(
     recordings: Sequence[Recording], spec: ScreeningSpec | None = None, on_progress: OnProgress | None = None
 ) -> ScreeningResult:
-    """Which channels to feed a model that predicts the targets, with how much memory, and which to leave out and why.
+    """Select input channels and memory length for a model that predicts the targets. Omitted channels get a reason.
 
     Args:
         recordings: at one rate; every channel of the first must be in all.
@@ -153,7 +153,7 @@ def _matrices(table: CandidateTable, spec: ScreeningSpec, clock: _Clock) -> Matr
 
 
 def _widened(table: CandidateTable, matrix: Array) -> Array:
-    """A matrix over live channels as one over all, NaN elsewhere."""
+    """Expand a matrix over live channels to all channels, NaN elsewhere."""
     live = np.flatnonzero(table.live)
     full = np.full((len(table.names), len(table.names)), np.nan)
     full[np.ix_(live, live)] = matrix
@@ -166,7 +166,7 @@ def trusted_names(table: CandidateTable, spec: ScreeningSpec) -> set[str]:
 
 
 def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec) -> list[Flag]:
-    """What is wrong with channels whatever the targets: dead, clocks, per-file artefacts, leaks, copies."""
+    """Flag channels with problems independent of the targets: constant, clocks, per-file artefacts, leaks, copies."""
     names = [table.names[i] for i in lagged.live]
     trust = trusted_names(table, spec)
     trusted = [k for k, name in enumerate(names) if name in trust]
@@ -262,7 +262,7 @@ def _clusters(
 
 
 def _at_best(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Relations) -> Array:
-    """Correlation in each piece with the target and at the lag where the mean is largest, ``(piece, channel)``."""
+    """Return the correlation in each segment at the target and lag with the largest mean, ``(piece, channel)``."""
     pieces = lagged.by_piece(targets)[:, : lagged.reach + 1]
     target = np.abs(relations.linear).argmax(axis=1)
     chosen = pieces[:, :, np.arange(pieces.shape[2]), target]
@@ -279,7 +279,7 @@ def _concluded(
     evidence: ScreeningEvidence,
     seconds: dict[str, float],
 ) -> ScreeningResult:
-    """The last flags, the proposal, and everything in one."""
+    """Add the last flags and the proposal, and assemble the result."""
     targets = tuple(table.names[i] for i in table.targets)
     free = {name for name in table.names if name not in targets} - {flag.channel for flag in flags}
     flags = flags + noise_flags(evidence, sorted(free))

@@ -1,4 +1,4 @@
-"""What a screening is asked: targets, horizon, reach of the lags, sizes of the samples, thresholds."""
+"""Settings of a screening: targets, horizon, largest lag, sample sizes, thresholds."""
 
 from __future__ import annotations
 

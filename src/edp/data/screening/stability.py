@@ -1,4 +1,4 @@
-"""Does a relation hold in every piece of the data, and is it more than chance?
+"""Check that a relation exists in every segment of the data and exceeds chance.
 
 Chance is what a channel of one piece shows with the targets of another: both keep their own course, so that slow
 signals, which go together now and then without any reason, are judged fairly.
@@ -47,7 +47,7 @@ class Metrics:
 def metrics_by_piece(
     table: CandidateTable, live: NDArray[np.int64], spec: ScreeningSpec, on_share: Callable[[float], None] | None = None
 ) -> Metrics:
-    """Every metric in every piece, and between pieces."""
+    """Compute every metric in every segment, and between segments."""
     rows = [piece_rows(table, p, spec) for p in range(len(table.pieces))]
     count, shifts = len(rows), min(_SHIFTS, len(rows) - 1)
 
@@ -63,7 +63,7 @@ def metrics_by_piece(
 
 
 def piece_rows(table: CandidateTable, piece_index: int, spec: ScreeningSpec) -> tuple[FloatArray, FloatArray]:
-    """Evenly spread rows of a piece: all channels at t, targets at t + horizon."""
+    """Return evenly spaced rows of a segment: all channels at t, targets at t + horizon."""
     now, ahead = [], []
     piece = table.pieces[piece_index]
     for stretch in piece.stretches:
@@ -103,7 +103,7 @@ def _pearson(values: FloatArray, width: int) -> Array:
 
 
 def stability_of(names: Sequence[str], targets: Sequence[str], metrics: Metrics, lags: Array) -> list[Stability]:
-    """One entry a metric, channel and target; `lags` are best lags, ``(piece, channel, target)``."""
+    """Return one entry per metric, channel and target; `lags` are the best lags, ``(piece, channel, target)``."""
     own = np.concatenate([metrics.own, lags[None]])
     chance = np.concatenate([_mean(np.abs(metrics.crossed), (1, 2)), np.full((1, *lags.shape[1:]), np.nan)])
     stabilities = []
@@ -119,7 +119,7 @@ def stability_of(names: Sequence[str], targets: Sequence[str], metrics: Metrics,
 
 
 def _summary(values: Array) -> tuple[float, float, float]:
-    """Mean, deviation and share with the sign of the mean; NaN where nothing is finite."""
+    """Return mean, deviation and the fraction with the sign of the mean; NaN without finite values."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return math.nan, math.nan, math.nan
@@ -129,7 +129,7 @@ def _summary(values: Array) -> tuple[float, float, float]:
 
 
 def _mean(values: Array, axes: tuple[int, ...]) -> Array:
-    """Mean of the finite values; NaN where there are none, without a warning."""
+    """Return the mean of the finite values; NaN without finite values, without a warning."""
     finite = np.isfinite(values)
     count = finite.sum(axis=axes)
     total = np.where(finite, values, 0.0).sum(axis=axes)
@@ -206,7 +206,10 @@ def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, le
 
 
 def _t(values: Array) -> Array:
-    """Absolute mean over its standard error among pieces, ``(piece, ...)`` to ``(...)``; NaN counts as no relation."""
+    """Return the absolute mean over its standard error among segments, ``(piece, ...)`` to ``(...)``.
+
+    NaN counts as 0.
+    """
     values = np.nan_to_num(values)
     error = values.std(axis=0, ddof=1) / math.sqrt(len(values))
     # Equal values in all pieces are as sure as can be, not a division by zero.
@@ -217,7 +220,7 @@ def _t(values: Array) -> Array:
 def lag_curves(
     table: CandidateTable, lagged: Lagged, names: Sequence[str], targets: Sequence[str], spec: ScreeningSpec
 ) -> tuple[list[LagCurve], Array]:
-    """The curve of every channel and target, and the best lag of each piece, ``(piece, channel, target)``.
+    """Return the lag curve of every channel and target, and the best lag per segment, ``(piece, channel, target)``.
 
     The interval comes from pieces drawn again and again with replacement.
     """

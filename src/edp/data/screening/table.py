@@ -1,4 +1,4 @@
-"""The data of a screening: candidates of all recordings as one table, cut into pieces that are compared."""
+"""Data table of a screening: candidate channels of all recordings, divided into segments that are compared."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _GROUPS = {
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """What is compared with its like: stretches of recordings, each float32 ``(time, channel)``."""
+    """Segment for comparison: contiguous parts of recordings, each float32 ``(time, channel)``."""
 
     name: str
     stretches: tuple[FloatArray, ...]
 
     @property
     def samples(self) -> int:
-        """Rows of all stretches."""
+        """Number of rows of all parts."""
         return sum(len(stretch) for stretch in self.stretches)
 
 
@@ -65,12 +65,12 @@ class CandidateTable:
 
     @property
     def samples(self) -> int:
-        """Rows of all pieces."""
+        """Number of rows of all segments."""
         return sum(piece.samples for piece in self.pieces)
 
     @cached_property
     def sums(self) -> tuple[Array, Array]:
-        """Mean and variance about it of each piece and channel, float64, each ``(piece, channel)``."""
+        """Mean and variance of each segment and channel, float64, each ``(piece, channel)``."""
         means, variances = [], []
         for piece in self.pieces:
             mean = sum(s.sum(axis=0, dtype=np.float64) for s in piece.stretches) / piece.samples
@@ -91,12 +91,12 @@ class CandidateTable:
 
     @cached_property
     def within(self) -> Array:
-        """Deviation about the mean of each piece, pooled, ``(channel,)``."""
+        """Standard deviation within segments, pooled, ``(channel,)``."""
         return np.sqrt(np.average(self.sums[1], axis=0, weights=[piece.samples for piece in self.pieces]))
 
     @cached_property
     def between(self) -> Array:
-        """Share of the variance that lies between the means of the pieces, ``(channel,)``; 0 for a constant one."""
+        """Fraction of the variance between the means of the segments, ``(channel,)``; 0 for a constant channel."""
         weights = [piece.samples for piece in self.pieces]
         among = np.average(np.square(self.sums[0] - self.mean), axis=0, weights=weights)
         total = among + np.square(self.within)
@@ -105,12 +105,15 @@ class CandidateTable:
 
     @cached_property
     def live(self) -> NDArray[np.bool_]:
-        """Whether a channel changes within some piece, ``(channel,)``."""
+        """Whether a channel changes within a segment, ``(channel,)``."""
         # Relative to the mean: rounding of a constant pressure of 30 MPa is no movement.
         return self.within > 1e-9 * np.abs(self.mean)
 
     def thinned(self, count: int, ahead: int = 0) -> list[NDArray[np.int64]]:
-        """Evenly spread rows, `count` in all, for each stretch in order; `ahead` rows follow each of them."""
+        """Return `count` evenly spaced row indices in total, one array per part in order.
+
+        Each row has `ahead` rows after it.
+        """
         lengths = [len(stretch) - ahead for piece in self.pieces for stretch in piece.stretches]
         total = sum(max(length, 0) for length in lengths)
         row_indices = np.linspace(0, total - 1, min(count, total)).astype(np.int64)
@@ -122,7 +125,7 @@ class CandidateTable:
         return rows
 
     def sample(self, count: int) -> FloatArray:
-        """Evenly spread rows of all pieces, float32 ``(row, channel)``."""
+        """Return evenly spaced rows of all segments, float32 ``(row, channel)``."""
         stretches = [stretch for piece in self.pieces for stretch in piece.stretches]
         return np.concatenate([s[rows] for s, rows in zip(stretches, self.thinned(count), strict=True)])
 
@@ -133,7 +136,7 @@ def chunks(stretches: Sequence[FloatArray], rows: int = 32_768) -> Iterator[Arra
 
 
 def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> CandidateTable:
-    """Gather candidates and targets and cut the recordings into pieces.
+    """Collect candidates and targets, and divide the recordings into segments.
 
     Raises:
         DataError: no recordings, mixed rates, a channel that a recording lacks, no target, missing values in a
@@ -192,7 +195,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
 
 
 def group_of(name: str, kind: Kind) -> str:
-    """Kind of signal, as Table 4.2 groups them; other channels by what they measure."""
+    """Return the signal group as in Table 4.2; other channels are grouped by their kind."""
     if name in TABLE_A1:
         if kind == Kind.PILOT_PRESSURE:
             return "conflux pilot pressure" if name.endswith("Conf") else "pilot pressure"
@@ -214,7 +217,7 @@ def _usual_targets(recording: Recording) -> tuple[str, ...]:
 
 
 def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequence[Recording], tuple[str, ...]]:
-    """Recordings of at least five times the largest lag, and the names of the others."""
+    """Return the recordings of at least five times the largest lag, and the names of the others."""
     # A correlation at the largest lag then rests on four fifths of the rows at least.
     least = LEAST_LAGS * max_lag
     long = [recording for recording in recordings if recording.samples >= least]
@@ -239,7 +242,10 @@ def _missing(names: Sequence[str], columns: Sequence[FloatArray]) -> dict[str, i
 
 
 def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: ScreeningSpec) -> tuple[Piece, ...]:
-    """A piece a recording; long ones cut where there are too few, neighbours joined where there are too many."""
+    """Return one segment per recording.
+
+    Long recordings are divided if there are too few, neighbours are joined if there are too many.
+    """
     total = sum(len(values) for values in columns)
     pieces: list[Piece] = []
     if len(columns) >= spec.pieces:
@@ -261,7 +267,7 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
 
 
 def _thinned(pieces: tuple[Piece, ...], max_lag: int) -> tuple[Piece, ...]:
-    """Pieces of at most `MOST_ROWS` in all, about: of more, evenly spread stretches of each recording, in memory."""
+    """Return segments with about `MOST_ROWS` rows in total, as evenly spaced parts of each recording in memory."""
     lengths = [len(stretch) for piece in pieces for stretch in piece.stretches]
     if sum(lengths) <= MOST_ROWS:
         return pieces

@@ -1,4 +1,4 @@
-"""What the past of a channel adds to a linear prediction that has the pasts of all others, on held-out pieces.
+"""Granger gain: improvement by the past of a channel in a linear prediction from all other pasts, on left-out segments.
 
 The models are solved and judged on lagged covariances alone. Leaving a channel out of a solved model costs one small
 system, so that every channel is left out in turn and the rest solved anew, exactly.
@@ -28,20 +28,20 @@ ENOUGH = 0.02
 
 
 def held_out_pieces(count: int, share: float, seed: int) -> NDArray[np.int64]:
-    """Which pieces are held out: at least two, at most all but two."""
+    """Choose the left-out segments: at least two, at most all but two."""
     # Two on either side at least, or there is no spread to judge by.
     piece_count = min(max(2, round(count * share)), count - 2)
     return np.sort(np.random.default_rng(seed).permutation(count)[:piece_count])
 
 
 def _correlations(lagged: Lagged, pieces: NDArray[np.int64]) -> Array:
-    """Sums over some pieces a row, ``(lag, channel, channel)``: about 1 on the diagonal, the same scale for all."""
+    """Return the mean product over the given segments, ``(lag, channel, channel)``: about 1 on the diagonal."""
     result: Array = lagged.sums[pieces].sum(axis=0, dtype=np.float64) / lagged.samples[pieces].sum()
     return result
 
 
 class _Model:
-    """A linear prediction of the target's change, solved on training pieces and judged on others."""
+    """Linear predictor of the target's change, fitted on the training segments and evaluated on the others."""
 
     def __init__(self, train: Array, taps: Sequence[Tap], target: int, ahead: int) -> None:
         self.taps, self.target, self.ahead = list(taps), target, ahead
@@ -57,13 +57,13 @@ class _Model:
         return ahead if self.ahead == 0 else ahead - gram(sums, self.taps, [(self.target, 0)])[:, 0]
 
     def power(self, sums: Array) -> float:
-        """Mean square of what is predicted."""
+        """Return the mean square of the predicted quantity."""
         reach = len(sums) // 2
         now = sums[reach, self.target, self.target]
         return float(now if self.ahead == 0 else 2.0 * (now - sums[reach + self.ahead, self.target, self.target]))
 
     def without(self, columns: NDArray[np.int64]) -> Array:
-        """Weights with some regressors left out and the rest solved anew; zero where left out."""
+        """Return the weights after removing some regressors and solving again; removed weights are zero."""
         unit = np.zeros((len(self.taps), len(columns)))
         unit[columns, np.arange(len(columns))] = 1.0
         inverse = scipy.linalg.cho_solve(self.factor, unit, check_finite=False)
@@ -88,7 +88,7 @@ def linear_values(
     held_out: NDArray[np.int64],
     on_share: Callable[[float], None] | None = None,
 ) -> list[Value]:
-    """The value of each used channel for each target.
+    """Return the Granger gain of each used channel for each target.
 
     Args:
         names: of the channels of `lagged`.
@@ -130,7 +130,7 @@ def linear_values(
 
 
 def _interval(values: Array, middle: float) -> tuple[float, float, float]:
-    """The pooled figure with a 95 % t interval from the pieces."""
+    """Return the pooled value with a 95 % t interval from the segments."""
     error = values.std(ddof=1) / math.sqrt(len(values)) if len(values) > 1 else math.nan
     half = float(stdtrit(max(len(values) - 1, 1), 0.975) * error)
     return middle, middle - half, middle + half
@@ -139,7 +139,7 @@ def _interval(values: Array, middle: float) -> tuple[float, float, float]:
 def window_needed(
     lagged: Lagged, used: Sequence[int], targets: Sequence[int], horizon: int, held_out: NDArray[np.int64]
 ) -> tuple[int, dict[int, float]]:
-    """The shortest history from which a linear prediction is about as good as from the longest that was looked at.
+    """Return the shortest history for which a linear prediction is about as good as for the longest history evaluated.
 
     Args:
         lagged: covariances of every piece.

@@ -1,4 +1,4 @@
-"""The on-board adaptation of a model as text: its constants, and what its templates are filled with."""
+"""C code of the on-board adaptation of a model: its constants, and the values for its templates."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def own_bytes(adaptation: Adaptation) -> int:
 
 
 def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, object]:
-    """What the templates of an adaptation are filled with besides what its model gives.
+    """Return the template values of an adaptation, in addition to those of its model.
 
     Args:
         adaptation: the adaptation.
@@ -68,7 +68,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
 
 
 def constants(adaptation: Adaptation) -> list[CConstant]:
-    """All constants, those with a text in the order of the C code."""
+    """Return all constants; those with text are in the order of the C code."""
     lines = []
     for name in POINTERS:
         values = np.atleast_1d(getattr(adaptation, name)).ravel()

@@ -33,7 +33,7 @@ class Calls:
         self.graph, self.plan = graph, plan
 
     def value(self, name: str, offset: int = 0) -> str:
-        """Where a value lies, as a C expression."""
+        """Return a C expression for the location of a value."""
         if name == INPUT:
             base, at = "in", offset
         else:
@@ -41,12 +41,12 @@ class Calls:
         return f"{base} + {at}" if at else base
 
     def scratch(self, layer: Layer, offset: int = 0) -> str:
-        """Where a layer's scratch numbers lie."""
+        """Return a C expression for the location of a layer's scratch memory."""
         base, at = WORK[scratch_number(layer)], self.plan.scratch[layer.name] + offset
         return f"{base} + {at}" if at else base
 
     def of(self, layer: Layer) -> list[str]:
-        """The statements that compute a layer.
+        """Return the statements that compute a layer.
 
         Raises:
             ExportError: this kind of layer has no C function.
@@ -70,22 +70,22 @@ Write = Callable[[Calls, Any], list[str]]
 
 
 def constant(layer: Layer, name: str) -> str:
-    """The C array of a layer's constant."""
+    """Return the C array of a layer's constant."""
     return f"{identifier(layer.name)}_{name}"
 
 
 def slot(layer: Layer | str, name: str) -> str:
-    """The C array of what a layer remembers."""
+    """Return the C array of a layer's state."""
     return f"s->{identifier(layer if isinstance(layer, str) else layer.name)}_{name}"
 
 
 def ring(layer: Layer) -> str:
-    """The address of a layer's ring or counter."""
+    """Return the address of a layer's ring or counter."""
     return f"&s->{identifier(layer.name)}_ring_at"
 
 
 def runs(calls: Calls, layer: layers.Gather | QGather) -> list[tuple[str, int, int]]:
-    """Runs of neighbouring columns: the value they come from, the first column in it, their number."""
+    """Return runs of neighbouring columns: source value, first column in it, number of columns."""
     widths = [calls.graph.width_of(name) for name in layer.inputs]
     return [(layer.inputs[which], first, length) for which, first, length in neighbours(layer.columns, widths)]
 
@@ -268,7 +268,7 @@ def structs(layer: Layer) -> list[str]:
 
 
 def describe(layer: Layer) -> str:
-    """A comment on what a layer is: its name, kind and shapes."""
+    """Return a comment that describes a layer: name, kind and shapes."""
     shapes = [f"{name} {' x '.join(map(str, values.shape))}" for name, values in layer.tensors().items()]
     size = f"{layer.width} numbers" if layer.width else "no value"
     return f"/* {c_comment(layer.name)}: {layer.kind}, {'; '.join([size, *shapes])} */"

@@ -42,7 +42,7 @@ STRUCTS = {
 
 @dataclass(frozen=True)
 class DataModel:
-    """How a compiler lays constants out.
+    """Data layout of a compiler for constants.
 
     Attributes:
         pointer: bytes of a pointer.
@@ -76,7 +76,7 @@ class CConstant:
     text: str = ""
 
     def bytes_on(self, machine: DataModel) -> int:
-        """What it takes on a machine, up to the next constant."""
+        """Return the size on a machine in bytes, up to the next constant."""
         if self.kind in STRUCTS:
             pointers, numbers = STRUCTS[self.kind]
             # A struct is as aligned as its pointers.
@@ -87,12 +87,12 @@ class CConstant:
 
 
 def total_bytes(constants: Iterator[CConstant] | list[CConstant], machine: DataModel = CORTEX_M) -> int:
-    """What constants take in read-only memory."""
+    """Return the size of constants in read-only memory."""
     return sum(one.bytes_on(machine) for one in constants)
 
 
 def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Iterator[CConstant]:
-    """All constants of a model, in the order of the C code; those of ``NAME_weights.h`` first.
+    """Yield all constants of a model in the order of the C code, constants of ``NAME_weights.h`` first.
 
     Args:
         graph: its layers.
@@ -122,7 +122,7 @@ def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Itera
 
 
 def stored(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A constant's numbers in the order of the C code."""
+    """Return the elements of a constant in the order of the C code."""
     return laid(layer, name, integer_calls.laid_out(layer, values))
 
 
@@ -133,7 +133,7 @@ def _tensor(layer: Layer, name: str, values: NDArray[Any], written: bool) -> CCo
 
 
 def _tables(graph: Graph) -> CConstant:
-    """Where the tensors are, for their checksum."""
+    """Return the table of tensor locations for the checksum."""
     entries = [
         f"{{{constant(layer, name)}, {values.size}u, {values.itemsize}u}}"
         for layer in graph.layers
@@ -155,5 +155,5 @@ def _integer(value: int) -> str:
 
 
 def _up_to(size: int, multiple: int) -> int:
-    """The next multiple of a number of bytes."""
+    """Round a number of bytes up to the next multiple."""
     return -(-size // multiple) * multiple

@@ -147,7 +147,7 @@ def structs(layer: Layer) -> list[str]:
 
 
 def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
-    """A constant in the order in which the runtime reads it: see ``edp_q_products``."""
+    """Return a constant in the order in which the runtime reads it: see ``edp_q_products``."""
     if values.dtype != np.int8 or values.ndim < 2:
         return values
     if isinstance(layer, quantised.QConvolution):
@@ -172,7 +172,7 @@ def _in_order(matrix: NDArray[Any]) -> NDArray[Any]:
 
 
 def tables_header() -> str:
-    """The file of the runtime's tables."""
+    """Return the header file with the tables of the runtime."""
     parts = ["/* Functions at even distances, in 2^-16; see edp_integer.h. */", "#ifndef EDP_TABLES_H"]
     parts += ["#define EDP_TABLES_H", "", "#include <stdint.h>", "", f"#define EDP_TABLE {fixed.TABLE}u", ""]
     for name, values, note in (

@@ -1,4 +1,4 @@
-"""The order in which a matrix of weights lies in the C code."""
+"""Memory order of weight matrices in the C code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MATRICES: dict[type[Layer], tuple[str, ...]] = {
 
 
 def laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A constant's numbers in the order of the C code.
+    """Return the elements of a constant in the order of the C code.
 
     Matrices lie in panels of `PANEL` rows, in each of them column by column, so that a processor with vectors reads
     neighbours; the rows that are left over lie one after the other.

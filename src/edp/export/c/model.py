@@ -1,4 +1,4 @@
-"""A model's header, source and constants as text, from the graph and what is known of its two ends."""
+"""Header, source and constants of a model as C text, from its graph, inputs and outputs."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ COPIES = {Number.FLOAT: "edp_copy", Number.INT16: "edp_q_copy16", Number.INT32: 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What the templates of one model are filled with.
+    """Template values of one model.
 
     Attributes:
         name: C prefix of the model.
@@ -88,12 +88,12 @@ class Model:
 
     @property
     def integer(self) -> bool:
-        """Whether it computes in integer arithmetic."""
+        """Whether the model computes in integer arithmetic."""
         return isinstance(self.bundle.predictor, IntegerPredictor)
 
     @property
     def hydraulic(self) -> bool:
-        """Whether one of its layers is a grey box."""
+        """Whether a layer is a grey box."""
         return any(isinstance(layer, HydraulicTick) for layer in self.graph.layers)
 
     @property
@@ -118,13 +118,13 @@ class Model:
         return "edp_integer.h" if self.integer else (HYDRAULICS[0] if self.hydraulic else RUNTIME[0])
 
     def weights(self) -> str:
-        """The file of constants."""
+        """Return the file of constants."""
         parts = [f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */"]
         parts += [one.text for one in constants_of(self.graph, self.plan, written=True) if one.text]
         return "\n".join(parts) + "\n"
 
     def fill(self, template: str) -> Code:
-        """A template with everything in its place."""
+        """Fill in a template."""
         text = resources.files("edp.export.c").joinpath(f"templates/{template}").read_text()
         return fill(text, self._values())
 
@@ -251,7 +251,7 @@ class Model:
         return adaptation.values(law, self.name.upper(), len(self.bundle.predictor.output.coverages))
 
     def state_bytes(self) -> int:
-        """Of the state, without what a compiler may put between its parts."""
+        """Size of the state, without padding by the compiler."""
         slots = sum(max(1, part.size) * part.number.bytes for _, part in self.graph.slots() if part.name != "age")
         rings = sum(has_ring(layer) for layer in self.graph.layers)
         work = sum(size * kind.bytes for kind, size in self.plan.sizes.items())
@@ -269,7 +269,7 @@ class Model:
 
 
 def remembered(graph: Graph) -> tuple[list[str], list[str]]:
-    """Fields of the state for what the layers remember, and the statements that set them as after a reset."""
+    """Return the fields of the state, and the statements that set them after a reset."""
     declared, cleared = [], []
     for layer in graph.layers:
         for part in layer.slots:
@@ -319,7 +319,7 @@ def _listed(entries: Sequence[tuple[str, str]]) -> Code:
 
 
 def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = False) -> Model:
-    """A model ready to be written.
+    """Create a model ready to be written.
 
     Args:
         name: C prefix of the model.
@@ -343,7 +343,7 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
 
 
 def _check(model: Model) -> None:
-    """Refuse what the C code cannot count.
+    """Refuse sizes that the C code cannot represent.
 
     Raises:
         ExportError: a size is beyond the numbers of the generated code.

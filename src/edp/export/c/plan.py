@@ -1,4 +1,4 @@
-"""Where values lie in a model's work memories: places are used again once nobody reads them."""
+"""Memory plan of a model: locations of values in the work memory, which are reused after the last read."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _integer_scratch(layer: Layer) -> int:
 
 
 def scratch_number(layer: Layer) -> Number:
-    """What a layer's scratch numbers are."""
+    """Return the number type of a layer's scratch memory."""
     return Number.FLOAT if layer.number is Number.FLOAT else Number.INT32
 
 

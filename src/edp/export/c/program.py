@@ -27,7 +27,7 @@ MOST_COPIED = 64
 
 
 def features(statements: Iterable[str]) -> tuple[int, int, int]:
-    """What the size of a model's own code depends on.
+    """Return the features that determine the size of a model's own code.
 
     Returns:
         Calls, arguments on the stack, integers that are wider than a byte.

@@ -1,4 +1,4 @@
-"""What a model and its program take on a controller, counted from its layers: the bytes that every command states.
+"""Memory of a model and its program on a controller, computed from its layers; every command reports these numbers.
 
 `constant_bytes` counts what the C code declares, so it is what a compiler makes of it, to the byte; `program_bytes`
 adds up measured functions and is within 2 % of what is linked.
@@ -32,7 +32,7 @@ class Sizes:
 
 
 def sizes_of(graph: Graph, adaptation: Adaptation | None = None) -> Sizes:
-    """What the C code of a list of layers takes, with that of its adaptation.
+    """Return the sizes of the C code of a graph, with its adaptation.
 
     Raises:
         ExportError: a layer has no C function.
@@ -41,7 +41,7 @@ def sizes_of(graph: Graph, adaptation: Adaptation | None = None) -> Sizes:
 
 
 def constant_bytes(graph: Graph, adaptation: Adaptation | None = None, machine: DataModel = CORTEX_M) -> int:
-    """Constants of a model in its C code, with those of its adaptation.
+    """Return the size of the constants in the C code of a model, with its adaptation.
 
     Args:
         graph: its layers.

@@ -18,7 +18,10 @@ FILES = ("edp_tangent.h", "edp_tangent.c", "edp_tangent_memory.c")
 
 
 def tangent_scratch_of(layer: Layer) -> int:
-    """Scratch numbers of a layer's tangent along one direction; what all directions share lies with the first."""
+    """Return the scratch size of a layer's tangent along one direction.
+
+    The first direction includes the common part.
+    """
     if isinstance(layer, layers.Activate):
         return layer.size
     if isinstance(layer, memory.Lstm | memory.LayerNormLstm | memory.Gru):
@@ -40,17 +43,17 @@ class Tangents:
         self.graph, self.calls, self.plan = graph, Calls(graph, plan), changes
 
     def change(self, name: str, offset: int = 0) -> str:
-        """Where the change of a value lies."""
+        """Return the location of the change of a value."""
         if name == INPUT:
             return f"t->last + {offset}" if offset else "t->last"
         return f"t->work + {self.plan.values[name] + offset}"
 
     def scratch(self, layer: Layer, offset: int = 0) -> str:
-        """Where a tangent's scratch numbers lie."""
+        """Return the location of a tangent's scratch memory."""
         return f"t->work + {self.plan.scratch[layer.name] + offset}"
 
     def of(self, layer: Layer) -> list[str]:
-        """The statements that compute a layer and bring its tangent on.
+        """Return the statements that compute a layer and propagate its tangent.
 
         Raises:
             ExportError: this kind of layer has no tangent.
@@ -64,15 +67,18 @@ class Tangents:
         return write(self, layer)
 
     def changes(self, layer: Layer) -> list[str]:
-        """Where the changes of a layer's inputs lie."""
+        """Return the locations of the changes of a layer's inputs."""
         return [self.change(name) for name in layer.inputs]
 
     def values(self, layer: Layer) -> list[str]:
-        """Where a layer's inputs lie."""
+        """Return the locations of a layer's inputs."""
         return [self.calls.value(name) for name in layer.inputs]
 
     def before(self, layer: Layer, function: str, *arguments: object) -> list[str]:
-        """A tangent and then the layer; directions and the change of its value close the arguments."""
+        """Return a tangent call followed by the layer.
+
+        The directions and the change of its value are the last arguments.
+        """
         # Tangents come first: they read states that the layer itself brings on.
         return [call(function, *arguments, "d", self.change(layer.name)), *self.calls.of(layer)]
 
@@ -81,7 +87,7 @@ Write = Callable[[Tangents, Any], list[str]]
 
 
 def changed(layer: Layer | str, name: str) -> str:
-    """The C array of the change of what a layer remembers."""
+    """Return the C array of the change of a layer's state."""
     return slot(layer, name).replace("s->", "t->")
 
 
@@ -90,7 +96,7 @@ def _pointers(places: list[str]) -> str:
 
 
 def _linear(function: str, *constants: str) -> Write:
-    """Of a layer whose result changes with its inputs alone."""
+    """Return the writer for a layer whose result depends linearly on its inputs only."""
 
     def write(t: Tangents, layer: Layer) -> list[str]:
         constants_of_layer = [constant(layer, name) for name in constants]

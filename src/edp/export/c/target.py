@@ -78,7 +78,7 @@ def core_files(model: Model) -> dict[str, str]:
 
 
 def check_name(name: str) -> None:
-    """Refuse what cannot be the name of a model in C.
+    """Refuse an invalid C name of a model.
 
     Raises:
         ExportError: it cannot.
@@ -93,7 +93,7 @@ def check_name(name: str) -> None:
 
 
 def golden(model: Model) -> str:
-    """Inputs, and what PyTorch makes of them, as a header for the test on a computer."""
+    """Return inputs and the outputs of PyTorch as a C header, for the test on a computer."""
     predictor = model.bundle.predictor
     inputs, outputs, allowed = golden_recording(predictor, GOLDEN_TICKS)
     text = [f"/* Random inputs of {model.name} and the network's predictions, bounds behind them. */"]

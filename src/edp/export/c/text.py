@@ -1,4 +1,4 @@
-"""C as text: identifiers, numbers, arrays, calls."""
+"""C text: identifiers, numbers, arrays, calls."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ WIDTH = 118
 
 
 def identifier(name: str) -> str:
-    """The name of a layer, which this program gave, as a C identifier."""
+    """Return the name of a layer as a C identifier."""
     return re.sub(r"\W", "_", name, flags=re.ASCII)
 
 
 def number(value: float | np.floating) -> str:
-    """A float32 literal with the digits that give back the same bits.
+    """Return a float32 literal with enough digits to restore the same bits.
 
     Raises:
         ExportError: NaN, or no float32, for which C has no literal.
@@ -40,14 +40,14 @@ def filled(items: Iterable[str], indent: str = "    ") -> Code:
 
 
 def array(kind: str, name: str, values: Iterable[str], note: str = "") -> Code:
-    """The definition of a constant array."""
+    """Return the definition of a constant array."""
     numbers = list(values)
     comment = f" /* {note} */" if note else ""
     return Code(f"static const {kind} {name}[{len(numbers)}] = {{{comment}\n{filled(numbers)}\n}};")
 
 
 def call(function: str, *arguments: object) -> str:
-    """A call statement; integers are written as unsigned."""
+    """Return a call statement; integers are written as unsigned."""
     argument_texts = [f"{x}u" if isinstance(x, int) else str(x) for x in arguments]
     return f"{function}({', '.join(argument_texts)});"
 

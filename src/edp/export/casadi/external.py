@@ -1,4 +1,4 @@
-"""What fills the C file of the external function: how the state's column is read and written."""
+"""Template values of the C file of the external function: reading and writing the state column."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def blanks(graph: Graph, name: str) -> dict[str, object]:
 
 
 def _load_count(graph: Graph, layer: Layer, layer_states: list[Place]) -> list[str]:
-    """Sets the ring or the counter of a layer in the C state."""
+    """Return statements that set the ring or counter of a layer in the C state."""
     if not has_ring(layer):
         return []
     rings = [state for state in layer_states if is_ring(graph, state)]

@@ -1,4 +1,4 @@
-"""A horizon of a network in compiled C, with its Jacobian. Needs NumPy, nothing else."""
+"""Prediction over a horizon in compiled C, with its Jacobian. Needs NumPy only."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def turbulent(dp: Any) -> Any:
 
 
 class HydraulicMachine:
-    """The constants of one machine, and the functions that a tick is made of.
+    """Constants of one machine, and the functions that make up a time step.
 
     Args:
         layer: what the layer is besides its arrays.
@@ -81,7 +81,7 @@ class HydraulicMachine:
         self.bristles = self._bristle_function(GAMMA * step)
 
     def demands(self, commands: Any) -> Any:
-        """Signed commands of the valves as shares of full, extension positive."""
+        """Return the signed commands of the valves as fractions of full scale, extension positive."""
         parts = []
         for j, (extend, retract) in enumerate(self.at["sides"]):
             signed = commands[int(extend)] - (commands[int(retract)] if retract != NONE else 0.0)
@@ -108,7 +108,7 @@ class HydraulicMachine:
         return ca.Function("advance", [rows, history], [ca.horzcat(*columns)])
 
     def _displaced_function(self, step: float) -> ca.Function:
-        """Displacements of the pumps: what the pilots ask for, under the common power limit."""
+        """Return the function for the pump displacements: pilot demands under the common power limit."""
         d, rows, p = ca.SX.sym("d", self.pumps), ca.SX.sym("rows", 5, self.valves), ca.SX.sym("p", self.pumps)
         start, span = self.circuit[DEMAND_START], self.circuit[DEMAND_SPAN]
         asked, power = [], ca.SX(0.0)
@@ -178,7 +178,7 @@ class HydraulicMachine:
         return ca.vertcat(p - self.air / (p + ATMOSPHERE), y[self.nodes :])
 
     def pressures(self, content: Any) -> Any:
-        """The pressures at which nodes hold so much oil, and the velocities: the inverse of `contents`.
+        """Return the pressures at which the nodes hold the given oil, and the velocities: the inverse of `contents`.
 
         Above a vacuum, whatever is content; a stage is solved for what is content, since it is nearly linear in that.
         """
@@ -189,7 +189,7 @@ class HydraulicMachine:
         return ca.vertcat(absolute - ATMOSPHERE, content[self.nodes :])
 
     def _stage(self, step: float) -> tuple[ca.Function, ca.Function]:
-        """The root of a stage ``(guess, parameters) -> contents``, and the largest residual there."""
+        """Return the solver of a stage ``(guess, parameters) -> contents``, and a function for the largest residual."""
         n, sizes = self.n, (self.unknown, self.n, self.valves, self.pumps, self.n, self.n * self.n, self.n, self.n, 1)
         content, fixed = ca.SX.sym("content", self.unknown), ca.SX.sym("fixed", sum(sizes))
         base, bristle, x, d, s, mass, force, reached, half = ca.vertsplit(fixed, [0, *np.cumsum(sizes).tolist()])
@@ -251,7 +251,7 @@ class HydraulicMachine:
         return net
 
     def _spool(self, j: int, side: int, x: Any, s: Any, edge: Any, tank: int) -> None:
-        """Edges of one spool in one direction, which pass nothing while it is moved the other way."""
+        """Add the edges of one spool in one direction; they are closed while the spool moves the other way."""
         i, pump = int(self.at["valve_actuator"][j]), int(self.at["valve_pump"][j])
         band, at = self.valve[j][BAND + side], self.at["valve_at"][j]
         r = ca.fmin(ca.fmax(((1.0, -1.0)[side] * x - band) / (1.0 - band), 0.0), 1.0)
@@ -291,7 +291,7 @@ class HydraulicMachine:
         return ca.Function("bristles", [v, before], [ca.vertcat(*after)])
 
     def feed(self, fed: Any, y: Any, s: Any) -> tuple[Any, Any]:
-        """Pressures, velocities and strokes with what the ports read."""
+        """Replace pressures, velocities and strokes by the values at the ports."""
         values = self.w["offset"] + self.w["answer_width"] * fed
         of_y, of_s = ca.vertsplit(y), ca.vertsplit(s)
         for c, (kind, which) in enumerate(self.at["ports"]):
@@ -327,7 +327,7 @@ class HydraulicMachine:
         return y, s + 0.5 * length * self.moved * (before + y[self.nodes :]), after, d, rows
 
     def tick(self, m: dict[str, Any], commands: Any, fed: Any) -> Any:
-        """Answers without the strokes, scaled; `m`: what is remembered, moved."""
+        """Advance one sample and return the scaled outputs without strokes; `m` is the state, updated in place."""
         history = ca.horzcat(self.demands(commands), m["history"][:, :-1])
         y, s = self.feed(fed, m["pressures_and_velocities"], m["strokes"])
         start = s, y[self.nodes :]
@@ -348,7 +348,7 @@ class HydraulicMachine:
 
 
 def patient(root: ca.Function, left: ca.Function, slopes: ca.Function) -> ca.Function:
-    """A root that is looked for again by damped steps where it was not found at once.
+    """Return a root finder that repeats the search with damped steps if the first search fails.
 
     Where a check or a relief toggles no step makes every residual less; steps that go to and fro are halved instead.
     `left` is the largest residual at a root, `slopes` gives residuals and their Jacobian.
@@ -395,5 +395,5 @@ def joint_angle(stroke: Any, knots: np.ndarray) -> Any:
 
 
 def write_tick(part: Any, commands: Any, fed: Any) -> Any:
-    """The layer for `edp_casadi.LAYERS`."""
+    """Build the layer for `edp_casadi.LAYERS`."""
     return HydraulicMachine(part.options, part.w).tick(part.m, commands, fed)

@@ -1,4 +1,4 @@
-"""A network as a CasADi function with explicit states. Needs NumPy and CasADi, nothing else.
+"""Network as a CasADi function with explicit states. Needs NumPy and CasADi only.
 
     network = Network("predictor.json")
     x, u = network.start, inputs of a tick in SI units, in the order of network.inputs
@@ -56,7 +56,7 @@ class Network:
         self.step = self._build()
 
     def order(self, names: Sequence[str]) -> list[int]:
-        """Where in `names`, the columns of a recording, each input is.
+        """Return the position of each input in `names`, the columns of a recording.
 
         Raises:
             ValueError: one of them is missing.
@@ -67,7 +67,7 @@ class Network:
         return [list(names).index(name) for name in self.inputs]
 
     def compile(self, compiler: str = "cc", *flags: str) -> Path:
-        """The C code beside the data as a shared library.
+        """Compile the C code next to the data to a shared library.
 
         Raises:
             RuntimeError: the compiler is missing or says no, or there is no C: a grey box has none here.
@@ -87,11 +87,11 @@ class Network:
         return compiled
 
     def external(self, library: str | Path) -> ca.Function:
-        """The same step from the C code, with its Jacobian: faster, in single precision."""
+        """Return the step function of the C library with its Jacobian: faster, in single precision."""
         return ca.external(self.about["name"] + EXTERNAL, str(Path(library).resolve()))
 
     def horizon(self, steps: int, carry: Any, feed: Any) -> ca.Function:
-        """The network run on its own predictions: ``(x, first, base) -> y``.
+        """Return the network run on its own predictions: ``(x, first, base) -> y``.
 
         The inputs of a tick are ``carry * inputs before + feed @ prediction before + base``; those of the first tick
         are ``first``. So velocities that are predicted a tick ahead feed themselves, positions are carried and fed
@@ -140,7 +140,7 @@ class Network:
 
 
 class _Part:
-    """A layer in the making: options, constants, and what it and the others remember."""
+    """Layer under construction: options, constants, and states of this and the other layers."""
 
     def __init__(self, options: Mapping[str, Any], w: Mapping[str, np.ndarray], everything: dict[str, Held], own: Held):
         self.options, self.w, self.everything, self.m = options, w, everything, own
@@ -149,11 +149,11 @@ class _Part:
         return self.options[name]
 
     def count(self) -> Any:
-        """Ticks seen before this one; an integer, through which nothing is differentiated."""
+        """Samples seen before this one, an integer without derivative."""
         return ca.floor(self.m["age"] + 0.5)
 
     def push(self, slot: str, x: Any) -> Any:
-        """The window with this tick, a column each; the ring forgets its oldest tick."""
+        """Append this sample to the window, one column per sample, and remove the oldest sample from the ring."""
         full = ca.horzcat(self.m[slot], x)
         self.m[slot] = full[:, 1:]
         return full
@@ -168,7 +168,7 @@ def _sigmoid(x: Any) -> Any:
 
 
 def _softmax(rows: Any) -> Any:
-    """Of a row or of each of several rows."""
+    """Return the softmax of each row."""
     weights = []
     for row in ca.vertsplit(rows):
         raised = ca.exp(row - ca.mmax(row))
@@ -177,7 +177,7 @@ def _softmax(rows: Any) -> Any:
 
 
 def _rows(x: Any, rows: int) -> Any:
-    """A value of several rows as a matrix with a column for each."""
+    """Return a value of several rows as a matrix with one column per row."""
     return ca.reshape(x, x.numel() // rows, rows)
 
 

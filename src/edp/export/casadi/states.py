@@ -1,4 +1,4 @@
-"""The state of a network as a column of numbers: slots in the order of the layers, rings with the oldest tick first."""
+"""State of a network as a column vector: slots in the order of the layers, rings with the oldest sample first."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ class Place:
 
 
 def places(graph: Graph) -> list[Place]:
-    """Every slot with numbers. Ages are integers: ticks seen before the present one, as far as they matter."""
+    """Return every slot with elements.
+
+    Ages are integers: samples seen before the present one, up to the relevant maximum.
+    """
     states, at = [], 0
     for layer, slot in graph.slots():
         # Empty rings have no place in a column.
@@ -55,7 +58,7 @@ def places(graph: Graph) -> list[Place]:
 
 
 def start(graph: Graph) -> Array:
-    """The column after a reset."""
+    """Return the state column after a reset."""
     parts = [graph.start(layer, slot).ravel() for layer, slot in graph.slots() if slot.size]
     return np.concatenate(parts) if parts else np.zeros(0, np.float32)
 

@@ -77,7 +77,7 @@ class CasadiTarget:
 
 
 def content(described: Description) -> dict[str, Any]:
-    """The description of the network as plain values: what every form tells, layers, states and rules."""
+    """Return the description of the network in JSON types: common part, layers, states and rules."""
     graph = described.graph
     return described.content() | {
         "rules": RULES,
@@ -114,6 +114,6 @@ def packed(data: dict[str, np.ndarray]) -> bytes:
 
 
 def external(graph: Graph, name: str) -> str:
-    """The C file that CasADi calls."""
+    """Return the C file that CasADi calls."""
     text = resources.files("edp.export.casadi").joinpath("external.c.in").read_text()
     return fill(text, blanks(graph, name) | {"version": __version__})

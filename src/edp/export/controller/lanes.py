@@ -1,4 +1,4 @@
-"""A twin as C that runs several lanes side by side: each layer for all lanes, so that weights are read once."""
+"""C code of a twin that runs a batch of copies: each layer is computed for all copies; weights are read once."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ PORTS, FED = "ports.", "ports.fed"
 
 @dataclass(frozen=True, eq=False)
 class LaneModel:
-    """What the templates of a model with lanes are filled with.
+    """Template values of a batched model.
 
     Attributes:
         name: C prefix.
@@ -69,7 +69,7 @@ class LaneModel:
         return {}
 
     def cost(self, plan: PlanParts) -> str:
-        """What a tick of the plan costs, for the header."""
+        """Return the cost of one controller step, for the header."""
         macs = plan.lane_ticks * self.model.graph.macs
         return (
             f" * COST. A tick runs {plan.lane_ticks} ticks of the model, {macs} multiply-accumulates, and up to "
@@ -79,12 +79,12 @@ class LaneModel:
 
     @property
     def work(self) -> int:
-        """Scratch numbers of a lane."""
+        """Number of scratch elements per copy."""
         return self.model.plan.sizes[Number.FLOAT]
 
     @property
     def memory_bytes(self) -> int:
-        """What a lane remembers, but for what compilers put between its parts."""
+        """State size per copy, without padding by the compiler."""
         rings = sum(line.startswith("edp_ring ") for line in remembered(self.model.graph)[0])
         slots = (max(1, part.size) for _, part in self.model.graph.slots() if part.name != "age")
         return 4 * sum(slots) + 8 * rings
@@ -130,7 +130,7 @@ class LaneModel:
         return fill(text, values)
 
     def _computed(self, free: bool) -> Iterator[str]:
-        """Statements of a tick; neighbouring layers without products share one loop over the lanes.
+        """Yield the statements of a time step. Neighbouring layers without products share one loop over the copies.
 
         Args:
             free: where no port is measured, what they read is the last answers, and the layers between are left out.
@@ -150,14 +150,14 @@ class LaneModel:
         yield from _loop(self.name, together)
 
     def _fed(self, calls: Calls, layer: Layer) -> list[str]:
-        """What a layer of the ports leaves to do where all of them run free."""
+        """Return the remaining statements of a port layer if all ports run free."""
         if layer.name != FED:
             return []
         last = next(x for x in self.model.graph.layers if isinstance(x, memory.Feedback))
         return [describe(layer), call("edp_copy", slot(last, "last"), last.size, calls.value(FED))]
 
     def _whole(self, calls: Calls, layer: Layer) -> str | None:
-        """The call that computes a layer for all lanes; None where there is none."""
+        """Return the call that computes a layer for all copies; None if there is no such function."""
         if any(source == INPUT for source in layer.inputs):
             return None
         if isinstance(layer, layers.Dense) and layer.rows == 1:
@@ -175,12 +175,12 @@ class LaneModel:
 
 
 def _first(location: str) -> str:
-    """A place in the work memory of the first lane."""
+    """Return a location in the work memory of the first copy."""
     return location.replace("work", "works[0]", 1)
 
 
 def _loop(name: str, statements: list[str]) -> Iterator[str]:
-    """Statements of a lane within a loop over all of them."""
+    """Yield the statements of one copy inside a loop over all copies."""
     if not statements:
         return
     text = " ".join(statements)
@@ -196,7 +196,7 @@ def _loop(name: str, statements: list[str]) -> Iterator[str]:
 
 
 def lane_model(name: str, bundle: Bundle) -> LaneModel:
-    """A twin ready to be written with lanes.
+    """Create a batched model of a twin, ready to be written.
 
     Args:
         name: C prefix of the model.

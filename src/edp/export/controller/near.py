@@ -1,4 +1,4 @@
-"""A grey box as the model of a plan in C: the first run as it is, and runs near it by tangents of its stages."""
+"""Grey box as the model of a controller plan in C: an exact first run, and linearised runs near it."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ RECALLED = """\
 
 @dataclass(frozen=True, eq=False)
 class NearModel:
-    """What the templates of a grey box and runs near it are filled with.
+    """Template values of a grey box with linearised runs.
 
     Attributes:
         name: C prefix.
@@ -91,7 +91,7 @@ class NearModel:
         return {"TICKS": ticks, "SPAN": max(ticks, plan.window), "NEWTON": plan.newton}
 
     def cost(self, plan: PlanParts) -> str:
-        """What a tick of the plan costs, for the header."""
+        """Return the cost of one controller step, for the header."""
         unknown = self.machine.unknown
         lines = (
             f" * COST. A tick solves the model's equations, of {unknown} unknowns, by up to {plan.newton} iterations",
@@ -146,7 +146,7 @@ class NearModel:
 
 
 def near_model(name: str, plan: PlanParts) -> NearModel | None:
-    """A grey box ready to be written with runs near it; None for other twins.
+    """Create a grey box with linearised runs, ready to be written; None for other twins.
 
     Args:
         name: C prefix of the model.

@@ -21,7 +21,7 @@ ROUNDED = 2.0**-23
 
 @dataclass
 class ConstantTables:
-    """Definitions of constants, and what the checksum at start-up reads.
+    """Definitions of constants, and the entries of the checksum at start-up.
 
     Attributes:
         lines: of C.
@@ -36,7 +36,7 @@ class ConstantTables:
     bytes: int = 0
 
     def floats(self, name: str, values: ArrayLike) -> None:
-        """A float array; two dimensions become an array of rows."""
+        """Add a float array; two dimensions become an array of rows."""
         numbers = np.asarray(values, dtype=np.float32)
         if numbers.ndim == 2:
             rows = ",\n".join(f"    {{{', '.join(map(number, row))}}}" for row in numbers)
@@ -46,13 +46,13 @@ class ConstantTables:
         self._check(name, numbers)
 
     def small(self, name: str, values: Iterable[int]) -> None:
-        """An array of 16-bit counts or places."""
+        """Add an array of 16-bit counts or positions."""
         numbers = np.asarray(list(values), dtype=np.uint16)
         self.lines.append(array("uint16_t", name, (f"{value}u" for value in numbers)))
         self._check(name, numbers)
 
     def text(self, line: str) -> None:
-        """A definition that the checksum leaves out, since it holds pointers or is a struct."""
+        """Add a definition that the checksum omits, since it holds pointers or is a struct."""
         self.lines.append(line)
 
     def _check(self, name: str, values: np.ndarray) -> None:
@@ -129,7 +129,7 @@ def _set_sides(tables: ConstantTables, name: str, sides: Iterable[tuple[Side, Si
 
 
 def _rising(speeds: ArrayLike) -> np.ndarray:
-    """Single-precision nodes that rise strictly: what double precision tells apart may be equal, and is divided by."""
+    """Return strictly rising single-precision nodes, since differences of nodes are divisors."""
     nodes = np.asarray(speeds, dtype=np.float32).copy()
     for i in range(1, len(nodes)):
         nodes[i] = max(nodes[i], np.nextafter(nodes[i - 1], np.float32(np.inf)))
@@ -145,7 +145,7 @@ def _truth(value: bool) -> str:
 
 
 def golden_rows(name: str, kind: str, rows: ArrayLike) -> Code:
-    """A two-dimensional array of a self-test."""
+    """Return a two-dimensional array for a self-test."""
     numbers = np.asarray(rows, dtype=np.float32)
     body = ",\n".join("    {\n" + filled(map(number, row), "     ") + "}" for row in numbers)
     return Code(f"static const {kind} {name}[{len(numbers)}][{numbers.shape[1]}] = {{\n{body}\n}};\n")

@@ -1,4 +1,4 @@
-"""What an exported controller is made of: numbers in SI units, of a PI loop and, where it plans, of its plan."""
+"""Parameters of an exported controller: a PI loop and, for a planning controller, its plan, in SI units."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Side = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class PilotCommand:
-    """How one pilot pressure follows from a lever.
+    """Mapping from a lever to one pilot pressure.
 
     Attributes:
         axis: 0 boom, 1 arm, 2 bucket.
@@ -83,7 +83,7 @@ class PlanParts:
 
     @property
     def variables(self) -> int:
-        """Of the program."""
+        """Number of optimisation variables of the plan."""
         return AXES * len(self.blocks)
 
     @property
@@ -101,7 +101,7 @@ class PlanParts:
 
 @dataclass(frozen=True, eq=False)
 class GoldenLoop:
-    """A stretch of a loop that was run in Python, with which the C code is compared on a computer.
+    """Part of a closed loop run in Python, with which the C code is compared on a computer.
 
     Attributes:
         measured: values of the controller's inputs, shape (ticks, input).

@@ -76,7 +76,7 @@ PRIVATE = """\
 
 @dataclass(frozen=True, eq=False)
 class ControllerFiles:
-    """What the templates of one controller are filled with.
+    """Template values of one controller.
 
     Attributes:
         name: C prefix.
@@ -213,7 +213,7 @@ class ControllerFiles:
         }
 
     def _recall(self, plan: PlanParts, model: PlanModel) -> Code:
-        """Statements of the self-test that set what is remembered."""
+        """Return the statements of the self-test that set the state."""
         at = AXES
         lines = ""
         for field, size in (("speeds[0]", plan.variables), ("latest", AXES)):

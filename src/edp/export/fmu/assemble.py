@@ -28,7 +28,7 @@ DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def check_choice(version: str, binaries: str) -> None:
-    """Refuse what is not written.
+    """Refuse an unsupported version or choice of binaries.
 
     Raises:
         ExportError: no such version or binaries.
@@ -40,7 +40,7 @@ def check_choice(version: str, binaries: str) -> None:
 
 
 def token_of(texts: Iterable[str]) -> str:
-    """Content address in the form of a GUID: everything that decides behaviour or interface goes in."""
+    """Return a content address in the form of a GUID, computed from everything that decides behaviour or interface."""
     state = hashlib.blake2b(digest_size=16)
     for text in (*texts, *plumbing(*COMMON, *OWN[2], *OWN[3]).values()):
         # The zero byte separates texts: two files cannot be shifted into one another.
@@ -49,7 +49,7 @@ def token_of(texts: Iterable[str]) -> str:
 
 
 def model_header(about: About, required: int, tangent: str = "") -> str:
-    """What binds the plumbing to the model.
+    """Return the header that connects the FMI code to the model.
 
     Args:
         about: the model.
@@ -66,7 +66,7 @@ def model_header(about: About, required: int, tangent: str = "") -> str:
 def fmu_files(
     about: About, core: Mapping[str, str], description: bytes, version: str, binaries: str
 ) -> dict[str, bytes]:
-    """The FMUs of a model by file name.
+    """Return the FMUs of a model by file name.
 
     Args:
         about: what the XML files tell.

@@ -20,7 +20,7 @@ FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-g0", "
 
 @dataclass(frozen=True)
 class Platform:
-    """Where a library runs.
+    """Platform of a shared library.
 
     Attributes:
         target: what the compiler calls it; the number is the oldest glibc.
@@ -46,7 +46,7 @@ PLATFORMS = {
 
 @dataclass(frozen=True)
 class Sources:
-    """What is compiled.
+    """Source files to compile.
 
     Attributes:
         name: of the libraries.

@@ -1,4 +1,4 @@
-"""``modelDescription.xml`` of both versions of FMI, and what goes with the sources."""
+"""``modelDescription.xml`` for both versions of FMI, and the files that accompany the sources."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FORMS3 = {"real": "Float64", "whole": "Int32", "flag": "Boolean"}
 
 @dataclass(frozen=True, eq=False)
 class About:
-    """What the XML files tell.
+    """Content of the XML files.
 
     Attributes:
         name: of the model and its binaries.
@@ -52,7 +52,7 @@ class About:
 
 
 def fmi2(about: About, sources: Sequence[str]) -> bytes:
-    """The description for FMI 2.0; `sources` are the C files to compile."""
+    """Return the description for FMI 2.0; `sources` are the C files to compile."""
     root = ET.Element("fmiModelDescription", {"fmiVersion": "2.0"} | _head(about) | {"guid": about.token})
     abilities = _abilities("canGetAndSetFMUstate", "canSerializeFMUstate", "providesDirectionalDerivative", about)
     more = {"canNotUseMemoryManagementFunctions": "true", "canInterpolateInputs": "false"}
@@ -78,7 +78,7 @@ def fmi2(about: About, sources: Sequence[str]) -> bytes:
 
 
 def fmi3(about: About) -> bytes:
-    """The description for FMI 3.0."""
+    """Return the description for FMI 3.0."""
     root = ET.Element("fmiModelDescription", {"fmiVersion": "3.0"} | _head(about) | {"instantiationToken": about.token})
     abilities = _abilities("canGetAndSetFMUState", "canSerializeFMUState", "providesDirectionalDerivatives", about)
     more = {"fixedInternalStepSize": repr(about.step_s)}
@@ -125,7 +125,7 @@ def _head(about: About) -> dict[str, str]:
 
 
 def _abilities(state: str, serial: str, derivative: str, about: About) -> dict[str, str]:
-    """What both versions promise, under their names."""
+    """Return the capability flags of both versions, under their names."""
     return {
         "needsExecutionTool": "false",
         "canBeInstantiatedOnlyOncePerProcess": "false",

@@ -1,4 +1,4 @@
-"""What an importer sees of a predictor: its variables in the order of their value references."""
+"""Variables of a predictor as an FMU, in the order of their value references."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ OWN = (
 
 
 def variables(model: Model) -> list[Variable]:
-    """Inputs, predictions and bounds in the order of the model's C structures, then those of the FMU itself."""
+    """Return inputs, predictions and bounds in the order of the C structures, then the FMU's own variables."""
     _, spread = usual_range(model.bundle.predictor)
     entries = [
         Variable(entry.name, "input", entry.description, kind=entry.kind, nominal=_nominal(width))
@@ -85,13 +85,13 @@ def _predictions(model: Model) -> list[Variable]:
 
 
 def _nominal(width: float) -> float:
-    """A width with three digits; 1 where there is none."""
+    """Return a width rounded to three digits; 1 for zero width."""
     # Three digits: a nominal value is an order of magnitude for the importer's tolerances.
     return float(f"{abs(width):.3g}") or 1.0
 
 
 def unique(listed: list[Variable]) -> list[Variable]:
-    """The same with names and descriptions of printable characters; names differ."""
+    """Return the variables with unique names and printable descriptions."""
     names = shown_names(entry.name for entry in listed)
     return [
         replace(entry, name=name, description=visible(entry.description, 2 * LONGEST_TEXT))

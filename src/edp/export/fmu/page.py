@@ -38,7 +38,7 @@ MONITOR = (
 
 
 def page(about: About) -> bytes:
-    """The page: what goes in and out, and the rules."""
+    """Return the documentation page: inputs, outputs and rules."""
     window = about.facts.get("window", "")
     monitor = "monitor_hash" in about.facts
     texts = MONITOR if monitor else RULES + (PLANT if "plant" in about.facts else ())

@@ -60,12 +60,12 @@ class FmuTarget:
 
 
 def _differentiable(bundle: Bundle) -> bool:
-    """Whether directional derivatives can be given: a staircase of integers has none, nor a grey box's C code."""
+    """Return whether directional derivatives exist: not for integer networks, nor for the C code of a grey box."""
     return not isinstance(bundle.predictor, IntegerPredictor) and differentiable(bundle.predictor.graph())
 
 
 def _about(model: Model, listed: list[Variable], core: Mapping[str, str]) -> About:
-    """What the XML files tell; the token is that of the sources and of the variables."""
+    """Return the content of the XML files with a token computed from sources and variables."""
     described = Description(model.name, model.bundle, model.graph).content()
     keys = ("model_hash", "scale_hash", "number_format", "window", "mode")
     facts = {key: str(described[key]) for key in keys}

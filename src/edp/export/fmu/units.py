@@ -36,7 +36,7 @@ class Shown:
 
 
 def shown(kind: Kind) -> Shown | None:
-    """The unit of reports of a kind, unless it is the SI unit."""
+    """Return the report unit of a kind; None if it is the SI unit."""
     facts = KINDS[kind]
     if facts.report_unit == facts.si_unit:
         return None
@@ -46,7 +46,7 @@ def shown(kind: Kind) -> Shown | None:
 
 
 def units_of(kinds: Sequence[Kind]) -> dict[str, list[Shown]]:
-    """Units that variables of these kinds have, with those in which they may be shown, and the second."""
+    """Return the units of variables of these kinds with their display units, and the second."""
     shown_units: dict[str, list[Shown]] = {}
     for kind in kinds:
         other = shown_units.setdefault(KINDS[kind].si_unit, [])

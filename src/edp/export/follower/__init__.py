@@ -1,4 +1,4 @@
-"""A grey box whose numbers follow the machine, as C99 without heap."""
+"""Grey box with on-board adaptation of its parameters, as C99 without heap."""
 
 from edp.export.follower.parts import FollowerParts as FollowerParts
 from edp.export.follower.parts import GoldenTicks as GoldenTicks

@@ -1,4 +1,4 @@
-"""What a follower in C is made of: a grey box, how its numbers follow, and the predictions that move towards it."""
+"""Content of a follower in C: a grey box, the adaptation of its parameters, and the corrected predictions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORN = 0.2
 
 @dataclass(frozen=True, eq=False)
 class GoldenTicks:
-    """A stretch of ticks of a machine that has changed, and what the Python package makes of it.
+    """Samples of a changed machine, and the results of the Python package for them.
 
     Attributes:
         inputs: commands, measured values and predictions ``(tick, number)``.
@@ -37,7 +37,7 @@ class GoldenTicks:
 
 @dataclass(frozen=True, eq=False)
 class FollowerParts:
-    """What is written.
+    """Content of a follower.
 
     Attributes:
         title: a line about it.
@@ -56,7 +56,7 @@ class FollowerParts:
     limit: NDArray[np.float64]
 
     def correction(self) -> TunedCorrection:
-        """The same in Python.
+        """Return the correction in Python.
 
         Raises:
             ConfigError: a target that is no velocity of the twin, or a group that it has no number of.
@@ -64,7 +64,7 @@ class FollowerParts:
         return TunedCorrection(TunedTwin(self.twin, self.spec), self.targets, self.horizons, self.limit)
 
     def golden(self) -> GoldenTicks:
-        """A stretch of a machine whose groups have changed."""
+        """Return samples of a machine whose parameter groups have changed."""
         correction, rng = self.correction(), np.random.default_rng(0)
         tuned, scales = correction.tuned, self.twin.scales
         signs = np.where(np.arange(len(tuned.labels)) % 2, -WORN, WORN)

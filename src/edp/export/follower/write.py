@@ -46,7 +46,7 @@ are kept in single precision, and Newton's method ends where its last change is 
 
 @dataclass(frozen=True, eq=False)
 class FollowerFiles:
-    """What the templates of one follower are filled with.
+    """Template values of one follower.
 
     Attributes:
         name: C prefix.
@@ -107,7 +107,7 @@ class FollowerFiles:
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """Counts of what it reads, gives and remembers."""
+        """Numbers of inputs, outputs and states."""
         parts, machine, channels = self.parts, self.machine, self.parts.twin.channels
         actuators, valves, pumps = machine.sizes
         velocities, groups = len(channels.velocities), len(self.tuned.labels)
@@ -139,7 +139,7 @@ class FollowerFiles:
         return 4 * (floats + 15) + 8 * (doubles + s["room"] + near) + s["valves"]
 
     def _law(self) -> Code:
-        """Counts and shares, in the order of `edp_follow_law`."""
+        """Return counts and factors in the order of `edp_follow_law`."""
         spec, rate, s = self.parts.spec, self.parts.twin.channels.rate_hz, self.sizes
         keep = math.exp(-spec.learn_ticks / (spec.forgetting_s * rate))
         oil = UNKNOWN_C if math.isnan(spec.oil_c) else spec.oil_c
@@ -247,7 +247,7 @@ def write_follower(parts: FollowerParts, plant: Bundle, name: str, folder: Path)
 
 
 def follower_files(parts: FollowerParts, plant: Bundle, name: str) -> FollowerFiles:
-    """A follower ready to be written; see `write_follower`.
+    """Create a follower ready to be written; see `write_follower`.
 
     Raises:
         ExportError: the grey box has no layer of its equations.

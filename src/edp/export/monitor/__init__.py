@@ -1,4 +1,4 @@
-"""Monitors as C99 without heap: residuals, chain and alarms beside the predictor, and a self-test."""
+"""Monitors as C99 without heap: residuals, chain and alarms along with the predictor, and a self-test."""
 
 from edp.export.monitor.fmu import write_monitor_fmu
 from edp.export.monitor.golden import drawn_rows

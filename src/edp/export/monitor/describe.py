@@ -1,4 +1,4 @@
-"""What the reader of an exported monitor must know: names, units, order, rate, limit; as JSON."""
+"""Description of an exported monitor: names, units, order, rate, limit; as JSON."""
 
 from __future__ import annotations
 

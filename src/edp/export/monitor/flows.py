@@ -1,4 +1,4 @@
-"""Balances of flow as C: spools by their commands, curves of their openings, and a residual a chamber."""
+"""Flow balances as C: spool positions from commands, opening curves, and one residual per chamber."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ class FlowCode:
 
     @property
     def length(self) -> int:
-        """Rows that are remembered, that of the tick among them."""
+        """Number of stored rows, including the present one."""
         return self.part.memory + 1
 
     def fields(self) -> list[str]:

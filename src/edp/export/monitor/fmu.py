@@ -1,4 +1,4 @@
-"""A monitor as units of FMI 2.0 and 3.0: measurements in; alarm, statistics and counts out."""
+"""Monitor as FMUs of FMI 2.0 and 3.0: measurements as inputs; alarm, statistics and counts as outputs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ COUNTS = (
 
 
 def monitor_variables(parts: MonitorParts) -> list[Variable]:
-    """Inputs and outputs in the order of the monitor's C structures, then those of the FMU itself."""
+    """Return inputs and outputs in the order of the monitor's C structures, then the variables of the FMU itself."""
     spread = 1.0 / parts.chain.spread
     inputs = [
         Variable(c.name, "input", c.description, kind=c.kind, nominal=float(f"{abs(width):.3g}") or 1.0)

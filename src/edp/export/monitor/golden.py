@@ -1,4 +1,4 @@
-"""Drawn rows of a self-test: the same numbers in Python and in C, so that the folder need not hold them."""
+"""Random rows for a self-test, equal in Python and C, so that the folder need not contain them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def golden_blocks(chain: ChainPart) -> int:
 
 
 def drawn_rows(chain: ChainPart) -> tuple[Rows, Rows]:
-    """Inputs ``(tick, input)`` and residuals ``(tick, residual)``, uniform in their usual range, NaN where missing.
+    """Return random inputs ``(tick, input)`` and residuals ``(tick, residual)`` in their usual range, NaN if missing.
 
     A tick draws its inputs, then its residuals, each as ``centre + spread (2 u - 1)`` in single precision.
     """

@@ -21,7 +21,7 @@ MOST_PLACES = 2**16 - 1
 
 
 def double_number(value: float) -> str:
-    """A literal of C with the digits that give back the same bits.
+    """Return a C literal with enough digits to restore the same bits.
 
     Raises:
         ExportError: NaN or infinite, for which C has no literal.
@@ -34,7 +34,7 @@ def double_number(value: float) -> str:
 
 @dataclass
 class MonitorTables:
-    """Definitions of constants, and what the checksums at start-up read.
+    """Definitions of constants, and the entries of the checksums at start-up.
 
     Attributes:
         lines: of C.
@@ -53,7 +53,7 @@ class MonitorTables:
     bytes: int = 0
 
     def doubles(self, name: str, values: ArrayLike) -> None:
-        """An array of doubles, row by row."""
+        """Add an array of doubles, row by row."""
         numbers: NDArray[np.float64] = np.asarray(values, dtype=np.float64).ravel()
         self.lines.append(array("double", name, map(double_number, numbers)))
         self.double_entries.append(f"{{{name}, {numbers.size}u}}")
@@ -61,7 +61,7 @@ class MonitorTables:
         self.bytes += numbers.nbytes
 
     def singles(self, name: str, values: ArrayLike) -> None:
-        """An array of doubles that are float32 numbers, stored as those: C widens them to the same bits.
+        """Add an array of doubles with float32 values, stored as floats, since C widens them without loss.
 
         Raises:
             ExportError: one is none.
@@ -74,13 +74,13 @@ class MonitorTables:
         self.floats(name, exact)
 
     def floats(self, name: str, values: ArrayLike) -> None:
-        """An array of floats, row by row."""
+        """Add an array of floats, row by row."""
         numbers: NDArray[np.float32] = np.asarray(values, dtype=np.float32).ravel()
         self.lines.append(array("float", name, map(number, numbers)))
         self._other(name, numbers)
 
     def places(self, name: str, values: Iterable[int]) -> None:
-        """An array of 16-bit places; an empty one has a single zero, since C has no empty array.
+        """Add an array of 16-bit positions; an empty one gets a single zero, since C has no empty arrays.
 
         Raises:
             ExportError: a place beyond 16 bits.
@@ -93,7 +93,7 @@ class MonitorTables:
         self._other(name, numbers)
 
     def text(self, line: str) -> None:
-        """A definition that the checksums leave out: it holds pointers or is a struct."""
+        """Add a definition that the checksums omit, since it holds pointers or is a struct."""
         self.lines.append(line)
 
     def _other(self, name: str, numbers: NDArray[np.generic]) -> None:
@@ -114,7 +114,7 @@ class MonitorTables:
 
 
 def golden_header(name: str, monitor: MonitorParts) -> Code:
-    """What a self-test compares with, as a header."""
+    """Return the reference values of a self-test as a header."""
     chain, rows = monitor.golden_chain, monitor.golden_residuals
     parts = monitor.chain
     lines = [f"/* What {name} gives in Python: statistics of drawn rows, and residuals of a stretch. */"]

@@ -1,4 +1,4 @@
-"""What an exported monitor is made of: networks, plain numbers in SI units, and what a self-test expects."""
+"""Content of an exported monitor: networks, parameters in SI units, and reference values of a self-test."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Places = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class NetworkPart:
-    """Residuals of a network: what was measured less what it predicted.
+    """Residuals of a network: measurement minus prediction.
 
     Attributes:
         bundle: the network.
@@ -67,7 +67,7 @@ class BalancePart:
 
 @dataclass(frozen=True, eq=False)
 class TwinPart:
-    """Residuals of a twin that runs once a group of its answers, with the ports of the group free.
+    """Residuals of a twin that runs once per group of its outputs, with the ports of the group free.
 
     Attributes:
         bundle: of its plant: commands, measured answers and flags in, answers one tick ahead out.
@@ -127,7 +127,7 @@ class FlowChamber:
 
 @dataclass(frozen=True, eq=False)
 class FlowPart:
-    """Balances of flow: `edp.monitor.residuals.flow_balances` as numbers.
+    """Flow balances: parameters of `edp.monitor.residuals.flow_balances`.
 
     Attributes:
         reads: inputs of the monitor that are read.
@@ -178,7 +178,7 @@ PIECE, ROW = 8, 32
 
 
 def pieces(count: int, size: int) -> list[int]:
-    """Sizes of the pieces of so many things."""
+    """Return the sizes of the parts when `count` items are divided into parts of `size`."""
     return [min(size, count - first) for first in range(0, count, size)]
 
 
@@ -207,23 +207,23 @@ class WatchPart:
 
     @property
     def own(self) -> bool:
-        """Whether it sees each summary by itself, in rows that are not clipped."""
+        """Whether each summary is monitored by itself, without clipping."""
         return self.matrix.ndim == 1
 
     @property
     def rows(self) -> int:
-        """Of the detector's memory, each as wide as its view."""
+        """Number of rows of the detector's state."""
         return int(self.option) if self.detector == "glr" else 2 if self.detector == "separate_cusums" else 1
 
     @property
     def passes(self) -> int:
-        """Of the detector through its directions in a block."""
+        """Number of passes of the detector over its directions in a block."""
         return self.rows if self.detector == "glr" else 2 if self.detector == "cusum" else 1
 
 
 @dataclass(frozen=True, eq=False)
 class ChainPart:
-    """From residuals to alarms: `edp.monitor.chain` as numbers.
+    """Chain from residuals to alarms: parameters of `edp.monitor.chain`.
 
     Attributes:
         block: ticks of a block.
@@ -279,7 +279,7 @@ class ChainPart:
 
 @dataclass(frozen=True, eq=False)
 class GoldenChain:
-    """What Python makes of drawn residuals and inputs (`edp.export.monitor.golden.drawn_rows`), a row a block.
+    """Results of Python for random residuals and inputs (`edp.export.monitor.golden.drawn_rows`), one row per block.
 
     Attributes:
         statistics: shape (blocks, watches).
@@ -296,7 +296,7 @@ class GoldenChain:
 
 @dataclass(frozen=True, eq=False)
 class GoldenResiduals:
-    """Inputs, and what Python's sources make of them.
+    """Inputs, and the residuals that Python computes from them.
 
     Attributes:
         inputs: shape (ticks, inputs).

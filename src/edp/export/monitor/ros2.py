@@ -78,7 +78,7 @@ def write_monitor_ros2(parts: MonitorParts, name: str, folder: Path) -> list[Pat
 
 
 def _about(parts: MonitorParts, name: str) -> dict[str, Any]:
-    """The description with names that fit into parameters and messages, and the outputs as one result."""
+    """Return the description with names valid for parameters and messages, and the outputs as one result."""
     about = description(parts, name)
     names = message_names(entry["name"] for entry in about["inputs"])
     about["inputs"] = [

@@ -136,7 +136,7 @@ class SourceCode(Protocol):
         ...
 
     def code(self, name: str, first: int) -> str:
-        """The function that fills the residuals from `first` on."""
+        """Return the function that fills the residuals beginning at `first`."""
         ...
 
     def reset(self) -> list[str]:
@@ -144,7 +144,7 @@ class SourceCode(Protocol):
         ...
 
     def forget(self) -> list[str]:
-        """Statements after a gap: what is known of the past is not trusted any more."""
+        """Return the statements after a gap, which invalidate the stored past."""
         ...
 
 
@@ -322,7 +322,7 @@ class TwinCode:
 
 
 def source_code(part: SourcePart, index: int, name: str) -> SourceCode:
-    """The source at a place of the monitor `name`.
+    """Return the code writer for one residual source of the monitor `name`.
 
     Raises:
         ExportError: its network has no form in C.
@@ -337,6 +337,6 @@ def source_code(part: SourcePart, index: int, name: str) -> SourceCode:
 
 
 def reads_tables(reads: Sequence[tuple[int, ...]], tables: MonitorTables) -> None:
-    """Inputs of every residual, one behind the other, and where each begins."""
+    """Add the table of inputs of all residuals, concatenated, and the table of their starts."""
     tables.places("reads", [column for columns in reads for column in columns])
     tables.places("reads_from", np.cumsum([0, *(len(columns) for columns in reads)]).tolist())

@@ -42,7 +42,7 @@ MOST_MEMORY = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class MonitorFiles:
-    """What the templates of one monitor are filled with.
+    """Template values of one monitor.
 
     Attributes:
         name: C prefix.
@@ -69,7 +69,7 @@ class MonitorFiles:
         return texts
 
     def folder_texts(self) -> dict[str, str]:
-        """The same with self-test, example and CMake file."""
+        """Return the texts with self-test, example and CMake file."""
         return self.texts() | {
             f"{self.name}_golden.h": golden_header(self.name, self.parts),
             "host_test.c": self._filled("host_test.c.in"),
@@ -223,7 +223,7 @@ class MonitorFiles:
 
     @property
     def double_operations(self) -> int:
-        """Of a tick, on average: + - * / each count as one."""
+        """Number of double operations per sample on average; + - * / each count as one."""
         chain = self.parts.chain
         summaries, points = self.parts.summaries, self.parts.points
         tick = (
@@ -294,14 +294,14 @@ def _memory(watch: WatchPart) -> int:
 
 
 def _watch_slices(watch: WatchPart) -> int:
-    """Centring, white numbers, and the steps of the detector; as `edp_watch_part` takes them."""
+    """Return the number of calls of `edp_watch_part`: centring, whitening and detector steps."""
     detector = len(pieces(watch.directions, PIECE)) * watch.passes
     white = len(pieces(watch.directions, ROW)) if watch.own else watch.directions
     return len(pieces(len(watch.mean), ROW)) + white + detector
 
 
 def monitor_files(parts: MonitorParts, name: str) -> MonitorFiles:
-    """A monitor ready to be written.
+    """Create a monitor ready to be written.
 
     Args:
         parts: its numbers.

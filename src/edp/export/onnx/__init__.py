@@ -1,4 +1,4 @@
-"""ONNX: one graph of a tick with explicit states, and one of a whole window, both from SI units to SI units."""
+"""ONNX export: one graph of a single sample with explicit states, one of a whole window; both in SI units."""
 
 from edp.export.onnx.target import OnnxTarget
 

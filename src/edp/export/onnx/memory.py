@@ -23,13 +23,13 @@ Step = Callable[..., tuple[str, dict[str, str]]]
 
 
 def shape_of(slot: Slot) -> tuple[int, ...]:
-    """The shape of a state in the graph: always a matrix."""
+    """Return the shape of a state in the graph, always a matrix."""
     # A row and not a vector: Gemm takes matrices only.
     return (1, *slot.shape) if len(slot.shape) == 1 else slot.shape
 
 
 def push(nodes: Nodes, ring: str, rows: int, x: str, axis: int = 0) -> tuple[str, str]:
-    """The ring with a tick more at its end, and the same without its oldest tick."""
+    """Return the ring with a sample appended, and the ring without its oldest sample."""
     if rows == 1:
         return nodes.join([ring, x], axis), x
     oldest, rest = nodes.split(ring, [1, rows - 1], axis)
@@ -177,13 +177,13 @@ def _window_attention(
 
 
 def correct(nodes: Nodes, layer: memory.PrefixCorrection, seen: str) -> str:
-    """What is added to the states, from the mean of the first ticks and the last of them, end to end."""
+    """Return the change of the states, concatenated, from the mean of the first samples and the last of them."""
     hidden = nodes.add("Tanh", nodes.linear(seen, layer.first_weight, layer.first_bias))
     return nodes.linear(hidden, layer.second_weight, layer.second_bias)
 
 
 def step_correction(nodes: Nodes, layer: memory.PrefixCorrection, state: Held, x: str) -> tuple[str, dict[str, str]]:
-    """The correction, zero but at the tick `ticks`, and the layer's own next states."""
+    """Return the correction, zero except at sample `ticks`, and the next states of the layer."""
     ticks, age = layer.ticks, state["age"]
     counting = nodes.clip(nodes.plus(nodes.times(age, np.float32(-1)), np.float32(ticks)), 0, 1)
     # Only while the prefix lasts; later ticks must leave the total as it is.

@@ -1,4 +1,4 @@
-"""What a reader of the ONNX files must know besides what every form tells: graphs, states and their starts, rules."""
+"""Description of the ONNX files in addition to the common part: graphs, states and their initial values, rules."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RULES = {
 
 
 def notes(described: Description) -> dict[str, str]:
-    """What the ONNX files themselves carry."""
+    """Return the metadata stored in the ONNX files."""
     about = described.content()
     return {
         "inputs": json.dumps([channel["name"] for channel in about["inputs"]]),
@@ -39,7 +39,7 @@ def notes(described: Description) -> dict[str, str]:
 
 
 def content(described: Description, files: Mapping[str, bytes], states: Sequence[State], opset: int) -> dict[str, Any]:
-    """The description of graphs as plain values; `files` are the graphs, by kind."""
+    """Return the description of the graphs in JSON types; `files` are the graphs, by kind."""
     graphs = {kind: _graph(described, kind, data, opset) for kind, data in files.items()}
     if "step" in graphs:
         graphs["step"]["states"] = [

@@ -27,7 +27,7 @@ ALLOWED = frozenset(_NAMES.split())
 
 
 def library() -> ModuleType:
-    """The `onnx` package.
+    """Import the `onnx` package.
 
     Raises:
         ExportError: it is not installed.
@@ -76,7 +76,7 @@ class Nodes:
         self._taken |= set(names)
 
     def name(self, what: str) -> str:
-        """A name of this scope that is not in use."""
+        """Return an unused name in this scope."""
         first = f"{self._scope}_{what}"
         free_name = next(
             c for n in range(len(self._taken) + 1) if (c := f"{first}_{n}" if n else first) not in self._taken
@@ -85,7 +85,7 @@ class Nodes:
         return free_name
 
     def constant(self, values: ArrayLike, what: str = "constant") -> str:
-        """A float32 array, or an int64 one if that is what comes; equal ones are written once."""
+        """Add a float32 or int64 constant; equal constants are written once."""
         array = np.asarray(values)
         plain = np.ascontiguousarray(array, dtype=np.int64 if array.dtype == np.int64 else np.float32)
         # Equal by bytes, so that 0.0 and -0.0 stay apart.
@@ -100,11 +100,11 @@ class Nodes:
         return any(constant_name == name and not any(data) for (_, _, data), constant_name in self._constants.items())
 
     def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
-        """A node with one output."""
+        """Add a node with one output."""
         return self.several(operator, inputs, 1, **attributes)[0]
 
     def several(self, operator: str, inputs: Sequence[str], outputs: int, **attributes: Any) -> list[str]:
-        """A node with several outputs."""
+        """Add a node with several outputs."""
         if operator not in ALLOWED:
             raise ExportError(f"operator {operator} is not one that importers can be counted on to have")
         output_names = [self.name(operator.lower()) for _ in range(outputs)]
@@ -117,7 +117,7 @@ class Nodes:
         return output_names
 
     def split(self, x: str, sizes: Sequence[int], axis: int) -> list[str]:
-        """Neighbouring pieces; the value itself where there is one piece."""
+        """Split a value into neighbouring parts; a single part is the value itself."""
         if len(sizes) == 1:
             return [x]
         # Before opset 13 the sizes were an attribute, since then they are an input.
@@ -134,7 +134,7 @@ class Nodes:
         return self.add("Gather", x, self.constant(chosen.astype(np.int64), "columns"), axis=1)
 
     def shaped(self, x: str, *shape: int) -> str:
-        """The numbers of a value in another shape, in the same order."""
+        """Reshape a value, keeping the order of its elements."""
         return self.add("Reshape", x, self.constant(np.array(shape, np.int64), "shape"))
 
     def clip(self, x: str, low: float, high: float) -> str:
@@ -161,15 +161,15 @@ class Nodes:
         return self.add("Gemm", a, b, third, alpha=float(scale), transB=int(turn))
 
     def times(self, x: str, factor: ArrayLike) -> str:
-        """A value times a constant."""
+        """Multiply a value by a constant."""
         return self.add("Mul", x, self.constant(factor, "factor"))
 
     def plus(self, x: str, term: ArrayLike) -> str:
-        """A value plus a constant."""
+        """Add a constant to a value."""
         return self.add("Add", x, self.constant(term, "term"))
 
     def less(self, a: str, b: str) -> str:
-        """``a - b``, without a subtraction of two values, which importers lack."""
+        """Return ``a - b`` without the subtraction operator, which some importers lack."""
         return self.add("Add", a, self.times(b, np.float32(-1.0)))
 
     def softmax(self, x: str) -> str:
@@ -183,7 +183,7 @@ class Nodes:
         outputs: Mapping[str, tuple[str, tuple[int, ...]]],
         notes: Mapping[str, str],
     ) -> bytes:
-        """The finished, checked file.
+        """Return the finished, checked file.
 
         Args:
             name: of the graph.
@@ -235,7 +235,7 @@ class Nodes:
             node.output[:] = [names.get(key, key) for key in node.output]
 
     def unread(self, ends: Iterable[str]) -> list[str]:
-        """Values that nothing reads, of nodes with another one that some of `ends` rest on."""
+        """Return the unread outputs of nodes that contribute to `ends` with another output."""
         read_values = set(ends)
         # Backwards: readers come after what they read.
         for node in reversed(self._nodes):
@@ -245,7 +245,7 @@ class Nodes:
         return [name for node in split for name in node.output if name not in read_values]
 
     def _drop_unread(self, outputs: Mapping[str, object]) -> None:
-        """Remove nodes and constants that no output rests on."""
+        """Remove nodes and constants that do not contribute to an output."""
         read_values, read_nodes = set(outputs), []
         for node in reversed(self._nodes):
             if read_values & set(node.output):
@@ -259,7 +259,7 @@ class Nodes:
 
 
 def _leave_out(node: Any, read_values: set[str]) -> None:
-    """Drop the outputs of a node that nothing reads."""
+    """Remove the unread outputs of a node."""
     names = [name if name in read_values else "" for name in node.output]
     while not names[-1]:
         names.pop()

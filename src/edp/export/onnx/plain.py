@@ -21,7 +21,7 @@ Plain = Callable[[Nodes, Any, int, Sequence[str], Sequence[int]], str]
 
 
 def activate(nodes: Nodes, function: Function, x: str) -> str:
-    """A function of each number."""
+    """Apply a function to each element."""
     if function is Function.GELU:
         # GELU is an operator only from opset 20 on; here it is written out by the error function.
         half = nodes.plus(nodes.add("Erf", nodes.times(x, np.float32(1 / math.sqrt(2)))), np.float32(1.0))

@@ -9,7 +9,7 @@ from edp.export.onnx.nodes import Nodes
 
 @dataclass
 class _Value:
-    """The last `ticks` ticks of a value of `width` numbers, in one form or both."""
+    """The last `ticks` samples of a value with `width` elements, as rows, columns or both."""
 
     ticks: int
     width: int
@@ -18,7 +18,7 @@ class _Value:
 
 
 class Sequences:
-    """Values by name; each form is made once, where it is asked for."""
+    """Values by name; each form is created on first use."""
 
     def __init__(self, nodes: Nodes) -> None:
         self._nodes = nodes
@@ -43,7 +43,7 @@ class Sequences:
         return bool(form.columns) and form.ticks == ticks
 
     def rows(self, name: str, ticks: int) -> str:
-        """The last `ticks` ticks as rows."""
+        """Return the last `ticks` samples as rows."""
         form = self._values[name]
         if not form.rows:
             # Convolutions want channels before time, everything else time before channels.
@@ -52,7 +52,7 @@ class Sequences:
         return self._last(form.rows, form.ticks, ticks, 0)
 
     def columns(self, name: str, ticks: int) -> str:
-        """The last `ticks` ticks as columns."""
+        """Return the last `ticks` samples as columns."""
         form = self._values[name]
         if not form.columns:
             three = self._nodes.shaped(form.rows, 1, form.ticks, form.width)

@@ -44,12 +44,12 @@ class State:
 
 
 def plain_name(name: str) -> str:
-    """The name of a layer as part of a name in the graph."""
+    """Return the name of a layer as part of a name in the graph."""
     return name.replace(".", "_")
 
 
 def states_of(graph: Graph) -> list[State]:
-    """The states of the step graph, in the order of its inputs."""
+    """Return the states of the step graph in the order of its inputs."""
     states: list[State] = []
     used_names = {INPUTS, SPOILT, *graph.results}
     for layer, slot in graph.slots():
@@ -62,7 +62,7 @@ def states_of(graph: Graph) -> list[State]:
 
 
 def refuse(layer: Layer) -> ExportError:
-    """The error for a kind of layer that is not written."""
+    """Return the error for an unsupported kind of layer."""
     kinds: set[type[Layer]] = {*PLAIN, *STEPS, memory.Feed, memory.PrefixCorrection}
     supported_kinds = sorted(kind.__name__ for kind in kinds)
     return ExportError(
@@ -87,7 +87,7 @@ def spoil(nodes: Nodes, inputs: str, ends: Iterable[str]) -> str:
 
 
 def step_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], opset: int = DEFAULT_OPSET) -> bytes:
-    """The file of the step graph.
+    """Return the file of the step graph.
 
     Args:
         graph: the layers.
@@ -149,7 +149,7 @@ def _add_layer(
 
 
 def corrections(nodes: Nodes, graph: Graph, layer: memory.PrefixCorrection, numbers: str) -> dict[tuple[str, str], str]:
-    """The part of a correction that each state gets, in the shape of the state."""
+    """Return the part of a correction for each state, in the shape of the state."""
     slots = {(name, slot.name): slot for name, slot in graph.slots()}
     parts = nodes.split(numbers, [slots[owner].size for owner in layer.corrects], 1)
     shaped = {}
@@ -162,7 +162,7 @@ def corrections(nodes: Nodes, graph: Graph, layer: memory.PrefixCorrection, numb
 def add_results(
     nodes: Nodes, graph: Graph, values: Mapping[str, str], spoilt: str, targets: int
 ) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """The results, NaN where an input was not finite, as outputs of the graph."""
+    """Add the results as graph outputs, NaN where an input was not finite."""
     outputs: dict[str, tuple[str, tuple[int, ...]]] = {}
     for meaning, value in graph.results.items():
         shape = shape_of_result(graph, value, targets)

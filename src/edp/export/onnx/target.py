@@ -1,4 +1,4 @@
-"""``--to onnx``: the graphs of a network, and files that say what goes in and what comes out."""
+"""Export target ``--to onnx``: the graphs of a network, and files that describe inputs and outputs."""
 
 from __future__ import annotations
 

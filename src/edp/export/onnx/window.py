@@ -28,7 +28,7 @@ CHANNELS_FIRST = (BinaryOperation.ADD, BinaryOperation.MULTIPLY)
 
 
 def rows_before(layer: Layer, rows: int, ticks: int) -> int:
-    """Rows of its inputs that the last `rows` rows of a layer rest on, at most `ticks`."""
+    """Return the number of input rows required for the last `rows` rows of a layer, at most `ticks`."""
     if isinstance(layer, memory.Difference):
         # One tick more: the change at the first row needs its predecessor.
         return min(ticks, rows + 1)
@@ -41,7 +41,7 @@ def rows_before(layer: Layer, rows: int, ticks: int) -> int:
 
 
 def rows_needed(graph: Graph, ticks: int) -> dict[str, int]:
-    """Rows of each value that the predictions after the last tick rest on."""
+    """Return the number of rows of each value required for the predictions after the last sample."""
     need = dict.fromkeys((INPUT, *(layer.name for layer in graph.layers)), 0)
     need |= dict.fromkeys(graph.results.values(), 1)
     for layer in reversed(graph.layers):
@@ -101,7 +101,7 @@ class Window:
             raise refuse(layer)
 
     def _on_channels(self, layer: Layer) -> Callable[..., str] | None:
-        """Writes a layer whose result does not depend on how its numbers are laid out; None for another one."""
+        """Return the writer of a layer that is independent of the element layout; None for other layers."""
         if isinstance(layer, layers.Activate):
             return partial(activate, self.nodes, layer.function)
         if isinstance(layer, layers.Elementwise) and layer.operation in CHANNELS_FIRST:
@@ -159,12 +159,12 @@ class Window:
         self._give(layer, nodes.product(nodes.constant(weights, "weights"), source), rows)
 
     def _seen(self, window: int, rows: int, reach: int) -> np.ndarray:
-        """Which of the last `reach` ticks each of the last `rows` ticks sees, ``(rows, reach)``."""
+        """Return a mask of the last `reach` samples visible to each of the last `rows` samples, ``(rows, reach)``."""
         at, of = np.arange(reach - rows, reach)[:, None], np.arange(reach)[None]
         return (of <= at) & (of > at - window)
 
     def _hidden(self, window: int, rows: int, reach: int) -> str | None:
-        """What is added to scores so that ticks that are not seen do not count."""
+        """Return the term added to scores that masks invisible samples."""
         seen = self._seen(window, rows, reach)
         return None if seen.all() else self.nodes.constant(np.where(seen, 0, UNSEEN).astype(np.float32), "hidden")
 
@@ -184,7 +184,7 @@ class Window:
         self._give(layer, attend(self.nodes, layer, (query, keys, values), hidden), rows)
 
     def _recurrence(self, layer: Layer) -> None:
-        """A layer that carries its state over the window, corrected after the first ticks where that is learned."""
+        """Write a layer that carries its state over the window, corrected after the first samples if trained."""
         nodes, ticks = self.nodes, self.ticks
         source = self.values.rows(layer.inputs[0], ticks)
         state = {
@@ -252,14 +252,14 @@ def _reordered(array: np.ndarray, order: Sequence[int]) -> np.ndarray:
 
 def _first(nodes: Nodes, state: str, units: int) -> str:
     # An all-zero start is the operator's default.
-    """A state as an operator takes it; left out where it is zero."""
+    """Return a state as an operator input; empty if it is zero."""
     return "" if nodes.is_zero(state) else nodes.shaped(state, 1, 1, units)
 
 
 def lstm(
     nodes: Nodes, layer: memory.Lstm, source: str, ticks: int, state: Mapping[str, str]
 ) -> tuple[str, dict[str, str]]:
-    """The operator's gates are in the order i, o, f, c."""
+    """Write an LSTM; the gates of the ONNX operator are in the order i, o, f, c."""
     order, units = (0, 3, 1, 2), layer.width
     bias = np.concatenate([_reordered(layer.bias, order), np.zeros((1, 4 * units), np.float32)], axis=1)
     y, h, c = nodes.several(
@@ -282,7 +282,7 @@ def lstm(
 def gru(
     nodes: Nodes, layer: memory.Gru, source: str, ticks: int, state: Mapping[str, str]
 ) -> tuple[str, dict[str, str]]:
-    """The operator's gates are in the order z, r, h; the reset gate acts behind the product, as in the network."""
+    """Write a GRU; the gates of the ONNX operator are in the order z, r, h, with the reset gate after the product."""
     order, units = (1, 0, 2), layer.width
     bias = np.concatenate([_reordered(layer.bias_x, order), _reordered(layer.bias_h, order)], axis=1)
     y, h = nodes.several(
@@ -303,7 +303,7 @@ def gru(
 
 
 def window_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], opset: int = DEFAULT_OPSET) -> bytes:
-    """The file of the window graph; arguments and errors as of `step_model`."""
+    """Return the file of the window graph; arguments and errors as for `step_model`."""
     nodes = Nodes(opset)
     nodes.reserve(INPUTS, *graph.results)
     window = Window(nodes, graph)

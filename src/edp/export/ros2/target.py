@@ -68,7 +68,7 @@ class Ros2Target:
 
 
 def _content(described: Description) -> dict[str, Any]:
-    """The description, with names that fit into parameters and messages.
+    """Return the description with names valid for parameters and messages.
 
     They are `shown_names` without ``=``, which ends the name in a parameter, and do not begin as a formula of a
     spreadsheet does; a name that was replaced is kept as ``original``.
@@ -117,7 +117,7 @@ def _blanks(model: Model, package: str, about: Mapping[str, Any]) -> dict[str, o
 
 
 def source_guess(name: str, kind: Kind) -> str:
-    """A guess that the parameter file offers."""
+    """Return the source proposed in the parameter file."""
     # Pressures have no field in a message of joints.
     if kind in PRESSURES:
         return f"pressure:{name}"

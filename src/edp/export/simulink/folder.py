@@ -1,4 +1,4 @@
-"""What the templates of a MATLAB folder are filled with, and which of them a network gets."""
+"""Template values of a MATLAB folder, and the choice of templates for a network."""
 
 from __future__ import annotations
 
@@ -73,16 +73,16 @@ class Folder:
 
     @property
     def described(self) -> Description:
-        """What every form tells."""
+        """Description common to all forms."""
         return Description(self.model.name, self.model.bundle, self.model.graph)
 
     @property
     def native(self) -> Native | None:
-        """The network as MATLAB code; there is none in integer arithmetic and of a grey box."""
+        """Network as MATLAB code; None for integer arithmetic and grey boxes."""
         return None if self.model.integer or self.model.hydraulic else Native(self.model.graph)
 
     def content(self) -> dict[str, Any]:
-        """The description as plain values."""
+        """Return the description in JSON types."""
         about = self.described.content()
         for side in ("inputs", "targets"):
             fields = matlab_names([entry["name"] for entry in about[side]])
@@ -90,7 +90,7 @@ class Folder:
         return about | {"rules": RULES, "status": list(STATUS)}
 
     def tables(self) -> dict[str, Any]:
-        """What the MAT file holds besides the golden recording."""
+        """Return the content of the MAT file without the golden recording."""
         low, high = input_limits(self.model.bundle.predictor)
         tables: dict[str, Any] = {"edp": self.content()}
         if self.native is not None:
@@ -147,14 +147,14 @@ class Folder:
 
     @property
     def words(self) -> int:
-        """32-bit words that hold the C state, with what a compiler puts between its parts."""
+        """Number of 32-bit words of the C state, including padding by the compiler."""
         short = sum(slot.number is Number.INT16 for _, slot in self.model.graph.slots())
         short += sum(kind is Number.INT16 for kind in self.model.plan.sizes)
         # Each 16-bit array may be followed by two bytes of padding; the sum is rounded up to words.
         return (self.model.state_bytes() + 2 * short + 7) // 4
 
     def _ports(self) -> dict[str, object]:
-        """Result ports of the S-function and results of the C Caller's function."""
+        """Return the result ports of the S-function and the results of the C Caller's function."""
         sizes: list[str] = []
         give: list[str] = []
         # MATLAB's matrices have columns first, C's have rows first.

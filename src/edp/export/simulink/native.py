@@ -62,7 +62,7 @@ class Native:
         return dict(zip(keys, matlab_names(list(short)), strict=True))
 
     def laid(self, layer: Layer) -> dict[str, Any]:
-        """A layer's constants in the order in which MATLAB reads them."""
+        """Return the constants of a layer in the order in which MATLAB reads them."""
         tensors = {
             part: values.reshape(-1, 1) if values.ndim == 1 else values for part, values in layer.tensors().items()
         }
@@ -82,19 +82,19 @@ class Native:
         return tensors
 
     def runs(self, layer: layers.Gather) -> list[tuple[int, int, int]]:
-        """Runs of neighbouring columns: which input, its first column, how many."""
+        """Return runs of neighbouring columns: input, first column, number of columns."""
         return runs(layer.columns, [self.graph.width_of(name) for name in layer.inputs])
 
     def value(self, name: str) -> str:
-        """The variable of a value."""
+        """Return the variable of a value."""
         return "in" if name == INPUT else f"v.{self._fields[name, '']}"
 
     def constant(self, layer: Layer, part: str) -> str:
-        """The constant of a layer."""
+        """Return the constant of a layer."""
         return f"w.{self._fields[layer.name, part]}"
 
     def slot(self, layer: str, part: str) -> str:
-        """What a layer remembers."""
+        """Return the state of a layer."""
         return f"s.{self._fields[layer, part]}"
 
     def weights(self) -> dict[str, Any]:
@@ -105,13 +105,13 @@ class Native:
         return {self._fields[key]: values for key, values in tensors.items()}
 
     def start(self) -> dict[str, Array]:
-        """States after a reset by field: columns; rings have a column a tick, the oldest first."""
+        """Return the initial states by field: columns; rings have one column per sample, the oldest first."""
         return {
             self._fields[name, slot.name]: _column(self.graph.start(name, slot)) for name, slot in self.graph.slots()
         }
 
     def code(self) -> Code:
-        """The statements of a tick: from ``in`` and states ``s`` to values ``v`` and the next states.
+        """Return the statements of a time step: from ``in`` and states ``s`` to values ``v`` and the next states.
 
         Raises:
             ExportError: a layer has no form in MATLAB.
@@ -129,13 +129,13 @@ class Native:
         return Code("\n".join(lines))
 
     def results(self) -> Code:
-        """The statement that lists the results."""
+        """Return the statement that lists the results."""
         listed = (f"out.{meaning} = {self.value(value)}" for meaning, value in self.graph.results.items())
         return Code("; ".join(listed) + ";")
 
 
 def functions_for(code: str) -> Code:
-    """The functions that code calls, and those that they call."""
+    """Return the functions that code calls, and the functions called by them."""
     text = resources.files("edp.export.simulink").joinpath("templates/layers.m.in").read_text()
     bodies = {}
     # Functions are cut out of one tested file, so that generated code and tests share them.
@@ -162,7 +162,7 @@ def _column(values: Array) -> Array:
 
 
 def _simple(pattern: str) -> Write:
-    """A statement with the inputs as ``{0}``, ``{1}``, constants and slots by name, other fields of the layer too."""
+    """Return a writer for a statement with inputs ``{0}``, ``{1}``, and constants, slots and layer fields by name."""
 
     def write(native: Native, layer: Any, x: Sequence[str]) -> list[str]:
         names = {part: native.constant(layer, part) for part in native.laid(layer)}
@@ -175,7 +175,7 @@ def _simple(pattern: str) -> Write:
 
 
 def _plain(value: float) -> str:
-    """A number of a layer; text never becomes code."""
+    """Return a layer option as a literal; text never becomes code."""
     if isinstance(value, bool):
         return str(value).lower()
     return f"{np.float32(value):.9g}" if isinstance(value, float) else str(value)

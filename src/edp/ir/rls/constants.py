@@ -1,4 +1,4 @@
-"""What an adaptation is made of: options, and the constants that were fitted to a run."""
+"""Parameters of an adaptation: options, and constants fitted to a run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BETTER = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptationSpec:
-    """How fast and how far an adaptation goes.
+    """Speed and limits of an adaptation.
 
     Attributes:
         rank: r, directions of the inputs that corrections may use beside what they always use.
@@ -124,7 +124,7 @@ class Adaptation:
 
     @property
     def features(self) -> int:
-        """n, numbers of phi."""
+        """Number of features n, the length of phi."""
         return 1 + 3 * len(self.columns) + self.spec.rank
 
     @property
@@ -134,7 +134,7 @@ class Adaptation:
 
     @property
     def numbers(self) -> dict[str, np.float32]:
-        """What the options come to, as the arithmetic takes it.
+        """Return the options as constants of the arithmetic.
 
         Coefficients follow ``theta' = a theta + w`` with ``a = exp(-1 / (forgetting rate))`` and a variance of w that
         keeps their spread at `prior`: so their covariance never exceeds ``prior^2`` in any direction.
@@ -174,7 +174,7 @@ class Adaptation:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any], arrays: Mapping[str, Array]) -> Adaptation:
-        """An adaptation from `to_plain` and `arrays`.
+        """Create an adaptation from `to_plain` and `arrays`.
 
         Raises:
             ConfigError: they do not go together.

@@ -13,7 +13,7 @@ from edp.ir.rls.constants import CLIP, FEATURE_LIMIT, MOST_ERROR, Adaptation, Ar
 
 
 class RlsStatus(IntEnum):
-    """What a step of an adaptation has done."""
+    """Result code of an adaptation step."""
 
     NONE = 0
     """Nothing: there is no prediction to correct."""
@@ -27,7 +27,7 @@ class RlsStatus(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class RlsState:
-    """What an adaptation has learned, to be kept over a restart.
+    """Learned state of an adaptation, to be stored over a restart.
 
     Attributes:
         digest: of the adaptation that it belongs to.
@@ -39,7 +39,7 @@ class RlsState:
 
 
 def total(products: Array) -> Array:
-    """Sums over the last axis, one number after the other, as a loop adds them."""
+    """Return sums over the last axis, added sequentially like a loop."""
     # `np.add.accumulate` adds in order; `np.sum` adds in pairs and would differ from C in the last bit.
     return np.asarray(np.add.accumulate(products, axis=-1, dtype=np.float32)[..., -1], dtype=np.float32)
 
@@ -86,16 +86,16 @@ class RlsCorrector:
         self.repairs = self._streak = 0
 
     def interrupt(self) -> None:
-        """Tell that ticks are missing: what was predicted before them is not judged; what was learned stays."""
+        """Report missing samples: predictions made before them are not compared; learned coefficients stay."""
         self._streak = 0
 
     @property
     def learned(self) -> RlsState:
-        """What was learned so far."""
+        """Return the learned state."""
         return RlsState(self.adaptation.digest, self.theta.copy())
 
     def restore(self, learned: RlsState) -> None:
-        """Go on from what was learned earlier.
+        """Restore an earlier learned state.
 
         Raises:
             ConfigError: it belongs to another adaptation, or holds numbers out of their bounds.
@@ -110,7 +110,7 @@ class RlsCorrector:
     def step(
         self, inputs: ArrayLike, prediction: ArrayLike, fresh: bool = True, learn: bool = True
     ) -> tuple[Array, RlsStatus]:
-        """Learn from what has come due, and correct a prediction.
+        """Learn from predictions that are now due, and correct a prediction.
 
         Args:
             inputs: of this tick ``(I,)``, SI units.
@@ -152,7 +152,7 @@ class RlsCorrector:
         return out, RlsStatus.LEARNING if taught else RlsStatus.HOLDING
 
     def _directed(self, x: Array) -> Array:
-        """The inputs along the directions ``(r,)``."""
+        """Return the projections of the inputs on the directions ``(r,)``."""
         constants = self.adaptation
         if not constants.spec.rank:
             return np.zeros(0, dtype=np.float32)
@@ -168,7 +168,7 @@ class RlsCorrector:
         return np.concatenate([np.ones(1, dtype=np.float32), present, change, _within(error, FEATURE_LIMIT), directed])
 
     def _moves(self, values: Array) -> bool:
-        """Whether one of the targets is farther from its middle than at rest."""
+        """Return whether a target is outside its dead zone around the middle."""
         return bool((np.abs(values - self.adaptation.middle) > self.adaptation.dead_zone).any())
 
     def _error(self, h: int, measured: Array) -> Array:
@@ -177,7 +177,10 @@ class RlsCorrector:
         return np.asarray((measured - row[n : n + len(measured)]) / self.adaptation.unit[h])
 
     def _correction(self, h: int, phi: Array) -> Array:
-        """In units ``(J,)``; coefficients that are not finite, which nothing but damaged memory makes, are cleared."""
+        """Return the correction in target units ``(J,)``.
+
+        Coefficients that are not finite (damaged memory) are cleared.
+        """
         correction = total(self.theta[h] * phi)
         damaged = ~np.isfinite(correction)
         if damaged.any():

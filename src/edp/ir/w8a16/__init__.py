@@ -1,4 +1,4 @@
-"""W8A16: networks in integer arithmetic, 8-bit weights and 16-bit values, and what they compute to the last bit."""
+"""W8A16 networks in integer arithmetic: 8-bit weights, 16-bit values, defined bit for bit."""
 
 from edp.ir.w8a16.calibration import calibrate
 from edp.ir.w8a16.quantise import Formats, quantise

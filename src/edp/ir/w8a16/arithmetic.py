@@ -36,7 +36,7 @@ TABLE = 513
 
 
 def frac_for(largest: float, bits: int = 15) -> int:
-    """The most fractional bits with which `largest` still fits in `bits` bits and a sign."""
+    """Return the largest number of fractional bits with which `largest` fits in `bits` bits and a sign."""
     # NaN and zero give the finest format: a value that never moves needs no range.
     if not largest > 0.0:
         return bits
@@ -59,7 +59,7 @@ def saturated(x: Any, largest: int = LARGEST) -> Fixed:
 
 
 def to_fixed(values: Any, frac: int, largest: int = LARGEST) -> Fixed:
-    """Real numbers as integers, rounded half up and kept in range."""
+    """Convert real numbers to integers, rounded half up and limited to the range."""
     scaled = np.floor(np.asarray(values, dtype=np.float64) * 2.0**frac + 0.5)
     return np.clip(scaled, -largest, largest).astype(np.int64)
 
@@ -112,7 +112,7 @@ NORMAL = _table(lambda x: 0.5 * (1.0 + math.erf(x / math.sqrt(2.0))), 8.0)
 
 
 def looked_up(table: NDArray[np.uint16], x: Fixed, step: int) -> Fixed:
-    """A table at x >= 0, `2^step` apart, interpolated; beyond its end its last entries."""
+    """Interpolate a table at x >= 0 with spacing `2^step`; beyond its end the last entries are used."""
     # The last entry has no neighbour to interpolate to; x stays just below it.
     x = np.minimum(x, ((TABLE - 1) << step) - 1)
     at, rest = x >> step, x & ((1 << step) - 1)

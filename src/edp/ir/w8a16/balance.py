@@ -1,4 +1,4 @@
-"""Trees and their weights brought to sizes that 8-bit weights suit, without a change of what the network computes."""
+"""Rescaling of trees and their weights for 8-bit weights, without changing the network function."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edp.ir.layers import Dense, Gather, TreeSums
 
 
 def balanced(graph: Graph) -> Graph:
-    """The same network with larger leaves where trees have larger weights than all else that a dense layer reads.
+    """Return an equivalent network with larger leaves if trees have larger weights than other inputs of a layer.
 
     The 8-bit weights of an output share one scale: beside a weight of 1 for the trees those of a linear model, a few
     hundredths, would keep two or three bits. Leaves are multiplied by a power of two and the weights divided by it,
@@ -40,12 +40,12 @@ def balanced(graph: Graph) -> Graph:
 
 
 def _only_reader(graph: Graph, layer: Layer) -> Layer | None:
-    """The one layer that reads a value; None where there are others, or the value is a result."""
+    """Return the only layer that reads a value; None if there are others, or the value is a result."""
     readers: Sequence[Layer] = [other for other in graph.layers if layer.name in other.inputs]
     return readers[0] if len(readers) == 1 and layer.name not in graph.results.values() else None
 
 
 def _columns(graph: Graph, join: Gather, value: str) -> np.ndarray:
-    """Which numbers of a joined value come from one of its inputs."""
+    """Return a mask of the elements of a joined value that come from one of its inputs."""
     owners = np.repeat(np.array(join.inputs), [graph.width_of(name) for name in join.inputs])
     return np.asarray(owners[list(join.columns)] == value)

@@ -1,4 +1,4 @@
-"""How large each value of a network becomes, and what its weights are multiplied by, seen on recordings."""
+"""Calibration: ranges of all values and input moments of the weights, measured on recordings."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def calibrate(
     ticks: int = 20_000,
     error_of: Callable[[int], float] | None = None,
 ) -> Formats:
-    """Formats of all values and 8-bit weights, chosen on recordings.
+    """Choose formats of all values and 8-bit weights from recordings.
 
     What is computed before the first weights is seen at every tick, since clipped inputs cost most; the rest on pieces
     of `PIECE` ticks spread evenly over all recordings. All inputs share one format: where a few of them are very large
@@ -67,7 +67,7 @@ def calibrate(
 
 
 def finer(frac: int, error_of: Callable[[int], float]) -> int:
-    """The format of least error from `frac` on, until `PATIENCE` finer ones in a row bring nothing."""
+    """Return the format with the least error, searching from `frac` until `PATIENCE` finer formats bring no gain."""
     best, error, candidate = frac, error_of(frac), frac
     while candidate - best < PATIENCE:
         candidate += 1
@@ -77,7 +77,7 @@ def finer(frac: int, error_of: Callable[[int], float]) -> int:
 
 
 def pieces(recordings: Sequence[NDArray[np.floating]], ticks: int) -> list[NDArray[np.floating]]:
-    """Pieces of recordings, of about so many ticks in all, at even distances."""
+    """Return evenly spaced segments of recordings with about `ticks` samples in total."""
     total = sum(len(rows) for rows in recordings)
     share = min(1.0, ticks / max(1, total))
     cut = []

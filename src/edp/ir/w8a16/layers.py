@@ -44,7 +44,7 @@ class FixedLayer(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Sized(FixedLayer):
-    """One that gives `size` numbers."""
+    """Layer with `size` output elements."""
 
     size: int
 
@@ -55,7 +55,7 @@ class _Sized(FixedLayer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Weighted(FixedLayer):
-    """One with a matrix, and for each of its outputs a bias and the way from the sum to the value's format."""
+    """Layer with a matrix, and for each output a bias and the conversion from the sum to the value's format."""
 
     weight: Bytes
     bias: Words
@@ -86,7 +86,7 @@ class Dequantise(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class QGather(FixedLayer):
-    """Chosen numbers of the inputs, which are laid end to end; those of input i lose `shifts[i]` bits."""
+    """Selected elements of the concatenated inputs; elements of input i are shifted right by `shifts[i]` bits."""
 
     columns: tuple[int, ...]
     shifts: tuple[int, ...]
@@ -98,7 +98,7 @@ class QGather(FixedLayer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class QSum(_Sized):
-    """``a + b`` or ``a - b`` of `size` numbers; they are shifted left by `lefts`, the sum right by `right`."""
+    """``a + b`` or ``a - b`` of `size` elements, shifted left by `lefts`; the sum is shifted right by `right`."""
 
     lefts: tuple[int, int]
     right: int
@@ -107,7 +107,7 @@ class QSum(_Sized):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class QMultiply(_Sized):
-    """``a b`` of `size` numbers, shifted right by `right`."""
+    """``a b`` of `size` elements, shifted right by `right`."""
 
     right: int
 
@@ -319,7 +319,7 @@ class QTrailingMean(_Sized):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class QAttentionPool(FixedLayer):
-    """Softmax-weighted mean of the last `window` inputs, the bias of its scores left out: it changes nothing.
+    """Softmax-weighted mean of the last `window` inputs, without the bias of the scores, which has no effect.
 
     Slots: rings of inputs and of scores, and ticks seen.
     """

@@ -1,4 +1,4 @@
-"""Mean products of what each matrix of a network is multiplied by."""
+"""Second moments of the inputs of each matrix of a network."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.floating]
 
 
 class InputMoments:
-    """Gathers ``x x'`` of every matrix of a graph, piece by piece.
+    """Accumulator of ``x x'`` for every matrix of a graph, segment by segment.
 
     Args:
         graph: the float network.
@@ -27,7 +27,7 @@ class InputMoments:
         self._ticks = 0
 
     def add(self, values: Mapping[str, Array]) -> None:
-        """Take in a piece from reset: values ``(time, number)`` of every layer."""
+        """Add a segment that begins with a reset: values ``(time, number)`` of every layer."""
         for layer in self.graph.layers:
             for matrix, x in _multiplied(layer, values).items():
                 product = np.einsum("tri,trj->rij", x, x)
@@ -35,14 +35,14 @@ class InputMoments:
         self._ticks += len(next(iter(values.values())))
 
     def means(self) -> dict[str, Array]:
-        """By matrix ``(terms, terms)``; for a `GroupedDense` ``(row, terms, terms)``."""
+        """Return the mean moments by matrix, ``(terms, terms)``; for a `GroupedDense` ``(row, terms, terms)``."""
         apart = {layer.name for layer in self.graph.layers if isinstance(layer, layers.GroupedDense)}
         means = {name: total / max(1, self._ticks) for name, total in self._sums.items()}
         return {name: mean if name in apart else mean.mean(axis=0) for name, mean in means.items()}
 
 
 def _multiplied(layer: Layer, values: Mapping[str, Array]) -> dict[str, Any]:
-    """What the matrices of a layer are multiplied by, ``(time, row, terms)``."""
+    """Return the inputs of the matrices of a layer, ``(time, row, terms)``."""
     if not layer.inputs:
         return {}
     x = values[layer.inputs[0]]

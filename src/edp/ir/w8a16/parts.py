@@ -1,4 +1,4 @@
-"""Which layers of a float network are computed in integers, and which stay in single precision."""
+"""Choice of the float layers that are computed in integers; the others stay in single precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A list of float layers as one of integer layers, given how large each value becomes.
+"""Conversion of a float layer graph to integer layers, given the range of each value.
 
 What lies between the standardised inputs and the last weights is computed in integer arithmetic; scaling of the
 inputs, the way back to SI units and the few kinds in `FLOAT` stay in single precision.
@@ -49,7 +49,7 @@ class Formats:
 
 # A quarter more than calibration has seen; one more bit would cost half of the resolution.
 def formats(ranges: Ranges, margin: float = 1.25) -> Formats:
-    """The finest format of each value that holds `margin` times its largest magnitude."""
+    """Return the finest format of each value that holds `margin` times its largest magnitude."""
     fracs = {name: fixed.frac_for(margin * size) for name, size in ranges.items() if "/" not in name}
     # The state of a rotation is 32-bit, and half of what it may grow to is kept free.
     wide = {name: fixed.frac_for(2.0 * margin * size, 29) for name, size in ranges.items() if "/" in name}
@@ -82,7 +82,7 @@ class _Work:
         return gate_constants
 
     def as_fixed(self, value: str) -> str:
-        """The name of a value as integers."""
+        """Return the name of a value as integers."""
         if value in self.integer_fracs:
             return value
         name = f"{value}.whole"
@@ -93,7 +93,7 @@ class _Work:
         return name
 
     def as_float(self, value: str) -> str:
-        """The name of a value as floats."""
+        """Return the name of a value as floats."""
         if value not in self.integer_fracs:
             return value
         name = f"{value}.real"
@@ -103,14 +103,14 @@ class _Work:
         return name
 
     def frac(self, value: str) -> int:
-        """The format chosen for a value."""
+        """Return the format chosen for a value."""
         if value not in self.fracs:
             raise ExportError(f"value '{value}' has no format; the formats are those of another network")
         return self.fracs[value]
 
 
 def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.floating]] | None = None) -> Graph:
-    """The same network in W8A16.
+    """Convert the network to W8A16.
 
     Args:
         graph: the float network.
@@ -154,7 +154,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
 
 
 def outline(graph: Graph) -> Graph:
-    """The network in W8A16 with nothing in it: every constant has its shape and kind, but zeros for numbers.
+    """Return the structure of the W8A16 network: every constant has its shape and type, filled with zeros.
 
     What a network takes of a controller depends on no number, so neither training nor recordings are needed.
 
@@ -172,7 +172,7 @@ def outline(graph: Graph) -> Graph:
 
 
 def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str], Any]:
-    """What slots start from, in their formats."""
+    """Return the initial values of slots in their formats."""
     numbers = {(name, slot.name): slot.number for name, slot in finished.slots()}
     start: dict[tuple[str, str], Any] = {}
     for key, values in graph.initial.items():
@@ -187,7 +187,7 @@ def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str]
 
 
 def _within(frac: int, finest: int) -> int:
-    """A format to which a shift right of 0 to 31 bits leads from `finest`."""
+    """Return a format that a right shift of 0 to 31 bits reaches from `finest`."""
     return min(max(frac, finest - 31), finest)
 
 
@@ -210,7 +210,7 @@ def _elementwise(work: _Work, x: layers.Elementwise, input_fracs: list[int]) -> 
 
 
 def _sum(work: _Work, x: layers.Elementwise, input_fracs: list[int]) -> quantised.FixedLayer:
-    """The finer of two formats is the common one, as far as 32 bits reach."""
+    """Convert a sum; the finer of two formats is the common one, limited to 32 bits."""
     frac, (a, b) = work.frac(x.name), input_fracs
     # 14 bits of difference: 16-bit values shifted by more would leave 32 bits.
     common = min(max(a, b), min(a, b) + 14)

@@ -1,4 +1,4 @@
-"""What a W8A16 network computes, bit for bit, over many ticks at once: the definition that exported code must meet."""
+"""Reference implementation of W8A16 networks, bit for bit, over many samples: the definition for exported code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which integers weights become: the nearest, or those that make the least error in what a layer gives.
+"""Rounding of weights to integers: to the nearest, or with the least error of the layer output.
 
 The second way takes the columns of a matrix one after the other, rounds each, and lets the columns that follow make up
 for its error (E. Frantar et al., GPTQ, 2022): with ``H`` the mean of ``x x'`` over data, the error of an output is
@@ -22,7 +22,7 @@ DAMPING = 0.01
 
 @dataclass(frozen=True)
 class WeightRounding:
-    """How weights are rounded; without data or known numbers to the nearest.
+    """Rounding of weights; without moments or given weights to the nearest.
 
     Attributes:
         weights: integers found before, by matrix.
@@ -55,13 +55,13 @@ class WeightRounding:
 
 
 def nearest(weight: Array, scale: Array) -> NDArray[np.int8]:
-    """Rounded half to even."""
+    """Round half to even."""
     wide = scale.reshape(scale.shape + (1,) * (weight.ndim - scale.ndim))
     return np.clip(np.rint(weight / wide), -fixed.WEIGHT, fixed.WEIGHT).astype(np.int8)
 
 
 def least_error(weight: Array, scale: Array, moments: Array) -> NDArray[np.int8]:
-    """Columns one after the other, the ones with the largest inputs first.
+    """Round column by column in the order of decreasing input size, compensating the error in later columns.
 
     Args:
         weight: ``(out, terms)``.

@@ -42,7 +42,7 @@ def rows(matrix: str, weight: Array, bias: Array, formats: tuple[int, int], roun
 
 
 def _scale(weight: Array, bias: Array, input_frac: int) -> Array:
-    """What one step of an integer weight is worth, for each output."""
+    """Return the value of one step of an integer weight, for each output."""
     terms = tuple(range(bias.ndim, weight.ndim))
     # A bias far larger than its weights takes part in the choice of the scale, else it would not fit.
     scale = np.maximum(np.abs(weight).max(axis=terms) / fixed.WEIGHT, np.abs(bias) * 2.0 ** (input_frac - 30))
@@ -60,13 +60,13 @@ def _scale(weight: Array, bias: Array, input_frac: int) -> Array:
 
 
 def to_gates(matrix: str, weight: Array, input_frac: int, rounding: WeightRounding) -> dict[str, Any]:
-    """A matrix ``(out, in)`` into gates or scores; see `rows`."""
+    """Return the constants of a matrix ``(out, in)`` that computes gates or scores; see `rows`."""
     constants = rows(matrix, weight, np.zeros(len(weight)), (input_frac, fixed.GATE_FRAC), rounding)
     return {key: constants[key] for key in ("weight", "multiplier", "shift")}
 
 
 def halves(gain: Array, most: int = 30) -> tuple[NDArray[np.int16], int]:
-    """Gains as 16-bit numbers with the most fractional bits, up to `most`, and how many these are."""
+    """Return gains as 16-bit numbers and their number of fractional bits, at most `most`."""
     bits = min(fixed.frac_for(float(np.abs(gain).max())), most)
     return fixed.to_fixed(gain, bits).astype(np.int16), bits
 

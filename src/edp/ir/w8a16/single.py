@@ -94,7 +94,7 @@ def _gelu(x: Rows) -> Rows:
 
 
 def _turned(x: Rows, quarters: int) -> Rows:
-    """The runtime's sine of x and of so many quarter turns more."""
+    """Return the runtime's sine of x plus a number of quarter turns."""
     f = np.float32
     # 8,192 rad: up to there n times the parts of pi/2 below stays exact.
     limited = np.clip(x, f(-8192.0), f(8192.0))
@@ -150,12 +150,12 @@ def softmax(scores: Rows) -> Rows:
 
 
 def split(x: Any, rows: int) -> Any:
-    """The last dimension as so many rows."""
+    """Split the last dimension into the given number of rows."""
     return x.reshape(*x.shape[:-1], rows, -1)
 
 
 def flat(x: Any) -> Any:
-    """The last two dimensions as one."""
+    """Merge the last two dimensions."""
     return x.reshape(*x.shape[:-2], -1)
 
 
@@ -195,7 +195,7 @@ def _rows(layer: layers.RowAttention, m: Memory, *qkv: Rows) -> Rows:
 
 
 def _window(layer: memory.WindowAttention, m: Memory, q: Rows, k: Rows, v: Rows) -> Rows:
-    """The ring is read as it lies in memory: the order of a sum matters to its last bit."""
+    """Compute window attention in the memory order of the ring, since the order of a sum affects its last bit."""
     root = np.sqrt(np.float32(layer.size // layer.heads))
     out = np.empty_like(q)
     for tick in range(len(q)):
@@ -214,7 +214,7 @@ def _window(layer: memory.WindowAttention, m: Memory, q: Rows, k: Rows, v: Rows)
 
 
 def _trailing_mean(layer: memory.TrailingMean, m: Memory, x: Rows) -> Rows:
-    """The ring is read as it lies in memory, as in `_window`; rows not yet seen are zero."""
+    """Compute the trailing mean in the memory order of the ring, as in `_window`; rows not yet seen are zero."""
     shape = (layer.window - 1, *x.shape[1:])
     ring = np.array(np.broadcast_to(m["ring"].reshape(len(m["ring"]), -1, layer.size), shape))
     at, seen, out = m.get("at", 0), int(m["age"][0]), np.empty_like(x)

@@ -1,1 +1,1 @@
-"""Readers and writers of log files: one format a file, registered by its name."""
+"""Readers and writers of log files: one module per format, registered by name."""

@@ -38,7 +38,7 @@ class Definitions:
 
 
 def definitions_of(text: Any, message_type: str) -> Definitions | None:
-    """The definitions that a connection carries, else those of a known distribution; None for an unknown type.
+    """Return the message definitions of a connection, otherwise of a known distribution; None for an unknown type.
 
     Raises:
         DataError: a definition that is too long.
@@ -66,7 +66,7 @@ DISTRIBUTION = "ros2_humble"
 
 
 def open_reader(path: Path) -> Any:
-    """A reader of a bag of ROS 1 or ROS 2, of an MCAP file, or of the folder of a ROS 2 bag; not opened yet.
+    """Return an unopened reader for a ROS 1 or ROS 2 bag, an MCAP file or the folder of a ROS 2 bag.
 
     Raises:
         DataError: a part that is no regular file, or whose sizes cannot be.
@@ -79,7 +79,7 @@ def open_reader(path: Path) -> Any:
 
 @cache
 def _readers() -> tuple[Any, Any]:
-    """The library's readers, unpacking as `unpack_to` does."""
+    """Return the reader classes of the library, with unpacking limited by `unpack_to`."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag1 import reader as rosbag1
     from rosbags.rosbag2 import Reader as Reader2
@@ -132,7 +132,7 @@ def _by_ratio(kind: str, data: bytes) -> bytes:
 
 
 class _Zstd:
-    """What the library takes of zstd's module: whole messages, and whole files of a packed bag."""
+    """Replacement of the zstd functions that the library uses: whole messages, and whole files of a packed bag."""
 
     @staticmethod
     def decompress(data: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Files of a bag that is packed file by file, unpacked into memory: a reader of logs writes nothing to disk."""
+"""In-memory unpacking of bag files that are compressed as a whole, since readers write nothing to disk."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _STEP = 1 << 24
 
 
 class Size(NamedTuple):
-    """What of a file's status is asked for."""
+    """File status with the size only."""
 
     st_size: int
 
 
 class MemoryFile:
-    """A file that lies in memory, with what the library of bags asks of a path."""
+    """File in memory with the path operations that the bag library uses."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -34,24 +34,24 @@ class MemoryFile:
         return self.name
 
     def exists(self) -> bool:
-        """It does."""
+        """Return True."""
         return True
 
     def is_dir(self) -> bool:
-        """It is none."""
+        """Return False."""
         return False
 
     def stat(self) -> Size:
-        """How large it is."""
+        """Return the size."""
         return Size(len(self.data))
 
     def open(self, mode: str = "r") -> Any:
-        """A stream of bytes, to read it or to write all of it."""
+        """Return a byte stream for reading, or for writing the whole content."""
         return _Sink(self) if "w" in mode else io.BytesIO(self.data)
 
 
 class _Sink(io.BytesIO):
-    """What is written becomes the file's content when the stream is closed."""
+    """Stream that stores its content in the file when it is closed."""
 
     def __init__(self, file: MemoryFile) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class _Sink(io.BytesIO):
 
 
 class NoFolder:
-    """Stands for the temporary folder that the library unpacks to."""
+    """Substitute for the temporary folder into which the library unpacks."""
 
     name = "packed bag"
 

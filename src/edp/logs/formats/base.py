@@ -1,4 +1,4 @@
-"""What a file holds before any map, unit or time rule is applied, and the registry of file formats."""
+"""Raw content of a log file before conversion of units and time, and the registry of file formats."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ PIECE_ROWS = 1 << 16
 
 
 class ColumnTable(Protocol):
-    """Columns of one file that share their rows, read together in one go through the file."""
+    """Columns of one file with common rows, which are read together in one pass."""
 
     def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
-        """Rows ``start <= row < stop`` of the named columns, in pieces of some rows, in order.
+        """Yield the rows ``start <= row < stop`` of the named columns in order, in chunks of rows.
 
         Yields:
             one array of numbers a name, all of the same length, shape ``(rows of the piece,)``.
@@ -79,7 +79,7 @@ class RawSignal:
 
     @property
     def values(self) -> Column:
-        """The values, read now; not kept."""
+        """Read and return the values; they are not cached."""
         return self.load()
 
     @property
@@ -124,7 +124,7 @@ class RawLog:
         return name in self.signals or name in self.aliases
 
     def signal(self, name: str) -> RawSignal:
-        """The named column.
+        """Return the column with the given name.
 
         Raises:
             DataError: no such column, or several; the names to choose from are offered.
@@ -180,7 +180,7 @@ TRUTH = "truth"
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """How a MAT file is laid out, and where truth goes (the vocabulary beyond Table A.1).
+    """Write options: layout of a MAT file, and handling of ground truth (vocabulary beyond Table A.1).
 
     Attributes:
         mat_layout: a name in `edp.logs.formats.mat_layouts.LAYOUTS`; other formats have one layout.
@@ -202,12 +202,12 @@ class WriteOptions:
 
 
 def is_truth(name: str) -> bool:
-    """Whether a channel is one that only a simulation knows: of the vocabulary, but not of Table A.1."""
+    """Return whether a channel is known to simulations only: in the vocabulary, but not in Table A.1."""
     return name in VOCABULARY and name not in TABLE_A1
 
 
 def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
-    """The measured channels and the truth of a recording; None for a part without channels."""
+    """Split a recording into measured channels and ground truth; None for a part without channels."""
     of_truth = [is_truth(name) for name in recording.channel_names]
 
     def part(truth_part: bool) -> Recording | None:
@@ -233,7 +233,7 @@ class LogFormat(Protocol):
         """Whether a file that begins with `head` (up to 4 KiB) holds this format."""
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
-        """Read a file; raises `DataError` for anything it cannot be read for."""
+        """Read a file; raises `DataError` if it cannot be read."""
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write a recording to `path`, which need not carry the format's suffix."""
@@ -263,7 +263,7 @@ _TIME_UNIT_NAMES = {"sec": "s", "seconds": "s", "milliseconds": "ms", "microseco
 
 
 def find_time(names: Sequence[str], signal_map: SignalMap, path: Path) -> str | None:
-    """The name of the time column among `names`; None where rows are uniform by the map or nothing looks like time.
+    """Return the name of the time column; None if rows are uniform by the map or no name looks like time.
 
     Raises:
         DataError: the map names a time column that the file lacks.

@@ -106,7 +106,7 @@ class CsvFormat:
         return RawLog(path, signals, repeated=repeated, meta=table.facts)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
-        """Write ``time_s`` and every channel as ``name [unit]``; numbers read back bit for bit."""
+        """Write ``time_s`` and every channel as ``name [unit]``. Values are read back bit for bit."""
         header = ["time_s"] + [f"{channel.name} [{channel.unit}]" for channel in recording.channels]
         columns = [f"c{i}" for i in range(len(header))]
         plain = arrow_csv.WriteOptions(include_header=False)
@@ -165,7 +165,7 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
 
 
 def _number_of_any_kind(delimiter: str) -> Callable[[str], bool]:
-    """Whether a cell holds a number by any decimal sign, before that of the file is known."""
+    """Return a function that tests whether a cell is a number with any decimal sign, before that sign is known."""
 
     def is_some_number(cell: str) -> bool:
         return is_number(cell) or is_number(cell, ",") or is_grouped(cell.strip())
@@ -174,7 +174,7 @@ def _number_of_any_kind(delimiter: str) -> Callable[[str], bool]:
 
 
 def _holds_numbers_only(head: list[str], decimal: str) -> bool:
-    """Whether a row has no names: numbers, and dates beside them."""
+    """Return whether a row contains numbers and dates only, so that it has no names."""
     filled = [cell for cell in head if cell.strip()]
     others = [cell for cell in filled if not is_number(cell, decimal)]
     return len(others) < max(len(filled), 1) and all(map(is_date, others))
@@ -183,7 +183,7 @@ def _holds_numbers_only(head: list[str], decimal: str) -> bool:
 def _names_beside(
     path: Path, rows: list[list[str]], remark: str, delimiter: str, signal_map: SignalMap
 ) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
-    """Names of columns that no row holds: from the comment above the numbers, else by number where all are taken.
+    """Return column names for a table without a header row: from the comment above the numbers, or numbered.
 
     Raises:
         DataError: neither.
@@ -225,9 +225,7 @@ def _units_above(rows: list[list[str]], units: tuple[str | None, ...]) -> tuple[
 
 
 def _first_lines(path: Path) -> tuple[list[str], int, str, str | None, str]:
-    """The lines behind leading comments, how many are before them, the encoding, a delimiter that they state, and the
-    last comment.
-    """
+    """Return the lines after leading comments, the count before them, encoding, stated delimiter and last comment."""
     for size in _HEAD_BYTES:
         with path.open("rb") as stream:
             head = stream.read(size)
@@ -256,7 +254,7 @@ def _first_lines(path: Path) -> tuple[list[str], int, str, str | None, str]:
 
 
 def _rows(path: Path, lines: list[str], delimiter: str) -> tuple[list[list[str]], list[int]]:
-    """The first rows that are not empty, and how many lines end with each.
+    """Return the first rows that are not empty, and the number of lines up to each.
 
     Raises:
         DataError: a cell too long.
@@ -284,7 +282,7 @@ def _rows(path: Path, lines: list[str], delimiter: str) -> tuple[list[list[str]]
 
 
 def _delimiter(path: Path, lines: list[str]) -> str:
-    """The delimiter that splits the first lines into the same, largest number of cells."""
+    """Return the delimiter that splits the first lines into the same, largest number of cells."""
     sample = [line for line in lines[:20] if line.strip()]
     best, most = ",", 0
     for delimiter in _DELIMITERS:
@@ -300,7 +298,7 @@ def _delimiter(path: Path, lines: list[str]) -> str:
 
 
 def _delimiter_of_numbers(path: Path, lines: list[str]) -> str:
-    """The delimiter by which the later of the first lines, behind those of a logger, fall into cells of numbers."""
+    """Return the delimiter that splits the later of the first lines into numeric cells."""
     filled = [line for line in lines[:_ROWS_LOOKED] if line.strip()]
     tail = filled[len(filled) // 2 :]
     best, best_score = ",", (0.0, 0)
@@ -321,7 +319,7 @@ def _delimiter_of_numbers(path: Path, lines: list[str]) -> str:
 
 
 def _parted_by_blanks(lines: list[str]) -> bool:
-    """Whether each line holds the same number of numbers, two or more, with blanks between them."""
+    """Return whether each line has the same number of numeric cells, two or more, separated by blanks."""
     rows = [line.split() for line in lines]
     widths = {len(row) for row in rows}
     return len(widths) == 1 and max(widths) > 1 and all(is_number(cell) for row in rows for cell in row)

@@ -1,4 +1,4 @@
-"""Text exports of dSPACE ControlDesk: rows about the recording and its traces, each with its key, above the numbers.
+"""Text exports of dSPACE ControlDesk: keyed header rows about the recording and its traces above the numbers.
 
 The first cell of a row of the head is its key; rows of numbers have none, but the first. A trace without a name and
 a path is the time, in seconds, of the traces behind it; each raster has one, and slower rasters end in earlier rows.
@@ -59,7 +59,7 @@ class ControlDeskHead:
 
 
 def controldesk_head(path: Path, lines: Sequence[str], encoding: str) -> ControlDeskHead | None:
-    """The head of an export of ControlDesk; None for any other text.
+    """Return the head of a ControlDesk export; None for any other text.
 
     Args:
         path: the file.
@@ -93,7 +93,7 @@ def controldesk_head(path: Path, lines: Sequence[str], encoding: str) -> Control
 
 
 def _rows_of_head(path: Path, encoding: str, delimiter: str) -> tuple[dict[str, list[str]], list[list[str]], int]:
-    """Rows of the head by their keys, some rows of numbers, and the lines before these.
+    """Return the header rows by key, some numeric rows, and the number of lines before them.
 
     Raises:
         DataError: the head does not end, or cannot be read.
@@ -128,7 +128,7 @@ def _rows_of_head(path: Path, encoding: str, delimiter: str) -> tuple[dict[str, 
 
 
 def _told_apart(names: Sequence[str], paths: Sequence[str], times: Sequence[int]) -> tuple[str, ...]:
-    """Names of the cells of a row, each once: that of the trace, else the block in its path."""
+    """Return unique column names: the trace name, or the block name in its path if the trace name is ambiguous."""
     shared = Counter(names)
     blocks = [
         path.rstrip("/").rpartition("/")[2] or name if shared[name] > 1 or _PORT.fullmatch(name) or not name else name

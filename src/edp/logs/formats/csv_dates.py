@@ -29,7 +29,7 @@ def dates_of(cells: Sequence[str | None]) -> NDArray[np.datetime64]:
 
 
 def is_date(cell: str) -> bool:
-    """Whether a cell holds a date or a time of day with digits and signs between them, as no name does."""
+    """Return whether a cell contains a date or a time of day with digits and separators."""
     text = cell.strip()
     if not text[:1].isdigit() or not any(sign in text for sign in ":/.-"):
         return False
@@ -65,7 +65,7 @@ def _iso(cell: str | None) -> str:
 
 
 def _clock(text: str, half: str = "") -> str:
-    """A time of day as ISO 8601 has it; `half` of the day is A, P or unknown."""
+    """Convert a time of day to ISO 8601; `half` of the day is A, P or unknown."""
     match = _CLOCK.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"{text[:40]!r} is no time of day")

@@ -7,7 +7,7 @@ _LACKING = frozenset(b"\x81\x8d\x8f\x90\x9d")
 
 
 def encoding_of(head: bytes) -> str:
-    """The encoding of a text that begins with `head`, under a name that Python and pyarrow know."""
+    """Return the encoding of a text that begins with `head`, as a name known to Python and pyarrow."""
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     try:

@@ -1,4 +1,4 @@
-"""Lines of a text file that are no rows of its table: names that a restarted logger wrote anew, and what ends it."""
+"""Detection of CSV lines that are not data: header lines repeated by a restarted logger, and footers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 @dataclass(frozen=True)
 class Leftovers:
-    """What of a file is to be passed over.
+    """Lines of a file that are skipped.
 
     Attributes:
         names: lines above the table that stand within it again, without the blanks around them.
@@ -46,7 +46,7 @@ class Leftovers:
 
 
 def leftovers_of(path: Path, encoding: str, delimiter: str, skip: int, width: int) -> Leftovers:
-    """Look through a file for lines that are no rows.
+    """Search a file for lines that are not rows.
 
     Args:
         path: the file.
@@ -84,7 +84,7 @@ def _is_names(line: bytes, mark: bytes, width: int) -> bool:
 
 
 def _end_of_table(path: Path, size: int, mark: bytes, skip: int, width: int) -> int:
-    """Bytes before the last lines: from one of words in too few cells on, or a last one with control characters."""
+    """Return the size without a footer: last lines of text in too few cells, or a last line with control characters."""
     with path.open("rb") as stream:
         start = stream.seek(max(size - _TAIL_BYTES, 0))
         tail = stream.read()
@@ -118,11 +118,11 @@ class PassedText(io.RawIOBase):
         self._rest = b""
 
     def readable(self) -> bool:
-        """It is read only."""
+        """Return True, since the stream can be read."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Fill a buffer as far as there is text."""
+        """Fill a buffer with the available text."""
         while not self._rest:
             text = self._changed()
             if text is None:
@@ -139,12 +139,12 @@ class PassedText(io.RawIOBase):
         super().close()
 
     def _changed(self) -> bytes | None:
-        """The next lines as they are to be read; None at the end of the text."""
+        """Return the next lines after filtering; None at the end of the text."""
         raise NotImplementedError
 
 
 class TableText(PassedText):
-    """A text with lines of `MARK` in place of the names that stand within its table again, up to the end of the table.
+    """Text of a table with `MARK` lines in place of repeated headers, up to the end of the table.
 
     Args:
         path: the text.

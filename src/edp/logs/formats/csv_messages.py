@@ -37,7 +37,7 @@ def message_columns(table: CsvTable) -> set[int]:
 
 
 def at_own_times(table: CsvTable, column_index: int, name: str, time: Column) -> RawSignal:
-    """A column at the rows that hold a number of it."""
+    """Return a column reduced to the rows that contain a number."""
     values = load_column(table, str(column_index), table.rows)
     present = np.isfinite(values)
     values = values[present]

@@ -1,4 +1,4 @@
-"""Where the table of a text file begins: loggers write lines about themselves above it."""
+"""Detection of the first table row in a text file, below lines that a logger writes about itself."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class TablePlace:
 def find_table(
     rows: Sequence[Sequence[str]], is_number: Callable[[str], bool], is_unit_row: Callable[[list[str]], bool]
 ) -> TablePlace | None:
-    """The place of the table where lines of another kind stand above it; None where it begins with the first row.
+    """Return the position of the table below lines of another kind; None if the table begins with the first row.
 
     Args:
         rows: the first rows, cells as text.
@@ -72,7 +72,7 @@ def find_table(
 
 
 def _runs_on(row: Sequence[str], width: int, is_number: Callable[[str], bool]) -> bool:
-    """Whether names and the first numbers stand in one line, since a program forgot to end that of the names."""
+    """Return whether names and the first numbers share a line, because a line end is missing after the names."""
     names, numbers = row[:width], row[width:]
     return (
         len(numbers) == width
@@ -87,7 +87,7 @@ def _is_numeric(cells: list[str], is_number: Callable[[str], bool]) -> bool:
 
 
 def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Callable[[str], bool]) -> bool:
-    """Whether most cells of a row in the columns of numbers are numbers: text may stand for a missing value."""
+    """Return whether most cells in the numeric columns of a row are numbers. Text may replace missing values."""
     if not width <= len(row) <= width + _MOST_REMARKS or any(map(is_number, row[width:])):
         return False
     filled = [row[i] for i in columns if row[i].strip()]
@@ -95,7 +95,7 @@ def _is_data(row: Sequence[str], width: int, columns: list[int], is_number: Call
 
 
 def _may_name(row: Sequence[str], width: int, whole: Sequence[Sequence[str]], is_number: Callable[[str], bool]) -> bool:
-    """Whether a row may hold names, units or descriptions: more than half of its cells filled, none with a number."""
+    """Return whether a row may contain names, units or descriptions: half of its cells filled, without numbers."""
     ends_open = len(row) == width - 1 and not any(other[-1].strip() for other in whole)
     if width < len(row) <= width + _MOST_REMARKS:
         row = row[:width]
@@ -109,7 +109,7 @@ def _may_name(row: Sequence[str], width: int, whole: Sequence[Sequence[str]], is
 
 
 def _header_of(rows: Sequence[Sequence[str]], top: int, first: int, is_unit_row: Callable[[list[str]], bool]) -> int:
-    """Which of the rows above the numbers holds the names: the lowest that neither holds units nor describes."""
+    """Return the row with the column names: the lowest row above the numbers without units or descriptions."""
     # A row of names may pass for one of units: t, V and A are both.
     named = [top, *(row for row in range(top + 1, first) if not is_unit_row(list(rows[row])))]
     lowest = named[-1]

@@ -1,4 +1,4 @@
-"""Text exports of TwinCAT Scope: facts of channels in rows above the numbers, and one time column a group of channels.
+"""Text exports of TwinCAT Scope: header rows with channel data, and one time column per group of channels.
 
 Every row of the head begins with its key, which stands again above each time column. Times count in milliseconds from
 the start of the export, groups may have rates of their own, and rows end where slower channels have no more samples.
@@ -49,7 +49,7 @@ class ScopeHead:
 
 
 def scope_head(path: Path, lines: Sequence[str]) -> ScopeHead | None:
-    """The head of an export of TwinCAT Scope; None for any other text.
+    """Return the head of a TwinCAT Scope export; None for any other text.
 
     Args:
         path: the file.
@@ -96,7 +96,7 @@ def _time_places(steps: Sequence[str], width: int) -> list[int]:
 
 
 def _unit(cell: str) -> str | None:
-    """``V (Voltage)`` is V; ``(None)`` is none."""
+    """Return the unit of a cell: ``V (Voltage)`` is V, ``(None)`` has no unit."""
     return normalise_unit(cell.partition("(")[0])
 
 
@@ -163,7 +163,7 @@ def _numbers(path: Path, head: ScopeHead, decimal: str, encoding: str) -> NDArra
 
 
 def _count_rows(path: Path, head: ScopeHead, encoding: str) -> int:
-    """Rows of numbers: lines that are not empty, without that which says that the file ends.
+    """Count the numeric rows: lines that are not empty, without the end-of-file marker.
 
     Raises:
         DataError: a row with more cells than the head.

@@ -40,7 +40,7 @@ _BLOCK_BYTES = 1 << 24
 
 @dataclass(frozen=True)
 class TextLayout:
-    """How a text file is laid out: its columns with units, and where its numbers begin."""
+    """Layout of a text file: its columns with units, and the position of the first numeric row."""
 
     names: tuple[str, ...]
     units: tuple[str | None, ...]
@@ -52,7 +52,7 @@ class TextLayout:
 
 
 def is_number(cell: str, decimal: str = ".") -> bool:
-    """Whether a cell holds a number or nothing."""
+    """Return whether a cell is a number or empty."""
     text = cell.strip()
     if text in NULLS:
         return True
@@ -94,7 +94,7 @@ def has_decimal_commas(rows: list[list[str]], delimiter: str) -> bool:
 
 
 def _without_groups(cells: pa.Array) -> pa.Array | None:
-    """Texts as numbers, by decimal comma and points for thousands; None where one is neither a number nor missing."""
+    """Parse numbers with decimal comma and thousands points; None if a text is neither a number nor missing."""
     cells = pc.utf8_trim_whitespace(cells)
     cells = pc.if_else(pc.is_in(cells, pa.array(NULLS)), pa.scalar(None, pa.string()), cells)
     if not pc.all(pc.match_substring_regex(cells, _GERMAN)).as_py() and cells.null_count < len(cells):
@@ -104,7 +104,7 @@ def _without_groups(cells: pa.Array) -> pa.Array | None:
 
 
 def _switched(cells: pa.Array) -> pa.Array | None:
-    """States of a switch as 0 and 1; None where a text is none."""
+    """Convert switch states to 0 and 1; None if a text is not a state."""
     cells = pc.utf8_lower(pc.utf8_trim_whitespace(cells))
     missing = pc.is_in(cells, pa.array([text.lower() for text in NULLS]))
     on, off = pc.is_in(cells, pa.array(_ON)), pc.is_in(cells, pa.array(_OFF))
@@ -202,14 +202,14 @@ class CsvTable:
 
     @property
     def facts(self) -> dict[str, int]:
-        """Numbers of the first lines that are left out, by what they are."""
+        """Line numbers of the first skipped lines, by reason."""
         left_out = {TORN_LINE: self.torn_line}
         if self.leftovers is not None:
             left_out |= {NAMES_AGAIN: self.leftovers.first, BEHIND_TABLE: self.leftovers.end_line}
         return {fact: line for fact, line in left_out.items() if line is not None}
 
     def pass_over(self) -> bool:
-        """Look once for lines that are no rows of the table; whether there are some that were read as rows so far."""
+        """Search for lines that are not rows, once. Returns whether some of them were read as rows before."""
         if self.leftovers is not None or self.layout.delimiter == " ":
             return False
         layout = self.layout
@@ -217,7 +217,7 @@ class CsvTable:
         return bool(self.leftovers)
 
     def find_texts(self) -> None:
-        """Find all columns that hold text further down in one go: a parse a column would take columns times rows."""
+        """Find all columns that contain text in later rows in one pass. One parse per column would be quadratic."""
         numeric = [key for key in self.keys if self.types[key] != pa.string()]
         self.types |= dict.fromkeys(numeric, pa.string())
         texts: set[str] = set()
@@ -229,7 +229,7 @@ class CsvTable:
         self.types |= {key: pa.float64() for key in numeric if key not in texts}
 
     def options(self, keys: Sequence[str]) -> tuple[Any, Any, Any]:
-        """How pyarrow reads the wanted columns."""
+        """Return the pyarrow options for reading the given columns."""
 
         def note(row: Any) -> str:
             if not row.text.startswith(MARK):
@@ -256,14 +256,14 @@ class CsvTable:
         return read, parse, convert
 
     def source(self) -> Any:
-        """The file, its table alone, or its rows with one blank between cells where any number of blanks parts them."""
+        """Return the file, its table part, or its rows with single blanks between cells."""
         layout = self.layout
         if self.leftovers:
             return TableText(self.path, layout.skip_rows, layout.delimiter, len(layout.names), self.leftovers)
         return SqueezedText(self.path, layout.encoding, layout.skip_rows) if layout.delimiter == " " else self.path
 
     def stream(self, keys: Sequence[str]) -> Iterator[pa.RecordBatch]:
-        """Blocks of rows of the wanted columns, from the file or from what is kept."""
+        """Yield blocks of rows of the given columns, from the file or the cache."""
         if self.kept is not None:
             yield from self.kept.select(list(keys)).to_batches(max_chunksize=PIECE_ROWS)
             return
@@ -298,7 +298,7 @@ class CsvTable:
         return numbers
 
     def grouped_numbers(self, column_index: int) -> NDArray[np.float64] | None:
-        """A whole column of text as numbers with points for thousands, shape ``(rows,)``; None where it is none."""
+        """Return a text column as numbers with thousands points, shape ``(rows,)``; None if it is not numeric."""
         if self.layout.decimal != ",":
             return None
         parts = [_without_groups(batch.column(0)) for batch in self.stream([self.keys[column_index]])]
@@ -310,7 +310,7 @@ class CsvTable:
         return np.concatenate(columns) if columns else None
 
     def texts(self, column_index: int) -> list[str | None]:
-        """The cells of a column of text."""
+        """Return the cells of a text column."""
         key = self.keys[column_index]
         return [cell for batch in self.stream([key]) for cell in batch.column(key).to_pylist()]
 
@@ -344,7 +344,7 @@ class CsvTable:
             )
 
     def refuse_text(self, column_index: int) -> None:
-        """Say where a column that should hold numbers holds text."""
+        """Raise the error that names the first text in a column of numbers."""
         name, row, key = self.layout.names[column_index], self.layout.skip_rows + 1, self.keys[column_index]
         for batch in self.stream([key]):
             for cell in batch.column(key).to_pylist():

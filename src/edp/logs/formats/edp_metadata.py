@@ -1,4 +1,4 @@
-"""The facts that EDP writes into its own Parquet and MAT files, as JSON: rate, name, source, meta and channels."""
+"""Metadata that EDP writes into its Parquet and MAT files, as JSON: rate, name, source, meta and channels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edp.signals import Channel, Kind
 
 @dataclass(frozen=True)
 class EdpMetadata:
-    """What a file that EDP wrote says about itself; without `rate_hz` the file is someone else's."""
+    """Metadata of a file written by EDP; without `rate_hz` the file has another origin."""
 
     rate_hz: float | None = None
     name: str | None = None
@@ -27,7 +27,7 @@ class EdpMetadata:
     truth_digest: str | None = None
 
     def for_log(self) -> dict[str, Any]:
-        """What a `RawLog` takes of it."""
+        """Return the metadata for a `RawLog`."""
         return {
             "rate_hz": self.rate_hz,
             "name": self.name,
@@ -47,7 +47,7 @@ KNOWN = frozenset({"name", "rate_hz", "source", "meta", "channels", "digest", "t
 
 
 def facts_text(recording: Recording, truth: Recording | None = None) -> str:
-    """A recording's facts as JSON, with those of the channels that the file holds apart."""
+    """Return the metadata of a recording as JSON, with separate entries for the ground truth."""
     facts = {
         "name": recording.name,
         "rate_hz": recording.rate_hz,
@@ -114,7 +114,7 @@ def _check_texts(texts: Sequence[str]) -> None:
 
 
 def _check_depth(value: Any) -> None:
-    """Refuse what is nested so deep that writing it again would end in an error of the stack."""
+    """Refuse values nested so deeply that writing them again would overflow the stack."""
     # Level by level: a recursive walk would end in the very error that is looked for.
     level = [value]
     for _ in range(DEEPEST):

@@ -48,7 +48,7 @@ class MatFormat:
     libraries = ("edp.logs.formats.matlab.unpacking",)
 
     def claims(self, head: bytes) -> bool:
-        """The text header of v5 and v7.3 (also when cut off), or the numbers of a v4 header."""
+        """Return whether the head is the text header of v5 or v7.3 (possibly cut off) or a v4 header."""
         if any(head.startswith(magic) or magic.startswith(head) for magic in MAGIC):
             return True
         return is_v4(head)
@@ -87,7 +87,7 @@ class MatFormat:
         return _raw_log(path, mat_variables, edp_metadata, signal_map)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
-        """Write the variables of the wanted layout, and ``edp_info``, a JSON text with units and facts."""
+        """Write the variables in the requested layout, and ``edp_info``, a JSON text with units and metadata."""
         if options.mat_version not in _VERSIONS:
             closest_version = closest(options.mat_version, _VERSIONS)
             raise DataError(f"MAT version '{options.mat_version}' cannot be written{closest_version}")

@@ -1,4 +1,4 @@
-"""How a recording is laid out in a MAT file; one entry a layout."""
+"""Layouts of a recording in a MAT file, one entry per layout."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STORAGE = "Simulink.SimulationData.Storage.RamDatasetStorage"
 
 @dataclass(frozen=True)
 class MatLayout:
-    """How a recording becomes variables.
+    """Conversion of a recording to MATLAB variables.
 
     Attributes:
         build: makes the value of `variable`.
@@ -36,7 +36,7 @@ class MatLayout:
     stamps: str = ""
 
     def variables(self, recording: Recording) -> dict[str, Any]:
-        """The variables of a file."""
+        """Return the variables of a file."""
         mat_values = {self.variable: self.build(recording)}
         return mat_values | {self.stamps: _time(recording)} if self.stamps else mat_values
 
@@ -45,7 +45,7 @@ LAYOUTS: Registry[MatLayout] = Registry("MAT layout")
 
 
 def _struct(recording: Recording) -> Any:
-    """A struct of column vectors, ``log.time`` in seconds and one field per channel in SI units."""
+    """Return a struct of column vectors: ``log.time`` in seconds and one field per channel in SI units."""
     fields: dict[str, Any] = {"time": _time(recording)}
     for name in recording.channel_names:
         fields[name] = np.ascontiguousarray(recording.column(name)).reshape(-1, 1)
@@ -83,22 +83,22 @@ def _one_timeseries(recording: Recording, name: str, unit: str, values: Any) -> 
 
 
 def _timeseries(recording: Recording) -> Any:
-    """A struct with one ``timeseries`` per channel."""
+    """Return a struct with one ``timeseries`` per channel."""
     return {name: _one_timeseries(recording, name, *rest) for name, *rest in _columns(recording)}
 
 
 def _dataset(recording: Recording) -> Any:
-    """A ``Simulink.SimulationData.Dataset`` of ``timeseries``."""
+    """Return a ``Simulink.SimulationData.Dataset`` of ``timeseries``."""
     return _dataset_of(recording, _columns(recording))
 
 
 def _logsout(recording: Recording) -> Any:
-    """The same with the vectors that a model logs: ``CylVels`` of three columns."""
+    """Return a Dataset with the vector signals that a model logs: ``CylVels`` has three columns."""
     return _dataset_of(recording, _vectors(recording))
 
 
 def _vector_struct(recording: Recording) -> Any:
-    """A struct with ``time`` in seconds and one field per signal, vectors as matrices."""
+    """Return a struct with ``time`` in seconds and one field per signal; vectors are matrices."""
     return {"time": _time(recording)} | {name: values for name, _, values in _vectors(recording)}
 
 
@@ -145,7 +145,7 @@ def _dataset_of(recording: Recording, signals: list[tuple[str, str, Any]]) -> An
 
 
 def _saved(classname: str, fields: dict[str, Any]) -> MatlabOpaque:
-    """An object as its ``saveobj`` leaves it: a single property ``any`` that holds a struct."""
+    """Return an object as its ``saveobj`` stores it: a single property ``any`` with a struct."""
     struct = np.empty((1, 1), dtype=[(name, object) for name in fields])
     for name, value in fields.items():
         struct[0, 0][name] = value
@@ -153,7 +153,7 @@ def _saved(classname: str, fields: dict[str, Any]) -> MatlabOpaque:
 
 
 def _timetable(recording: Recording) -> Any:
-    """A ``timetable`` with one variable per channel."""
+    """Return a ``timetable`` with one variable per channel."""
     from edp.logs.formats.matlab.library import pandas as pd
 
     # Whole nanoseconds, as pandas counts durations, which are the row times of a timetable.

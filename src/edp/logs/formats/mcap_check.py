@@ -1,4 +1,4 @@
-"""Whether the records of an MCAP file fit into it, looked at before a library takes their sizes as they are.
+"""Check that the records of an MCAP file fit into it, before a library relies on their sizes.
 
 Layout: magic, then records of an operation code (1 byte), a length (8) and content, then magic again.
 """
@@ -67,7 +67,7 @@ def _walk(path: Path, view: mmap.mmap | memoryview, size: int) -> None:
 
 
 class _Walk:
-    """The records one after the other, and what they announce together."""
+    """Traversal of the records, which adds up the announced sizes."""
 
     def __init__(self, path: Path, view: mmap.mmap | memoryview) -> None:
         self.path = path
@@ -93,7 +93,7 @@ class _Walk:
                 self.announced = max(self.announced, messages)
 
     def chunk(self, at: int, length: int) -> None:
-        """Times (16 bytes), size unpacked (8), checksum (4), name of the packing, size packed (8), content."""
+        """Check a chunk: times (16 bytes), unpacked size (8), checksum (4), compression, packed size (8), content."""
         if length < 40:
             raise _broken(self.path, f"has at byte {at} a chunk of {length} bytes")
         start, stop, unpacked, _, named = struct.unpack_from("<QQQII", self.view, at)
@@ -105,7 +105,7 @@ class _Walk:
         self.weigh(at, start, stop, packed, unpacked)
 
     def index(self, at: int, length: int) -> None:
-        """Times (16 bytes), place and length of the chunk (16), then lists, and at the end both sizes (16)."""
+        """Check a chunk index: times (16 bytes), position and length of the chunk (16), lists, and both sizes (16)."""
         if length < 64:
             raise _broken(self.path, f"has at byte {at} an index of {length} bytes")
         start, stop, chunk_offset, _ = struct.unpack_from("<QQQQ", self.view, at)

@@ -1,4 +1,4 @@
-"""MCAP files whose messages are JSON, as recorders without ROS write them; those of `edp live --record` among them.
+"""MCAP files with JSON messages, as written by recorders without ROS and by `edp live --record`.
 
 A column is a number in the messages of a topic, named as in bags: ``/topic.path.of.field``, elements of lists from 1.
 Nothing of a file is taken on trust: records are walked within their bounds (`mcap_check`), chunks are unpacked to the
@@ -59,7 +59,7 @@ class _Topic:
     facts: str = ""
 
     def take(self, at_ns: int, values: dict[str, float], where: str) -> None:
-        """A message's numbers; what it lacks is missing, and so is what earlier ones lacked."""
+        """Add the numbers of a message; missing values become NaN, also for earlier messages without the column."""
         rows = len(self.at_ns)
         for name, value in values.items():
             column = self.columns.get(name)
@@ -76,7 +76,7 @@ class _Topic:
 
 
 def holds_json(path: Path) -> bool:
-    """Whether an MCAP file is one of messages in JSON: its profile is none of ROS.
+    """Return whether an MCAP file has JSON messages: its profile is not a ROS profile.
 
     Raises:
         DataError: the file is cut off within its header.
@@ -181,7 +181,7 @@ def _message(path: Path, body: memoryview, by_number: dict[int, _Topic]) -> int:
 
 
 def _flatten(name: str, value: Any, values: dict[str, float], where: str) -> None:
-    """The numbers within a value, by their paths; null is a number that is missing. Depth is bounded by the parser."""
+    """Collect the numbers in a value by their paths; null is a missing number. The parser limits the depth."""
     if isinstance(value, dict):
         for key, inner in value.items():
             _flatten(f"{name}.{key}" if name else key, inner, values, where)
@@ -217,7 +217,7 @@ def _walk(view: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _unpacked(path: Path, body: memoryview) -> bytes | memoryview:
-    """Records of a chunk, at most as many bytes as it announces (`mcap_check` has weighed them)."""
+    """Return the records of a chunk, at most as many bytes as it announces (`mcap_check` has checked the size)."""
     size, _, named = struct.unpack_from("<QII", body, 16)
     packing = bytes(body[32 : 32 + named]).decode()
     packed = body[40 + named :]

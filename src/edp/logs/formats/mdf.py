@@ -57,7 +57,7 @@ class MdfFormat:
         return head.startswith(_MAGIC)
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
-        """Read names, units and groups; values and times are read when asked for."""
+        """Read names, units and groups; values and times are read on demand."""
         asammdf = _library()
         # Before the library opens the file, which follows every link.
         check_blocks(path)
@@ -86,11 +86,11 @@ class MdfFormat:
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
-        """Write one channel group of float32 with the time in s, packed, and EDP's facts as an attachment."""
+        """Write one packed channel group of float32 with the time in s, and EDP's metadata as an attachment."""
         self.write_with_events(recording, path, ())
 
     def write_with_events(self, recording: Recording, path: Path, events: Sequence[LogEvent]) -> None:
-        """The same with event blocks.
+        """Write the recording with event blocks.
 
         Raises:
             DataError: too many events.
@@ -151,7 +151,7 @@ class _File:
         return EdpMetadata()
 
     def group(self, number: int, edp_metadata: EdpMetadata, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
-        """The channels of one group that hold numbers, each with its full name."""
+        """Return the numeric channels of one group, each with its full name."""
         group = self.log.groups[number]
         samples = int(group.channel_group.cycles_nr)
         master = self.log.masters_db.get(number)
@@ -237,7 +237,7 @@ def _plain(signal: Any) -> NDArray[Any]:
 
 
 def _valid(signal: Any, values: NDArray[Any]) -> NDArray[Any]:
-    """The values, NaN where the file marks them as invalid."""
+    """Return the values with NaN where the file marks them as invalid."""
     if signal.invalidation_bits is None:
         return values
     invalid = np.asarray(signal.invalidation_bits, dtype=np.bool_)
@@ -245,7 +245,7 @@ def _valid(signal: Any, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _embedded(attachment: Any, where: str) -> bytes:
-    """The bytes of an attachment inside the file, unpacked to `_FACTS_BYTES` and no further; no other file is opened.
+    """Return the bytes of an attachment inside the file, unpacked up to `_FACTS_BYTES`; no other file is opened.
 
     Raises:
         DataError: the attachment lies outside the file, is packed in another way than deflate, or is too large.
@@ -276,7 +276,7 @@ def _advice(log: Any) -> str:
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """The library meets damaged bytes with any exception there is; every one means the same to the user."""
+    """Convert any exception of the library on damaged bytes into one DataError."""
     logger = logging.getLogger("asammdf")
     level = logger.level
     # The library logs each defect with its stack; the message to the user says it once.

@@ -139,7 +139,7 @@ class _Walk:
         return self.blocks[at]
 
     def numbers(self, block: _Block) -> None:
-        """Counts and sizes that the library takes as they are."""
+        """Check counts and sizes on which the library relies."""
         if block.id == b"##DZ":
             _, _, _, _, original, packed = struct.unpack_from("<2sBBIQQ", self.view, block.data_at)
             # 64 bytes more: the head of a packed stream weighs in the shortest ones.
@@ -152,7 +152,7 @@ class _Walk:
             self.group(block)
 
     def unpack(self, block: _Block, packed: int, original: int) -> None:
-        """The library unpacks to wherever the content leads; this goes no further than what is announced."""
+        """Unpack a block to at most its announced size; the library itself has no limit."""
         kind = struct.unpack_from("<2sBBIQQ", self.view, block.data_at)[1]
         if kind >= len(_PACKINGS):
             raise self.broken(block.at, f"a block packed in a way {kind} that is not known")
@@ -200,12 +200,12 @@ class _Walk:
         return seen[at]
 
     def text_of(self, block: _Block) -> int:
-        """Bytes of text that a block links to."""
+        """Return the number of text bytes linked from a block."""
         targets = [self.block(link) for link in block.links if link] if block.id in _NAMED else []
         return sum(target.length for target in targets if target.id in (b"##TX", b"##MD"))
 
     def group(self, group: _Block) -> None:
-        """A sorted data group: its records fill its data, and its channels lie inside a record."""
+        """Check a sorted data group: its records fill its data, and its channels fit into a record."""
         first = group.links[1]
         if not first:
             return

@@ -116,7 +116,7 @@ class Conversion:
         return out
 
     def _entries(self, raw: NDArray[Any]) -> NDArray[np.intp]:
-        """The place of each value in the table, -1 for the default."""
+        """Return the table index of each value, -1 for the default."""
         count = len(self.inner)
         if self.kind == _RANGE_TEXTS:
             lower, upper = (np.array([self.block[f"{end}_{i}"] for i in range(count)]) for end in _ENDS)
@@ -131,7 +131,7 @@ _ENDS = ("lower", "upper")
 def _in_ranges(
     lower: NDArray[np.float64], upper: NDArray[np.float64], raw: NDArray[Any], closed: bool | None = None
 ) -> NDArray[np.intp]:
-    """Which range each value lies in, -1 for none.
+    """Return the index of the range that contains each value, -1 if there is none.
 
     ASAM: the upper end belongs to a range (`closed`) of integers, not to one of floats.
     """
@@ -177,7 +177,7 @@ def _interpolated(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
 
 
 def _nearest(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
-    """The entry nearest to the value; the lower one half way."""
+    """Return the entry nearest to the value; the lower one at half distance."""
     keys, physical = _pairs(block)
     x = raw.astype(np.float64)
     above = np.minimum(np.searchsorted(keys, x), len(keys) - 1)

@@ -1,4 +1,4 @@
-"""Events of MDF 4: stretches of time with a name and a text, which measurement tools mark along the signals."""
+"""Events of MDF 4: named time intervals with a text, which measurement tools mark along the signals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SECONDS, _BY_TOOL = 1, 2
 
 @dataclass(frozen=True)
 class LogEvent:
-    """A stretch of a recording.
+    """Time interval of a recording with a name and a text.
 
     Attributes:
         name: a few words, shown along the signals.
@@ -49,7 +49,7 @@ class LogEvent:
 
 
 def event_blocks(events: Sequence[LogEvent]) -> list[Any]:
-    """Blocks of asammdf, the beginning and the end of each event, in the order of their numbers in the file.
+    """Return the asammdf blocks of the begin and end of each event, in file order.
 
     Raises:
         DataError: more than `MOST_EVENTS`.

@@ -1,4 +1,4 @@
-"""Formulas of MDF 4 (algebraic conversions), read by an own parser: nothing of a file's text is ever evaluated as code.
+"""Parser for formulas of MDF 4 (algebraic conversions). Text of a file is never evaluated as code.
 
 Grammar, after ASAM MCD-2 MC: numbers, the raw value ``X`` (also ``X1``), ``+ - * /``, power (``^``, also ``**``),
 signs, parentheses and the functions of `FUNCTIONS`, upper and lower case alike. Powers bind tighter than signs, and a
@@ -56,7 +56,7 @@ _TWO = frozenset({"pow"})
 
 
 class FormulaError(ValueError):
-    """A text that is no formula of the grammar."""
+    """Text that does not follow the formula grammar."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class _Parser:
         return self.steps
 
     def next_is(self, *signs: str) -> str | None:
-        """The next token where it is one of some signs, taken."""
+        """Consume and return the next token if it is one of the signs."""
         if self.at < len(self.tokens):
             kind, text = self.tokens[self.at]
             if kind == "sign" and text in signs:
@@ -169,7 +169,7 @@ class _Parser:
             self.steps.append(sign)
 
     def signed(self) -> None:
-        """A power with a sign before it; ``-X^2`` is ``-(X^2)``."""
+        """Parse a power with an optional sign; ``-X^2`` is ``-(X^2)``."""
         if sign := self.next_is("+", "-"):
             self.deeper()
             self.signed()

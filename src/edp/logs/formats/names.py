@@ -45,14 +45,14 @@ def told_apart(named_signals: Sequence[tuple[str, RawSignal]]) -> Named:
 
 
 def name_of_file(path: Path) -> str:
-    r"""The name of a recording from that of its file; bytes that are not UTF-8 stand as ``\xff``."""
+    r"""Return the name of a recording from its file name; bytes that are not UTF-8 become ``\xff``."""
     return path.stem.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def only(
     chosen_names: Iterable[str], signals: Mapping[str, RawSignal], repeated: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, RawSignal], dict[str, list[str]]]:
-    """The wanted columns of a log, in that order, and the names that several of them have."""
+    """Return the selected columns of a log in the given order, and the names shared by several of them."""
     chosen_signals = {name: signals[name] for name in chosen_names if name in signals}
     among = {name: [full for full in several if full in chosen_signals] for name, several in repeated.items()}
     return chosen_signals, {name: several for name, several in among.items() if len(several) > 1}
@@ -63,5 +63,5 @@ SHOWN = 80
 
 
 def shown_name(name: str) -> str:
-    """A name of a file in quotes for a message: shortened, with control characters as escapes."""
+    """Return a quoted name for a message: shortened, with control characters escaped."""
     return repr(name if len(name) <= SHOWN else name[: SHOWN - 3] + "...")

@@ -66,7 +66,7 @@ class ParquetFormat:
         return head.startswith(_MAGIC)
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
-        """Read the footer; each column is read from disk when its values are asked for."""
+        """Read the footer; each column is read from disk on demand."""
         with path.open("rb") as stream:
             stream.seek(0, 2)
             # The footer is written last: its magic number at the end tells a whole file.
@@ -92,7 +92,7 @@ class ParquetFormat:
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
-        """Write float32 columns in groups of rows; there is no time column: row k is at k / rate_hz."""
+        """Write float32 columns in row groups without a time column: row k is at k / rate_hz."""
         fields = [
             pa.field(
                 channel.name,
@@ -157,7 +157,7 @@ class _Table:
         self.weigh()
 
     def weigh(self) -> None:
-        """Refuse what a small file claims to hold: runs of equal values pack without end.
+        """Refuse a file that announces more data than memory allows, since runs of equal values compress without limit.
 
         Raises:
             DataError: more rows, or more values of lists, than the bytes of the file can mean or memory can take.
@@ -192,7 +192,7 @@ class _Table:
             )
 
     def batches(self, places: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, list[pa.Array]]]:
-        """The row that a batch begins with, and the columns at some places; groups of rows outside are not read."""
+        """Yield the first row of each batch and its columns; row groups outside the range are not read."""
         names = self.schema.names
         groups, first, skipped = [], 0, 0
         for number in range(self.file.metadata.num_row_groups):
@@ -227,7 +227,7 @@ class _Table:
 
 
 def _by_name(names: Sequence[str]) -> dict[str, list[int]]:
-    """Where the columns of each name lie: names that occur twice keep their order."""
+    """Return the column positions of each name; duplicate names keep their order."""
     places: dict[str, list[int]] = {}
     for field_index, name in enumerate(names):
         places.setdefault(name, []).append(field_index)
@@ -264,7 +264,7 @@ class _Clock:
 
 
 def _clocks(table: _Table, signal_map: SignalMap) -> dict[int, _Clock]:
-    """The clock of each column: one for all, or, as Simulink may write it, each signal's own column of time."""
+    """Return the clock of each column: one common clock, or the time column of each signal, as Simulink writes it."""
     names = table.schema.names
     time_of_field = {} if signal_map.time or signal_map.sample_time_s else _times_of_fields(table.schema)
     if len(set(time_of_field.values())) > 1:
@@ -283,7 +283,7 @@ def _clocks(table: _Table, signal_map: SignalMap) -> dict[int, _Clock]:
 
 
 def _times_of_fields(schema: pa.Schema) -> dict[int, int]:
-    """Columns that have a time column of their own: ``X_time`` beside ``X``, or the nearest ``time`` to the left."""
+    """Return columns with their own time column: ``X_time`` for ``X``, or the nearest ``time`` to the left."""
     names = [name.lower() for name in schema.names]
     first: dict[str, int] = {}
     for i, name in enumerate(names):
@@ -304,7 +304,7 @@ def _times_of_fields(schema: pa.Schema) -> dict[int, int]:
 
 
 def _signals(table: _Table, field_index: int, field: pa.Field, clock: _Clock | None) -> list[tuple[str, RawSignal]]:
-    """The columns of one field: itself, or the elements of its lists."""
+    """Return the columns of one field: the field itself, or the elements of its lists."""
     if _is_number(field.type):
         parts = [(field.name, str(field_index))]
     elif _is_list(field.type):
@@ -348,7 +348,7 @@ def _width(table: _Table, field_index: int) -> int:
 
 
 def _stamps(table: _Table, field_index: int, signal_map: SignalMap) -> Column:
-    """Time in seconds from a column of numbers, time stamps or durations; NaN where there is none."""
+    """Return time in seconds from a column of numbers, time stamps or durations; NaN for missing entries."""
     field = table.schema.field(field_index)
     if _is_time(field.type):
         numbers = table.whole(field_index).to_numpy(zero_copy_only=False)

@@ -44,18 +44,18 @@ _MOST_STEPS = 100_000
 
 
 class LongMessageError(DataError):
-    """A message with more numbers than samples of signals have: a plan, a map or a cloud."""
+    """Message with more numbers than signal samples have, such as a plan, a map or a point cloud."""
 
 
 class Types(Protocol):
-    """What is needed of a store of message types."""
+    """Part of the interface of a message type store."""
 
     fielddefs: Mapping[str, tuple[Any, Sequence[tuple[str, Any]]]]
 
 
 @dataclass
 class MessageLayout:
-    """Where the numbers of a message lie.
+    """Positions of the numbers in a message.
 
     Attributes:
         fields: path of each number, such as ``twist.linear.x`` or ``data_1``, with its first byte and dtype.
@@ -151,7 +151,7 @@ class _Walk:
         return []
 
     def several(self, kind: Any, count: int, path: str, names: list[str], depth: int) -> list[str]:
-        """A list: numbers are named by the list of names beside them, else counted from 1."""
+        """Visit a list. Numbers are named by the accompanying list of names, otherwise counted from 1."""
         plain = int(kind[0]) == _BASE
         if not plain and count > _MOST_STEPS:
             raise DataError(f"a list of {count} messages in a message")
@@ -193,7 +193,7 @@ class _Walk:
         self.at += size
 
     def skip_text(self, kind: str) -> None:
-        """A text of its own may change from message to message where its length does not."""
+        """Skip a text, whose content may change from message to message if its length does not."""
         before = len(self.layout.fixed)
         self.text(kind)
         # The length stays among the fixed bytes, since it decides where all later fields lie.

@@ -53,7 +53,7 @@ class BagFormat:
         return head.startswith(self.magic)
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
-        """Read topics, types and each topic's first message; the others when their values are asked for."""
+        """Read topics, types and the first message of each topic; other messages are read on demand."""
         if self.name == "mcap" and is_file_at(path) and holds_json(path):
             return read_json_mcap(path)
         column_names = {entry.column for entry in signal_map.channels} or set(VOCABULARY)
@@ -77,7 +77,7 @@ class BagFormat:
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
-        """Write a topic of one message a sample, float32, and EDP's facts as a topic of text."""
+        """Write one topic with one float32 message per sample, and EDP's metadata as a text topic."""
         write_bag(recording, path, self.name)
 
 
@@ -175,7 +175,7 @@ class _Collected:
 
 
 class _Topic:
-    """The messages of one topic: a table of its numbers."""
+    """Messages of one topic as a table of numbers."""
 
     def __init__(self, bag: _Bag, name: str, connections: list[Any]) -> None:
         self.bag = bag
@@ -236,7 +236,7 @@ class _Topic:
         return columns_of(raws, paths, self.kind, self.types, self.bag.cdr)
 
     def stamps(self) -> Column:
-        """Seconds since the bag's first message: of the headers where they state time, else of the log."""
+        """Seconds since the first message of the bag, by the message headers if they state time, or by the log."""
         if self._stamps is None and self.wanted_paths():
             _ = self.bag.together
         if self._stamps is None:
@@ -246,7 +246,7 @@ class _Topic:
         return self._stamps
 
     def take(self, log_ns: NDArray[np.int64], columns: list[NDArray[Any]], paths: list[str]) -> None:
-        """Keep what a scan found."""
+        """Store the result of a scan."""
         self.check_count(len(log_ns))
         seconds = np.zeros(0)
         if len(self.stamp_paths) == 2:
@@ -300,7 +300,7 @@ def _close(reader: Any) -> None:
 
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
-    """The library meets damaged bytes with any exception there is; every one means the same to the user."""
+    """Convert any exception of the library on damaged bytes into one DataError."""
     try:
         yield
     except ImportError as error:

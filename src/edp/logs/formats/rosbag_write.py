@@ -1,4 +1,4 @@
-"""Writing a recording as messages: one topic with a message a sample, one with EDP's facts."""
+"""Writer for bags: one topic with one message per sample, and one with EDP's metadata."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _fill(writer: Any, recording: Recording, distribution: str, cdr: bool) -> No
 
 
 def _messages(values: NDArray[np.float32], at_ns: NDArray[np.int64], start: int, cdr: bool) -> Iterator[bytes]:
-    """Serialised messages: a header with stamp and empty frame, then the values."""
+    """Yield serialised messages: a header with stamp and empty frame, then the values."""
     seconds, nanoseconds = np.divmod(at_ns, 1_000_000_000)
     if cdr:
         # 4 bytes of encoding, stamp, an empty text (its length counts the zero behind it) and 3 bytes to align.

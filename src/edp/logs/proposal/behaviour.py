@@ -1,4 +1,4 @@
-"""What numbers of columns say: time, counters, constants, steps, and which columns follow from others."""
+"""Statistics of numeric columns: time, counters, constants, steps, and dependencies between columns."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _LEAST_STEPS, _MOST_LOST = 50, 5
 
 @dataclass(frozen=True)
 class Behaviour:
-    """What the numbers of one column say.
+    """Statistics of one numeric column.
 
     Attributes:
         filled: share of rows that hold a number.
@@ -81,12 +81,12 @@ class Behaviour:
 
     @property
     def counts(self) -> bool:
-        """Rows are numbered, or parts of the log are: whole numbers that rise by one."""
+        """Whether the column is a counter: whole numbers that rise by one."""
         return self.whole and self.rises and not self.constant and abs(self.step - 1.0) < 1e-9
 
     @property
     def beside(self) -> bool:
-        """A few numbers in some rows on end, as a list of results that was written next to the table."""
+        """Whether only a few consecutive rows are filled, as in a list of results written next to the table."""
         return 0 < self.filled < _REMARKS_FILL and self.spanned < _REMARKS_SPAN
 
     @property
@@ -162,7 +162,7 @@ def _loses_rows(moving: Column) -> bool:
 
 @dataclass(frozen=True)
 class Relation:
-    """How a column follows from another one.
+    """Dependency of a column on another one.
 
     Attributes:
         how: ``change`` (its change in time), ``copy`` or ``reference`` (what the other one follows).
@@ -178,7 +178,7 @@ class Relation:
 
 
 def relations_of(columns: list[LogColumn]) -> dict[str, Relation]:
-    """The strongest relation of each column that has one, by name; among the first `RELATED` columns."""
+    """Return the strongest dependency of each column that has one, by name, among the first `RELATED` columns."""
     chosen = columns[:RELATED]
     found_relations: dict[str, Relation] = {}
     for column in chosen:
@@ -216,7 +216,7 @@ def _relation(column: LogColumn, other: LogColumn) -> Relation | None:
 
 
 def repeats(column: LogColumn, other: LogColumn) -> bool:
-    """Whether nothing in a log speaks against a column saying what another one does, in another unit."""
+    """Return whether a column can be a copy of another one in another unit."""
     own, theirs = column.pieces[0], other.pieces[0]
     if len(own) != len(theirs):
         return False
@@ -243,7 +243,7 @@ def _correlation(a: Column, b: Column) -> float:
 
 
 def _differ_by_rounding(own: Column, theirs: Column) -> bool:
-    """Whether a column is a scaled other one but for the last digits with which both were written."""
+    """Return whether a column equals a scaled copy of another one up to the last printed digits."""
     # Encoders side by side agree to a count, too: only columns of many counts tell.
     many = min(np.ptp(own) / _last_digit(own), np.ptp(theirs) / _last_digit(theirs)) > _MANY_COUNTS
     return bool(many) and _rounded_apart(own, theirs)
@@ -256,7 +256,7 @@ def _rounded_apart(own: Column, theirs: Column) -> bool:
 
 
 def _last_digit(values: Column) -> float:
-    """The least difference between two values that are not the same."""
+    """Return the smallest difference between distinct values."""
     steps = np.diff(np.unique(values))
     # Binary rounding makes differences far below the last printed digit.
     steps = steps[steps > 1e-9 * max(float(np.abs(values).max()), 1e-300)]
@@ -302,7 +302,7 @@ def _leads(own: Column, theirs: Column, level: float) -> bool:
 
 
 def is_steered_by(command: LogColumn, reference: LogColumn, measured: LogColumn) -> bool:
-    """Whether a column is what a controller makes of a reference and what follows it: gain, damping and offset."""
+    """Return whether a column is a controller output: gain, damping and offset of reference and measurement."""
     own, target, actual = (column.pieces[0] for column in (command, reference, measured))
     if not len(own) == len(target) == len(actual) or len(own) < 100:
         return False

@@ -1,4 +1,4 @@
-"""Which column tells the time of rows, in which unit, and how sure that is."""
+"""Detection of the time column of a log, its unit and the certainty."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ClockGuess:
 
 
 def clock_of(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
-    """The time of the rows of a log."""
+    """Determine the time of the rows of a log."""
     if look.rate_hz is not None:
         return _brought_down(ClockGuess(None, "s", None, look.rate_hz, confidence=1.0), look.rows)
     if look.time is None and look.step_s is not None:
@@ -69,7 +69,7 @@ def clock_of(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
 
 
 def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
-    """The column of stamps: that of the reader, one named so, or the first of an even rise at the front."""
+    """Return the column of time stamps: stated by the reader, recognised by name, or the first evenly rising one."""
     rising = [
         c
         for c in look.columns
@@ -94,13 +94,13 @@ def _time_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColum
 
 
 def _begins_anew(column: LogColumn, behaviour: Behaviour) -> bool:
-    """Whether stamps that are named so rise but for a few restarts; where they are even, rows count without them."""
+    """Return whether stamps recognised by name rise except for a few restarts. Even stamps are counted without them."""
     few = 0 < behaviour.falls <= _MOST_RESTARTS
     return few and not behaviour.even and (behaviour.steady or behaviour.lossy) and is_time_name(column.name)
 
 
 def _behind(column: LogColumn, look: LogLook, behaviours: Mapping[str, Behaviour]) -> LogColumn | None:
-    """The column behind one that numbers the rows, where it climbs as a clock does."""
+    """Return the column after a row counter, if it rises like a clock."""
     next_index = look.columns.index(column) + 1
     second = look.columns[next_index] if next_index < len(look.columns) else None
     if second is None or not behaviours[second.name].climbs or behaviours[second.name].counts:
@@ -109,12 +109,12 @@ def _behind(column: LogColumn, look: LogLook, behaviours: Mapping[str, Behaviour
 
 
 def _ticks(behaviour: Behaviour) -> bool:
-    """Whether a rise may be that of a clock: stamps that were printed with few digits repeat for some rows."""
+    """Return whether a column can be a clock. Stamps printed with few digits repeat over some rows."""
     return behaviour.holds < 0.5 or (behaviour.holds < _PRINTED and behaviour.levels > _MANY_STAMPS)
 
 
 def _fronts(look: LogLook) -> list[LogColumn]:
-    """The first column of the log, and that of each matrix in it (``data_1`` beside ``data_2``)."""
+    """Return the first column of the log and of each matrix in it (``data_1`` followed by ``data_2``)."""
     names = set(look.names)
     first = [c for c in look.columns if c.name.endswith("_1") and f"{c.name[:-1]}2" in names]
     return [*look.columns[:1], *(column for column in first if column is not look.columns[0])]
@@ -133,7 +133,7 @@ def _of_column(column: LogColumn, behaviour: Behaviour, look: LogLook) -> ClockG
 
 
 def _unit(column: LogColumn, behaviour: Behaviour) -> tuple[str, float, str]:
-    """Unit of stamps, how sure, and what to check."""
+    """Return the unit of the stamps, its certainty, and what to check."""
     stated = time_factor(column.name, column.unit, SignalMap())
     ending = column.name.lower().rpartition("_")[2]
     if column.unit or ending in TIME_UNITS:
@@ -153,7 +153,7 @@ def _unit(column: LogColumn, behaviour: Behaviour) -> tuple[str, float, str]:
 
 
 def _without_column(look: LogLook, behaviours: Mapping[str, Behaviour]) -> ClockGuess:
-    """Rows without a time column: a stated step, a clock that begins anew, or nothing at all."""
+    """Determine the time of rows without a time column: a stated step, a restarting clock, or unknown."""
     for column in look.columns:
         behaviour = behaviours[column.name]
         if behaviour.constant and behaviour.high > 0 and is_sample_time_name(column.name):

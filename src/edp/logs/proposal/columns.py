@@ -1,4 +1,4 @@
-"""The columns of a log as they are, a bounded part of each: what a proposal is made from."""
+"""Bounded part of the columns of a log, from which a map is proposed."""
 
 from __future__ import annotations
 
@@ -72,13 +72,13 @@ class LogColumn:
 
     @property
     def values(self) -> Column:
-        """All values that are kept, shape ``(rows,)``."""
+        """All stored values, shape ``(rows,)``."""
         return np.concatenate(self.pieces)
 
 
 @dataclass(frozen=True, eq=False)
 class LogLook:
-    """What was looked at of a log.
+    """Part of a log that was read for a proposal.
 
     Attributes:
         path: the log.
@@ -109,7 +109,7 @@ class LogLook:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns of numbers."""
+        """Names of the numeric columns."""
         return tuple(column.name for column in self.columns)
 
 
@@ -143,7 +143,7 @@ def names_in_log(path: Path) -> frozenset[str]:
 
 @contextmanager
 def _bounded(path: Path, most: int) -> Iterator[tuple[Path, str]]:
-    """The log itself, or a file with the first lines of a text of more than some bytes."""
+    """Yield the log itself, or a temporary file with the first lines of a large text file."""
     size = status_of(path).st_size if is_file_at(path) else 0
     if size <= most or format_for(path).name != "csv":
         yield path, ""
@@ -205,7 +205,7 @@ def _look(path: Path, part: Path, note: str, experiment: str | None) -> LogLook:
 
 
 def _of_the_machine(raw: RawLog) -> RawLog:
-    """A log without what its programs report about themselves; whole where there is nothing else."""
+    """Return the log without the status columns of the logging program, unless it has no others."""
     own = {name: signal for name, signal in raw.signals.items() if not name.startswith(_OF_THE_LOGGER)}
     return replace(raw, signals=own) if own else raw
 
@@ -215,7 +215,10 @@ def _is_time_word(name: str) -> bool:
 
 
 def _of_own_pace(path: Path, part: Path, note: str, signal_map: SignalMap) -> LogLook | None:
-    """A log whose signals have times of their own and differ in rate, at the times of the fastest; None for others."""
+    """Return a log whose signals have their own times at different rates, resampled to the fastest.
+
+    None for other logs.
+    """
     try:
         timed = _of_the_machine(open_log(part, signal_map))
     except DataError:
@@ -259,7 +262,7 @@ def _of_own_pace(path: Path, part: Path, note: str, signal_map: SignalMap) -> Lo
 
 
 def _clocks_of(signals: Sequence[RawSignal]) -> dict[str, Clock]:
-    """What the time stamps of signals say, by name; without those that reading refuses, in its own words."""
+    """Return the clock of each signal by name, without signals that cannot be read."""
     clocks: dict[str, Clock] = {}
     judged: dict[int, tuple[Column, Clock]] = {}
     for signal in signals:
@@ -287,7 +290,7 @@ def _step_s(signal: RawSignal) -> float:
 
 
 def _held(signal: RawSignal, stamps: Column) -> Column:
-    """The latest value at each of some times; the first one before it has any."""
+    """Return the latest value at each given time; the first value before that."""
     values = np.asarray(signal.load(), dtype=np.float64)
     own = np.asarray(signal.time_s, dtype=np.float64)
     if not bool(np.all(np.diff(own) >= 0)):
@@ -297,7 +300,7 @@ def _held(signal: RawSignal, stamps: Column) -> Column:
 
 
 def _usual_length(raw: RawLog) -> int:
-    """The number of rows that most columns have, the longer one where two are as frequent."""
+    """Return the number of rows that most columns have; the larger one if two are equally frequent."""
     lengths = [signal.samples for signal in raw.signals.values()]
     if not lengths or max(lengths) < 2:
         raise DataError(f"'{raw.path}' holds no column with two rows or more; nothing can be mapped")
@@ -305,7 +308,7 @@ def _usual_length(raw: RawLog) -> int:
 
 
 def _is_numeric(signal: RawSignal) -> bool:
-    """Whether its first rows are numbers."""
+    """Return whether the first rows are numbers."""
     try:
         _read([signal], 0, min(signal.samples, _PROBE_ROWS))
     except DataError:
@@ -323,7 +326,7 @@ def _ranges(length: int, first: int, later: int) -> list[tuple[int, int]]:
 
 
 def _read(signals: Sequence[RawSignal], start: int, stop: int) -> list[Column]:
-    """Rows of columns, those of one table in one go; each float64, with NaN for what no recording can hold."""
+    """Read rows of columns as float64, columns of one table in one pass; invalid values become NaN."""
     columns_by_id: dict[int, Column] = {}
     tables: dict[int, list[RawSignal]] = {}
     for signal in signals:
@@ -344,7 +347,7 @@ def _read(signals: Sequence[RawSignal], start: int, stop: int) -> list[Column]:
 
 
 def _pieces(signals: Sequence[RawSignal], ranges: Sequence[tuple[int, int]]) -> list[list[NDArray[np.float64]]]:
-    """Of each column its pieces; text further down makes a piece missing, not the log."""
+    """Return the segments of each column. Text in later rows makes a segment missing."""
     columns: list[list[NDArray[np.float64]]] = [[] for _ in signals]
     for start, stop in ranges:
         try:
@@ -366,7 +369,7 @@ def _read_or_missing(signal: RawSignal, start: int, stop: int) -> Column:
 def _time_of(
     part: Path, raw: RawLog, texts: Sequence[str], whole: SignalMap
 ) -> tuple[str | None, float | None, set[str]]:
-    """The column that the reader takes for time, the step in seconds, and the columns with stamps of their own."""
+    """Return the reader's time column, the step in seconds, and the columns with their own stamps."""
     by_word = [name for name in texts if _is_time_word(name)]
     others = [name for name in texts if name not in by_word]
     for name in (None, *islice([*by_word, *others], _MOST_TEXTS)):

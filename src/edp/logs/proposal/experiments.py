@@ -1,4 +1,4 @@
-"""Experiments that stand beside each other in a MAT file, each a recording of its own."""
+"""Experiments in one MAT file, each of which becomes a recording."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class Experiments:
     others: tuple[str, ...]
 
     def names(self) -> list[str]:
-        """A name a recording: ``train_1``; behind that of the file where there are several."""
+        """Unique names of the recordings: ``train_1``, prefixed with the file name if there are several files."""
         files = {path for path, _ in self.entries}
         short = [entry.replace("{", "_").rstrip("}") for _, entry in self.entries]
         return short if len(files) == 1 else [f"{path.stem}_{name}" for (path, _), name in zip(self.entries, short)]
 
     def tests(self) -> list[str]:
-        """Recordings that the author set apart as tests; empty where no names say so."""
+        """Return the recordings that the author named as test data; empty if no names say so."""
         variables = [entry.partition("{")[0].lower() for _, entry in self.entries]
         parted = {word in TRAINING_WORDS for word in variables} == {True, False}
         named = set(variables) <= {*TRAINING_WORDS, *TEST_WORDS}
@@ -47,7 +47,7 @@ class Experiments:
 
 
 def part_experiments(group: LogGroup) -> Experiments | None:
-    """The experiments within the logs of a group; None where they hold none.
+    """Return the experiments in the logs of a group; None if they hold none.
 
     Raises:
         DataError: too many for a data set.
@@ -70,5 +70,5 @@ def part_experiments(group: LogGroup) -> Experiments | None:
 
 
 def _pseudo_path(path: Path, name: str) -> Path:
-    """A path that stands for an experiment: no file has it."""
+    """Return a path that identifies an experiment; no file has this path."""
     return path.with_name(f"{path.name} {name.replace('/', '_')}")

@@ -10,13 +10,13 @@ _BYTES = frozenset(("data", "payload", "bytes", "data bytes", "databytes", "data
 
 
 def holds_frames(look: LogLook) -> bool:
-    """Whether the columns are those of a trace of a bus: an identifier and bytes."""
+    """Return whether the columns form a bus trace: an identifier and bytes."""
     names = {name.lower() for name in (*look.names, *look.texts)}
     return not _IDENTIFIERS.isdisjoint(names) and bool(names & {*_BYTES, "d0", "d1", "data0"})
 
 
 def refuse_frames(look: LogLook) -> None:
-    """Refuse a trace of a bus, whose bytes stand as text beside their identifiers.
+    """Refuse a bus trace whose bytes are text next to their identifiers.
 
     Raises:
         DataError: it is one; its numbers are no signals.

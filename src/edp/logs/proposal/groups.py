@@ -1,4 +1,4 @@
-"""Logs of a folder that belong together: those with the same columns, give or take a few."""
+"""Groups of logs in a folder that have nearly the same columns."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LogGroup:
 
     @property
     def rows(self) -> int:
-        """Rows of those that were looked at."""
+        """Number of rows read for the proposal."""
         return sum(look.rows for look in self.looks)
 
     @property
@@ -103,13 +103,13 @@ def group_logs(paths: Sequence[Path], progress: Progress = SILENT) -> tuple[list
 
 
 def some_of(logs: Sequence[_One]) -> list[_One]:
-    """`MOST_LOGS` logs at most, spread evenly over all of them."""
+    """Return at most `MOST_LOGS` evenly spaced logs."""
     places = np.unique(np.linspace(0, len(logs) - 1, min(len(logs), MOST_LOGS)).round().astype(int))
     return [logs[index] for index in places]
 
 
 def fits(look: LogLook, names: frozenset[str]) -> bool:
-    """Whether a log with some columns, time and text among them, belongs to one that was looked at."""
+    """Return whether a log with the given columns, including time and text, has nearly the columns of `look`."""
     mine = {*look.names, *look.texts} | ({look.time} if look.time is not None else set())
     return len(mine & names) >= _ALIKE * len(mine | names)
 

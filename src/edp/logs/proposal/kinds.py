@@ -1,4 +1,4 @@
-"""Kind and unit of a column, from what the file states, its name and its range, with how sure that is."""
+"""Kind and unit of a column from the stated unit, the name and the range, with a certainty."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class KindGuess:
 
 
 def with_article(kind: Kind) -> str:
-    """The kind in words: ``an angular velocity``."""
+    """Return the kind with its article: ``an angular velocity``."""
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind.replace('_', ' ')}"
 
 
@@ -93,7 +93,7 @@ def kind_of(column: LogColumn, behaviour: Behaviour, family: int) -> KindGuess:
 
 
 def _of_joint(kind: Kind, behaviour: Behaviour) -> KindGuess:
-    """What a joint of an arm does: it turns, as all but a few do, and robots count in radians."""
+    """Return the kind of a joint channel: joints turn, with few exceptions, and robots use radians."""
     unit = KINDS[kind].si_unit
     if kind is Kind.ANGLE and unit_by_range(kind, behaviour) is not None:
         return _of_range(kind, behaviour, 0.7, "a joint turns")
@@ -112,7 +112,7 @@ def _of_vocabulary(column: LogColumn, behaviour: Behaviour) -> KindGuess:
 
 
 def _looks_small(kind: Kind, behaviour: Behaviour) -> bool:
-    """Whether numbers are too small for a pressure in pascal."""
+    """Return whether the values are too small for a pressure in pascal."""
     return kind in _PRESSURES and max(abs(behaviour.low), abs(behaviour.high)) < 1e3
 
 
@@ -146,7 +146,7 @@ def _of_ending(unit: str, word: Kind | None, behaviour: Behaviour) -> KindGuess:
 
 
 def _of_range(kind: Kind, behaviour: Behaviour, confidence: float, why: str) -> KindGuess:
-    """A kind whose unit only the numbers tell."""
+    """Return a kind with a unit derived from the range of the values."""
     unit = unit_by_range(kind, behaviour)
     if unit is None:
         return _numbers(why, f"{with_article(kind)}? unit unknown")
@@ -156,7 +156,7 @@ def _of_range(kind: Kind, behaviour: Behaviour, confidence: float, why: str) -> 
 
 
 def is_plausible(kind: Kind, unit: str, behaviour: Behaviour) -> bool:
-    """Whether the range of a column lies within the limits of a kind."""
+    """Return whether the range of a column is within the plausibility limits of a kind."""
     low, high = KINDS[kind].plausible
     conversion = UNITS[unit]
     values = [value * conversion.factor + conversion.offset for value in (behaviour.low, behaviour.high)]
@@ -164,7 +164,7 @@ def is_plausible(kind: Kind, unit: str, behaviour: Behaviour) -> bool:
 
 
 def unit_by_range(kind: Kind, behaviour: Behaviour) -> str | None:
-    """The unit in which numbers of a kind have this range on a machine; None where several would do."""
+    """Return the unit in which a machine has values of this range; None if it is ambiguous."""
     low, largest = behaviour.low, max(abs(behaviour.low), abs(behaviour.high))
     # From (not included) and up to: what lies between the rows is left open.
     ranges: dict[Kind, list[tuple[float, float, str]]] = {

@@ -1,4 +1,4 @@
-"""What names of columns say: kinds, units and roles, in English and German, and in tags of instruments."""
+"""Kinds, units and roles derived from column names in English and German, and from instrument tags."""
 
 from __future__ import annotations
 
@@ -93,12 +93,12 @@ _TAGS: Mapping[str, Kind] = {"P": Kind.PRESSURE, "T": Kind.TEMPERATURE, "F": Kin
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """The words of a name, in lower letters, umlauts written out: ``CylVel_1`` is cyl, vel, 1."""
+    """Return the words of a name in lower case with umlauts written out: ``CylVel_1`` gives cyl, vel, 1."""
     return tuple(part.lower() for part in _PARTS.findall(name[:_LONGEST].translate(_UMLAUTS)))
 
 
 def kind_by_word(name: str) -> Kind | None:
-    """The kind that a word of a name means; None where no word does, or a rate of another kind is named."""
+    """Return the kind named by a word; None without such a word, or if the rate of another kind is named."""
     words = words_of(name)
     if not _TURNS.isdisjoint(words) and not _SPEEDS.isdisjoint(words):
         return Kind.ANGULAR_VELOCITY
@@ -113,34 +113,34 @@ def kind_by_word(name: str) -> Kind | None:
 
 
 def _glued(words: Sequence[str]) -> re.Match[str] | None:
-    """The first word taken apart where it is a kind with its role: ``posd``, ``velact``, ``accref``."""
+    """Match a first word composed of kind and role: ``posd``, ``velact``, ``accref``."""
     return _GLUED.fullmatch(words[0]) if words else None
 
 
 def is_error_name(name: str) -> bool:
-    """Whether a name is that of a deviation, which follows from two other columns."""
+    """Return whether a name denotes a deviation, which follows from two other columns."""
     return not _ERRORS.isdisjoint(words_of(name))
 
 
 def is_joint(name: str) -> bool:
-    """Whether a name is that of a joint of an arm or a leg."""
+    """Return whether a name denotes a joint of an arm or a leg."""
     return not _JOINTS.isdisjoint(words_of(name))
 
 
 def kind_by_tag(name: str) -> Kind | None:
-    """The kind of an instrument's tag; it means little by itself."""
+    """Return the kind of an instrument tag, which is a weak hint."""
     tag = _TAG.fullmatch(name)
     return None if tag is None else _TAGS[tag[1]]
 
 
 def tag_family(name: str) -> str:
-    """What tags of one kind share: their letters; empty for other names."""
+    """Return the common letters of tags of one kind; empty for other names."""
     tag = _TAG.fullmatch(name)
     return "" if tag is None else tag[1] + tag[2]
 
 
 def unit_by_ending(name: str) -> str | None:
-    """The unit that ends a name of several words: ``valve_percent``, ``pA_bar``."""
+    """Return the unit at the end of a name with several words: ``valve_percent``, ``pA_bar``."""
     for tail, unit in UNIT_TAILS.items():
         if name.endswith("_" + tail) and len(name) > len(tail) + 1:
             return unit
@@ -149,13 +149,13 @@ def unit_by_ending(name: str) -> str | None:
 
 
 def known_unit(stated: str | None) -> str | None:
-    """A stated unit under its name here; None where it is not known."""
+    """Return a stated unit in EDP's spelling; None if it is unknown."""
     unit = normalise_unit(stated)
     return unit if unit in UNITS else None
 
 
 def role_by_word(name: str) -> str:
-    """``reference``, ``command``, ``measured`` or ``label`` where a word says it; else empty."""
+    """Return ``reference``, ``command``, ``measured`` or ``label`` if a word of the name means it; otherwise empty."""
     words = words_of(name)
     # A letter is a role where it begins a name; R is that of a rod, of a side or of a reference, which stands alone.
     alone = all(word.isdigit() or word in _PARTS_OF_SETS for word in words[1:])
@@ -180,12 +180,12 @@ def is_counter_name(name: str) -> bool:
 
 
 def is_time_name(name: str) -> bool:
-    """Whether a name is that of time."""
+    """Return whether a name denotes time."""
     return any(word in _TIMES for word in words_of(name)[:1])
 
 
 def is_sample_time_name(name: str) -> bool:
-    """Whether a name is that of the time between two rows."""
+    """Return whether a name denotes the time between two rows."""
     return "".join(name.split()).lower() in _SAMPLE_TIMES
 
 
@@ -195,6 +195,6 @@ def is_stamp_name(name: str) -> bool:
 
 
 def ends_as_stamp(name: str) -> bool:
-    """Whether a name of several words ends as that of the time at which something was measured: ``pressure_ts``."""
+    """Return whether a name of several words ends like a time stamp: ``pressure_ts``."""
     words = words_of(name)
     return len(words) > 1 and words[-1] in _STAMP_ENDINGS

@@ -50,7 +50,7 @@ opens valves more often than every 100 s."""
 
 @dataclass(frozen=True)
 class ColumnGuess:
-    """What a column is taken for.
+    """Proposed meaning of a column.
 
     Attributes:
         column: its name in the file.
@@ -74,13 +74,13 @@ class ColumnGuess:
 
     @property
     def sureness(self) -> str:
-        """In a word; ``unsure`` is what lies below `BOUND`."""
+        """Certainty in one word; ``unsure`` is below `BOUND`."""
         return "sure" if self.confidence >= SURE else "likely" if self.confidence >= BOUND else "unsure"
 
 
 @dataclass(frozen=True)
 class MapProposal:
-    """A signal map and what it was made from."""
+    """Proposed signal map with its evidence."""
 
     look: LogLook
     clock: ClockGuess
@@ -88,7 +88,7 @@ class MapProposal:
     signal_map: SignalMap
 
     def of_role(self, *roles: str) -> tuple[ColumnGuess, ...]:
-        """The channels that have one of some roles, in order."""
+        """Return the channels with one of the given roles, in order."""
         return tuple(guess for guess in self.columns if guess.channel and guess.role in roles)
 
 
@@ -142,7 +142,7 @@ _EMPTY = "empty"
 
 
 def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) -> dict[str, Behaviour]:
-    """Behaviours of columns, of another log of the group where they rest, or move in steps only, in the first.
+    """Replace the statistics of a column that is constant in the first log by those of another log of the group.
 
     A machine is often tested one axis a log.
     """
@@ -157,7 +157,7 @@ def _where_they_move(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]
 
 
 def _ranges_of_all(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) -> dict[str, Behaviour]:
-    """Behaviours with the range that a column has in all logs of a group: in one that rests a unit cannot be told."""
+    """Widen the range of each column to all logs of a group, since a unit cannot be derived from a constant column."""
     ranges = dict(behaviours)
     for column in (column for look in beside for column in look.columns):
         numbers = column.values[np.isfinite(column.values)]
@@ -169,7 +169,7 @@ def _ranges_of_all(behaviours: dict[str, Behaviour], beside: Sequence[LogLook]) 
 
 
 def _of_brothers(columns: Sequence[LogColumn], kinds: dict[str, KindGuess]) -> dict[str, KindGuess]:
-    """Kinds, with that of its brothers for a column of a row of axes whose own range leaves the unit open."""
+    """Return the kinds; a column of a series of axes with an ambiguous unit takes the kind of the others."""
     rows: dict[str, list[LogColumn]] = {}
     for column in columns:
         rows.setdefault(_NUMBERS.sub("", column.name), []).append(column)
@@ -193,7 +193,7 @@ def _is_free(column: LogColumn, behaviour: Behaviour, clock: ClockGuess) -> bool
 
 
 def _steered(columns: Sequence[LogColumn], relations: dict[str, Relation]) -> dict[str, str]:
-    """Columns that are what a controller makes of a reference and of what follows it, each with the reference."""
+    """Return the columns that are controller outputs, each with its reference."""
     by_name = {column.name: column for column in columns}
     pairs = [(name, relation.other) for name, relation in relations.items() if relation.how == "reference"]
     return {
@@ -226,7 +226,7 @@ def _column_guess(
 
 
 def _aside(name: str, behaviour: Behaviour, kind: KindGuess, rate_hz: float | None, rows: int) -> ColumnGuess | None:
-    """A column that holds no motion: a constant, a counter, a label; None for all others."""
+    """Return the guess for a column without motion (constant, counter, label); None for other columns."""
     if behaviour.beside and not is_known(name):
         return ColumnGuess(
             name, "", "remark", _NO_KIND, 0.85, f"filled in {percent(behaviour.filled)} of the rows", "not taken"
@@ -299,7 +299,7 @@ def _role(
 
 
 def _without_copies(guesses: Sequence[ColumnGuess], beside: Sequence[LogLook]) -> list[ColumnGuess]:
-    """Columns that repeat an earlier one in another unit become no channels: the same would be predicted twice."""
+    """Remove channels that repeat an earlier column in another unit, since they would be predicted twice."""
     columns = [{column.name: column for column in look.columns} for look in beside]
     channels: set[str] = set()
     single = []
@@ -358,12 +358,12 @@ def _signal_map(look: LogLook, clock: ClockGuess, columns: Sequence[ColumnGuess]
 
 
 def _place(name: str) -> int:
-    """The place of a column that has no name but its place."""
+    """Return the position of a column that is named by its position only."""
     return int(name.rpartition("_")[2])
 
 
 def plain_map(look: LogLook) -> SignalMap:
-    """A map of all columns of numbers, so that they can be inspected: kinds as proposed, the others as numbers."""
+    """Return a map of all numeric columns for inspection: proposed kinds, otherwise plain numbers."""
     proposal = propose_map(look)
     # A column without any number is a delimiter too many, not a sensor.
     unmapped = [g for g in proposal.columns if not g.channel and g.role in ("constant", "counter") and g.why != _EMPTY]

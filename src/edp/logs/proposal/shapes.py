@@ -1,4 +1,4 @@
-"""What speaks against a proposal though the numbers can be read: rows that are no samples, a rate that loses motion."""
+"""Warnings about proposals for readable logs: rows that are not samples, a rate that loses motion."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _RATES_HZ = (200.0, 500.0, 1000.0, 2000.0, 5000.0)
 
 
 def shape_notes(look: LogLook) -> list[str]:
-    """What speaks against a table being a log with a channel a column.
+    """Return warnings that a table is not a log with one channel per column.
 
     Args:
         look: what was looked at.
@@ -57,7 +57,7 @@ def _neighbours_continue(look: LogLook) -> bool:
 
 
 def pace_notes(look: LogLook, clock: ClockGuess, targets: Collection[str]) -> list[str]:
-    """Whether what is to be predicted moves faster than the rate that a fast log is brought to shows.
+    """Return a warning if the targets move faster than the reduced rate can represent.
 
     Args:
         look: what was looked at.
@@ -92,7 +92,7 @@ def _faster(values: Column, rate_hz: float, limit_hz: float) -> float:
 
 
 def beside_notes(source: Path, paths: Collection[Path]) -> list[str]:
-    """Text files that hold tables beside logs of other endings, which are passed over for the remarks among them.
+    """Return warnings about text files with tables that are ignored next to logs of other formats.
 
     Args:
         source: what was asked about.

@@ -1,4 +1,4 @@
-"""What the time stamps of a group of logs need before training reads them: one rate, and repairs."""
+"""Requirements of the time stamps of a group of logs before training: one rate, and repairs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_KEPT = 0.8
 
 @dataclass(frozen=True)
 class Timing:
-    """What was found of the time of a group's logs.
+    """Timing of a group of logs.
 
     Attributes:
         rate_hz: the rate to bring all of them to; None where they have one.
@@ -37,7 +37,7 @@ class Timing:
 
     @property
     def shared(self) -> tuple[str, ...]:
-        """Repairs for all logs, one of each defect; ``hold`` where gaps of some are cut."""
+        """Repairs common to all logs, one per defect; ``hold`` if gaps of some logs are cut."""
         by_defect: dict[str, str] = {}
         for repair in sorted({one for repairs in self.repairs.values() for one in repairs}):
             by_defect[repair.partition("=")[0]] = repair  # "gaps=hold" comes after "gaps=cut"
@@ -45,12 +45,12 @@ class Timing:
 
     @property
     def apart(self) -> dict[Path, tuple[str, ...]]:
-        """Logs that need their own repairs, since others need another one of the same defect."""
+        """Logs that need their own repairs, because other logs need another repair for the same defect."""
         return {path: repairs for path, repairs in self.repairs.items() if not set(repairs) <= set(self.shared)}
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a person should know of rates and breaks."""
+        """Remarks on rates and breaks for the user."""
         rate = (
             ()
             if self.rate_hz is None
@@ -95,12 +95,12 @@ def repair_table(repairs: Sequence[str]) -> dict[str, str]:
 
 
 def _plain(rate_hz: float) -> float:
-    """A rate in two digits, as a person would say it."""
+    """Return a rate rounded to two digits."""
     return float(f"{rate_hz:.2g}")
 
 
 def _clocks(look: LogLook, clock: ClockGuess) -> list[Clock]:
-    """The clock of each piece of a log, by the rule with which it is read; none without a column of numbers."""
+    """Return the clock of each segment of a log; empty without a numeric time column."""
     time = next((column for column in look.columns if column.name == clock.column), None)
     clocks = []
     for piece in () if time is None else time.pieces:
@@ -120,7 +120,7 @@ def _repairs(clock: Clock) -> set[str]:
 
 
 def _of_falls(clock: Clock) -> str:
-    """``cut`` where a clock begins anew: sorted rows would be those of two sessions in turn; else ``sort``."""
+    """Return ``cut`` if a clock restarts, since sorting would mix two sessions; otherwise ``sort``."""
     back = np.diff(clock.stamps)[clock.falling - 1]
     return "cut" if back.min() < -max(_LONG_S, _LONG_STEPS * clock.step_s) else "sort"
 

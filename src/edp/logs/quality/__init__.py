@@ -1,1 +1,1 @@
-"""What is wrong with recordings: checks of one, comparisons of several, and measures of noise and spikes."""
+"""Quality of recordings: checks of single recordings, comparisons of several, and measures of noise and spikes."""

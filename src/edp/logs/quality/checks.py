@@ -1,4 +1,4 @@
-"""The checks of one channel, each a function from what was looked at to findings; `CHECKS` lists them all."""
+"""Checks of one channel, each a function from its statistics to findings; `CHECKS` lists them all."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Looked:
 
     @property
     def samples(self) -> int:
-        """All of them, missing ones included."""
+        """Number of samples, including missing ones."""
         return len(self.values)
 
     @property
@@ -107,7 +107,7 @@ Check = Callable[[Looked], list[Finding]]
 
 
 def look_at(channel: Channel, values: Values, rate_hz: float, in_gaps: int = 0) -> Looked:
-    """Gather what the checks need of one channel, float32, shape ``(time,)``."""
+    """Collect the statistics of one channel that the checks need, float32, shape ``(time,)``."""
     finite = np.isfinite(values)
     good = values if finite.all() else values[finite]
     starts = lengths = np.empty(0, dtype=np.intp)
@@ -126,13 +126,13 @@ def place_of(row: int, rate_hz: float) -> str:
 
 
 def shown(value: float, channel: Channel) -> str:
-    """A value in the report unit with that unit; a pure number stands alone."""
+    """Return a value in the report unit followed by this unit; dimensionless values have no unit."""
     unit = KINDS[channel.kind].report_unit
     return typed(value) + ("" if unit == "1" else f" {unit}")
 
 
 def copies(recording: Recording) -> list[Finding]:
-    """Channels that equal an earlier one of the recording in every sample; constant ones do not count."""
+    """Find channels that equal an earlier channel in every sample; constant channels do not count."""
     seen: dict[bytes, str] = {}
     findings = []
     for channel, values in zip(recording.channels, columns(recording), strict=True):
@@ -194,7 +194,7 @@ def _unit_finding(channel: Channel, what: str, largest: float, count: int, where
 
 
 def likely_unit(kind: Kind, largest: float) -> str | None:
-    """The unit in which a largest value of `largest` would be nearest to the kind's nominal size."""
+    """Return the unit in which a largest value of `largest` is nearest to the nominal size of the kind."""
     facts = KINDS[kind]
     best, best_off = None, math.inf
     for name, unit in UNITS.items():
@@ -261,7 +261,7 @@ def _check_clipped(at: Looked) -> list[Finding]:
 
 
 def _check_coarse(at: Looked) -> list[Finding]:
-    """Steps that are large beside what the channel does; a few levels of a state or an event are its nature."""
+    """Report steps that are large compared with the variation of the channel, except for states and events."""
     step, levels, part = at.measures.quantum, at.measures.levels, _coarseness(at)
     if step is None or part < _COARSE_STEP:
         return []

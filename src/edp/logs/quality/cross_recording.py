@@ -1,4 +1,4 @@
-"""What only shows where recordings stand beside each other: repeated sessions, a channel in two units."""
+"""Checks between recordings: repeated sessions, a channel in two units."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class DataQuality:
 
     @property
     def errors(self) -> int:
-        """Findings that keep a log from being used as it is."""
+        """Number of findings that make a log unusable without repair."""
         return sum(len(report.errors) for report in self.reports)
 
     @property
@@ -49,7 +49,7 @@ class DataQuality:
 
     @property
     def verdict(self) -> str:
-        """Of the worst finding: ``unusable`` as it is, ``check`` before use, or ``good``."""
+        """Verdict from the worst finding: ``unusable``, ``check`` or ``good``."""
         every = [finding for report in self.reports for finding in report.findings]
         return verdict_of([*every, *self.findings])
 
@@ -90,7 +90,7 @@ def compare(reports: Sequence[QualityReport], sketches: Sketches, more: Sequence
 
 
 def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
-    """Channels whose size and noise in one recording both lie a unit's ratio off those of the others.
+    """Find channels whose size and noise in one recording both differ from the others by the ratio of two units.
 
     A machine at rest makes a channel small, but not its noise; a weaker sensor makes noise large, but not the size.
     """
@@ -119,7 +119,7 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
 
 
 def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
-    """Which two units explain both ratios, empty where none do."""
+    """Return the two units that explain both ratios; empty if none do."""
     decades = [math.log10(ratio) for ratio in ratios]
     if min(map(abs, decades)) < math.log10(_LEAST_RATIO) - _NEAR_DECADES:  # Most channels: no two units explain it.
         return ""
@@ -131,7 +131,7 @@ def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
 
 @cache
 def _unit_pairs(kind: Kind) -> tuple[tuple[str, float], ...]:
-    """Each two units of a kind that lie well apart: what it is called, and their ratio in decades."""
+    """Return the distinguishable pairs of units of a kind: their description, and their ratio in decades."""
     unit_factors = [(name, unit.factor) for name, unit in UNITS.items() if kind in unit.kinds and not unit.offset]
     return tuple(
         (f"{name} read as {other}?", math.log10(base / factor))

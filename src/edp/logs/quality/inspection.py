@@ -43,7 +43,7 @@ _LONGEST_MISS = 64
 
 
 def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> QualityReport:
-    """Find what is wrong with a log: its columns, units, time stamps and values.
+    """Inspect a log: its columns, units, time stamps and values.
 
     Args:
         path: a log of any known format.
@@ -62,7 +62,7 @@ def look_into(
     rows: tuple[int, int | None] | None = None,
     repair: Repair | None = None,
 ) -> tuple[QualityReport, Sketch | None]:
-    """As `inspect_log`, with a sketch to compare recordings by; None where no sample could be read.
+    """Inspect a log and return a sketch for comparing recordings, None if no sample could be read.
 
     Args:
         path: a log file of a known format.
@@ -108,13 +108,13 @@ def look_into(
 
 
 def unreadable(path: Path, why: DataError) -> QualityReport:
-    """The report on a file of which nothing can be read: one error."""
+    """Return the report on an unreadable file: one error."""
     empty = Recording(name_of_file(path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(path))
     return inspect(empty, (Finding("error", None, str(why)),))
 
 
 def _opened(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[ChannelSource], list[EdpError]]:
-    """The log with its channels: by the map, or where none was given and no column is known, by a proposed one.
+    """Open a log with its channels by the map, or by a proposed map if none is given and no column is known.
 
     Raises:
         DataError: the file cannot be read.
@@ -138,7 +138,10 @@ def _opened(path: Path, signal_map: SignalMap) -> tuple[RawLog, SignalMap, list[
 
 
 def _is_misspelt(name: str) -> bool:
-    """Whether a name is nearly one of the vocabulary: any short word is somewhat like one of so many."""
+    """Return whether a name is a probable misspelling of a vocabulary name.
+
+    Short names are excluded, since they resemble many.
+    """
     return len(name) <= _LONGEST_MISS and bool(get_close_matches(name, VOCABULARY, n=1, cutoff=_MISSPELT))
 
 
@@ -155,7 +158,7 @@ def _changed(
 
 
 def _clocks(raw: RawLog, sources: list[ChannelSource], signal_map: SignalMap) -> list[tuple[str, Clock]]:
-    """Each distinct time column judged as it is in the file, under the name of its first channel."""
+    """Return each distinct time column of the file with the name of its first channel."""
     if signal_map.sample_time_s is not None or raw.rate_hz is not None:
         return []
     seen: dict[int, tuple[str, Clock]] = {}
@@ -174,7 +177,7 @@ def _clock_facts(name: str, clock: Clock) -> ClockFacts:
 
 
 def _readable(sources: list[ChannelSource]) -> tuple[list[ChannelSource], list[Finding]]:
-    """The channels whose columns can be read as numbers; a finding for each that cannot."""
+    """Return the channels whose columns are numeric, and a finding for each other channel."""
     usable, findings = [], []
     for entry in sources:
         try:

@@ -1,4 +1,4 @@
-"""What the samples of one channel say of the sensor and logger behind it: step, noise, update rate, clipping, spikes.
+"""Measures of sensor and logger from the samples of one channel: step, noise, update rate, clipping, spikes.
 
 All of it follows from the numbers alone; values are one channel, float32, shape ``(time,)``, without missing ones.
 """
@@ -69,7 +69,7 @@ NOTHING = Measures(None, 0, 0.0, 1.0, False, 0.0, 0.0, 0, 0, -1)
 
 
 def measure(values: Values) -> Measures:
-    """Measure one channel; a constant or nearly empty one has nothing to measure."""
+    """Measure one channel; a constant or nearly empty channel has no measures."""
     if len(values) < 4 or values.min() == values.max():
         return NOTHING
     step, levels = quantum(values)
@@ -99,7 +99,7 @@ def _is_busy(same: NDArray[np.bool_], at_end: NDArray[np.bool_]) -> bool:
 
 
 def quantum(values: Values) -> tuple[float | None, int]:
-    """Step of the lattice on which the values lie, None where there is none, and how many distinct values there are.
+    """Return the quantisation step of the values, None without one, and the number of distinct values.
 
     The smallest distance between neighbouring values is refined over the whole range; 99 % of the distances must then
     be whole multiples within 5 % of the step. Steps of up to four units in the last place of float32 are no lattice.
@@ -123,7 +123,7 @@ def quantum(values: Values) -> tuple[float | None, int]:
 
 
 def update_every(steps: Values) -> float:
-    """Samples between new values of a channel that is sampled faster than it is sent, from its steps.
+    """Return the samples between new values of a channel that is sampled faster than it is sent.
 
     The shortest distance between changes (2 % quantile) must be two samples or more, and half of all distances must
     lie within 1.5 times of it; a quantity that merely changes slowly spreads more.

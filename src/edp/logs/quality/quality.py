@@ -1,4 +1,4 @@
-"""What is odd in a recording: found and reported, never repaired here."""
+"""Inspection of a recording: problems are reported, never repaired here."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class ClockFacts:
 
 @dataclass(frozen=True)
 class QualityReport:
-    """All findings of one log, worst first, with the facts of its time and channels.
+    """All findings of one log, worst first, with data on its time and channels.
 
     Where it is `proposed`, no map was given and no column is of the vocabulary: channels are what `edp init` would take
     the columns for.
@@ -102,12 +102,12 @@ class QualityReport:
 
     @property
     def errors(self) -> tuple[Finding, ...]:
-        """Findings that keep the log from being used as it is."""
+        """Findings that make the log unusable without repair."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
     @property
     def verdict(self) -> str:
-        """``unusable`` as it is, ``check`` before use, or ``good``."""
+        """Verdict: ``unusable``, ``check`` or ``good``."""
         return verdict_of(self.findings)
 
     def to_json(self) -> dict[str, Any]:
@@ -117,7 +117,7 @@ class QualityReport:
 
 
 def verdict_of(findings: Sequence[Finding]) -> str:
-    """What the worst of some findings makes of their subject."""
+    """Return the verdict for the worst of the findings."""
     worst = min((SEVERITIES.index(finding.severity) for finding in findings), default=len(SEVERITIES) - 1)
     return VERDICTS[SEVERITIES[worst]]
 

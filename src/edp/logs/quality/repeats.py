@@ -100,7 +100,7 @@ class Repeat:
 
 
 def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
-    """Pairs of recordings that hold the same session, the longest shared stretch first.
+    """Return pairs of recordings with the same session, the longest common segment first.
 
     Recordings shorter than 12.8 s are compared by their samples alone. A pair counts where at least two windows agree
     (correlation above 0.98 in more than half of the channels that move), and most of those between them, at one lag. Of
@@ -131,7 +131,7 @@ def _identical(a: Sketch, b: Sketch) -> Repeat:
 
 
 def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
-    """The lag, in blocks, that most fingerprints of a pair of recordings vote for.
+    """Return the lag in blocks, per pair of recordings, with the most matching fingerprints.
 
     Fingerprints are made twice, a channel of a recording at a time: those of forty hours together take gigabytes.
     """
@@ -167,7 +167,10 @@ def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
 
 
 def _votes(i: int, places: NDArray[np.int64], theirs: Labels) -> tuple[Labels, NDArray[np.int64]]:
-    """Votes of a recording's windows, shape ``(vote, 3)`` with two recordings in order and a lag, and their numbers."""
+    """Return the votes of the windows of a recording, shape ``(vote, 3)``: two recordings and a lag.
+
+    And their counts.
+    """
     swap = i > theirs[:, 0]
     mine = np.stack([np.full(len(places), i), places], axis=1)
     a, b = np.where(swap[:, None], theirs, mine), np.where(swap[:, None], mine, theirs)
@@ -175,7 +178,7 @@ def _votes(i: int, places: NDArray[np.int64], theirs: Labels) -> tuple[Labels, N
 
 
 def _elected(votes: Labels, numbers: NDArray[np.int64]) -> dict[tuple[int, int], int]:
-    """The lag of each pair with enough votes."""
+    """Return the lag of each pair with enough votes."""
     votes, where = np.unique(votes, axis=0, return_inverse=True)
     counts = np.zeros(len(votes), dtype=np.int64)
     np.add.at(counts, where, numbers)
@@ -194,7 +197,7 @@ def _elected(votes: Labels, numbers: NDArray[np.int64]) -> dict[tuple[int, int],
 
 
 def _telling(sketches: Sequence[Sketch]) -> list[list[int]]:
-    """Columns of each recording to take fingerprints of.
+    """Return the columns of each recording from which fingerprints are taken.
 
     First the names that move most often over all recordings, so that the same are taken of each; then the recording's
     own liveliest: more of them where recordings share no name, so that renamed channels meet too.
@@ -222,7 +225,7 @@ def _lively(entry: Sketch) -> list[float]:
 
 
 def _searched_places(windows: int) -> NDArray[np.int64]:
-    """First blocks of the windows that are searched in, of so many: even and odd ones by turns."""
+    """Return the first blocks of the searched windows, even and odd alternately."""
     every = np.arange(0, windows, _HOP)
     every[1::2] += 1
     return every[every < windows]
@@ -248,7 +251,7 @@ def _fingerprints(values: Floats, places: NDArray[np.int64]) -> tuple[Floats, ND
 
 
 def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
-    """The repeat at a lag (block k of `a` is block k + `lag` of `b`), or None where the recordings do not agree."""
+    """Return the repeat at a lag (block k of `a` is block k + `lag` of `b`); None if the recordings differ."""
     if abs(a.hz - b.hz) > 1e-6:
         return None
     start = max(0, -lag)
@@ -279,7 +282,7 @@ def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
 def _judged(
     a: Sketch, b: Sketch, lag: int, start: int, pairs: list[tuple[int, int]], alike: NDArray[np.float64]
 ) -> Repeat | None:
-    """A repeat from the correlations by window and channel, shape ``(window, channel)``, NaN where neither moves."""
+    """Return a repeat from the correlations ``(window, channel)``, with NaN for channels without motion."""
     moves = np.isfinite(alike)
     agree = np.where(moves, alike, 0.0) > _SAME
     moving = moves.sum(axis=1)

@@ -1,4 +1,4 @@
-"""Recordings at a low rate, as they are compared by: whether a session repeats, and which samples are the same."""
+"""Sketches: recordings at a low rate for comparison, to find repeated sessions and identical samples."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class Sketch:
     seconds: float
 
     def with_hash_alone(self) -> Sketch:
-        """The sketch less its values: the recording is compared by the hash of its samples alone."""
+        """Return the sketch without values; the recording is then compared by the hash of its samples only."""
         return replace(self, values=self.values[:0].copy())
 
 
 class Sketches:
-    """The sketches of a data set; once they take `most` bytes, further recordings leave their hash alone."""
+    """Sketches of a data set. After `most` bytes, further recordings are represented by their hash."""
 
     def __init__(self, most: int = MOST_BYTES) -> None:
         self.left, self.all, self.by_hash = most, list[Sketch](), 0
@@ -60,7 +60,7 @@ class Sketches:
 
 
 def sketch(recording: Recording, name: str | None = None) -> Sketch:
-    """The sketch of a recording; missing values count as the mean of their channel."""
+    """Return the sketch of a recording; missing values are replaced by the mean of their channel."""
     rate = recording.rate_hz
     hz = min(SKETCH_HZ, rate)
     blocks = max(int(recording.samples * hz / rate), 1)

@@ -1,4 +1,4 @@
-"""Data-set stores: recordings in SI units on one grid, kept so that any stretch is read without the rest.
+"""Data-set stores: recordings in SI units on one grid, stored so that any segment can be read alone.
 
 A store is a folder: ``store.json`` says what is in it, ``rows/KEY.f32`` hold the samples as plain numbers, float32,
 little end first, one recording after the other, row by row.

@@ -1,4 +1,4 @@
-"""Building a store: logs are read once, in batches by several processes; a build that was stopped goes on."""
+"""Building of stores: logs are read once, in batches by several processes; a stopped build can continue."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class StoredLog:
 
     @property
     def key(self) -> str:
-        """A hash of where it lies, of its size and time, and of how it is read."""
+        """Hash of location, size, time and reading options of the log."""
         facts = [(str(part), status_of(part).st_size, status_of(part).st_mtime_ns) for part in self._files()]
         if self.remote is not None:
             facts = [(self.remote.address, self.remote.size, self.remote.written_ns)]
@@ -141,7 +141,7 @@ def build_store(
     workers: int = 1,
     progress: Progress = SILENT,
 ) -> StoreIndex:
-    """Read logs into a store; what it has already is kept, what was changed is read again.
+    """Read logs into a store. Unchanged logs are reused; changed logs are read again.
 
     Args:
         logs: in any order.
@@ -198,12 +198,12 @@ def _built(logs: dict[str, StoredLog], top: Path, workers: int, progress: Progre
 
 
 def _distinct(logs: Sequence[StoredLog]) -> dict[str, StoredLog]:
-    """Logs by key, each once."""
+    """Return the logs by key, without duplicates."""
     return {log.key: log for log in logs}
 
 
 def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreIndex:
-    """The index less recordings whose log was changed, or is to be read in another way."""
+    """Return the index without recordings whose log was changed or is read with other options."""
     paths = {log.where for log in logs.values()}
     unchanged = tuple(entry for entry in index.recordings if entry.log not in paths or entry.log_key in logs)
     used = {entry.rows for entry in unchanged}
@@ -211,7 +211,7 @@ def _without_replaced(index: StoreIndex, logs: dict[str, StoredLog]) -> StoreInd
 
 
 def _without_lost(index: StoreIndex, top: Path) -> StoreIndex:
-    """The index less recordings whose file of rows was removed or cut: their logs are read again."""
+    """Return the index without recordings whose data file is missing or truncated; their logs are read again."""
     whole = {file.key for file in index.files if _size(rows_path(top, file.key)) == file.bytes}
     recordings = tuple(entry for entry in index.recordings if entry.rows in whole)
     return replace(index, recordings=recordings, files=tuple(file for file in index.files if file.key in whole))
@@ -223,7 +223,7 @@ def _size(path: Path) -> int:
 
 
 def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[LogBatch]:
-    """Logs side by side, in batches of like size."""
+    """Divide the logs into batches of similar size."""
     sizes = {key: log.size for key, log in logs.items()}
     total = sum(sizes.values())
     # Some for each worker, so that none waits for the last one for long.
@@ -244,7 +244,7 @@ def _batch_key(keys: Sequence[str]) -> str:
 
 
 def store_batch(batch: LogBatch) -> dict[str, Any]:
-    """Read the logs of a batch into one file of rows; runs in a process of its own.
+    """Read the logs of a batch into one data file, in a separate process.
 
     Returns:
         the record of the batch: an index of its recordings alone, as plain values. It lies beside the rows, too, so
@@ -291,14 +291,14 @@ def store_batch(batch: LogBatch) -> dict[str, Any]:
 
 
 def _at_hand(log: StoredLog) -> AbstractContextManager[Path]:
-    """The log as a file of this machine."""
+    """Return the log as a local file."""
     return nullcontext(log.path) if log.remote is None else copied(log.remote)
 
 
 def _stored(
     log: StoredLog, key: str, rows: str, first: int, write: Callable[[Any], object]
 ) -> tuple[StoreEntry, tuple[Channel, ...]]:
-    """Write the samples of a log; what the index says of it."""
+    """Write the samples of a log and return its index entry."""
     raw = open_log(log.path, log.signal_map)
     sources, problems = resolve(raw, log.signal_map)
     if problems:
@@ -333,7 +333,7 @@ def _stored(
 
 
 def _merged_meta(meta: dict[str, Any], part: Any) -> dict[str, Any]:
-    """Facts of a log and of one more part of it; each repair once."""
+    """Merge the metadata of a log with those of one more part; each repair occurs once."""
     repairs = list(meta.get("repairs", []))
     repairs += [repair for repair in part.get("repairs", []) if repair not in repairs]
     return {**meta, **part, **({"repairs": repairs} if repairs else {})}
@@ -348,7 +348,7 @@ def _check_digest(assembly: Assembly, digest: str) -> None:
 
 
 def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
-    """Records of batches that an earlier build finished and no index lists; logs of a damaged one are read again."""
+    """Yield the batch records of an earlier build that are not in the index. Logs of damaged records are read again."""
     present = {file.key for file in index.files}
     for path in entries_of(top / ROWS, "*.json"):
         if path.stem in present or not is_file_at(rows_path(top, path.stem)):
@@ -365,7 +365,7 @@ def _records_beside(top: Path, index: StoreIndex) -> Iterator[dict[str, Any]]:
 
 
 def _with_record(index: StoreIndex, record: dict[str, Any], logs: dict[str, StoredLog]) -> StoreIndex:
-    """An index with the recordings of a batch that are asked for."""
+    """Return the index extended by the requested recordings of a batch."""
     batch = index_of(record, "record of a batch of the store")
     lists = list(index.lists)
     recordings = list(index.recordings)
@@ -380,7 +380,7 @@ def _with_record(index: StoreIndex, record: dict[str, Any], logs: dict[str, Stor
 
 
 def _remove_unused(top: Path, index: StoreIndex) -> None:
-    """Files that no recording lies in, and records of batches, which the index holds now."""
+    """Remove data files without recordings, and batch records, which the index now contains."""
     used = {file.key for file in index.files}
     for path in entries_of(top / ROWS):
         if path.suffix == ".json" or (path.suffix == ".f32" and path.stem not in used):

@@ -1,4 +1,4 @@
-"""The index of a store: which recordings it holds, where their samples lie, and what was refused."""
+"""Index of a store: its recordings, the positions of their samples, and refused logs."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class RefusedLog:
 
 @dataclass(frozen=True, kw_only=True)
 class StoreIndex:
-    """What a store holds.
+    """Content of a store.
 
     Attributes:
         kind: ``edp-store``.
@@ -130,7 +130,7 @@ def is_store(path: str | Path) -> bool:
 
 
 def rows_path(folder: Path, key: str) -> Path:
-    """The file of samples with this key."""
+    """Return the path of the data file with this key."""
     return folder / ROWS / f"{key}.f32"
 
 
@@ -141,7 +141,7 @@ def stamped(folder: Path, file: RowsFile) -> RowsFile:
 
 
 def read_index(folder: str | Path) -> StoreIndex:
-    """The index of a store, checked: every recording lies within a file of the store.
+    """Read and check the index of a store: every recording lies within a data file.
 
     Raises:
         DataError: no store, one that is half built, of another schema, or damaged.
@@ -159,7 +159,7 @@ def read_index(folder: str | Path) -> StoreIndex:
 
 
 def checked_index(text: str, where: str) -> StoreIndex:
-    """An index from its file's content, with every recording within a file of the store.
+    """Parse and check the content of an index file: every recording lies within a data file.
 
     Raises:
         DataError: it is of another schema, or damaged.
@@ -194,7 +194,7 @@ def without_seal(table: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def index_of(table: dict[str, Any], where: str) -> StoreIndex:
-    """An index from plain values, each of the right type.
+    """Build an index from JSON types, checking each type.
 
     Raises:
         DataError: what is wrong, and where.
@@ -209,7 +209,7 @@ def index_of(table: dict[str, Any], where: str) -> StoreIndex:
 
 
 def plain_index(index: StoreIndex) -> dict[str, Any]:
-    """An index as plain values."""
+    """Convert an index to JSON types."""
     plain: dict[str, Any] = _TREE.plain(index)
     return plain
 
@@ -253,7 +253,7 @@ def check_places(index: StoreIndex, where: str) -> None:
 def listed(
     lists: Sequence[tuple[Channel, ...]], channels: tuple[Channel, ...]
 ) -> tuple[list[tuple[Channel, ...]], int]:
-    """Lists of channels with one more where it is new, and its number."""
+    """Return the lists of channels with a new list appended if necessary, and its number."""
     merged_lists = list(lists)
     if channels not in merged_lists:
         merged_lists.append(channels)

@@ -34,7 +34,7 @@ _compared: set[str] = set()
 
 
 def read_store(folder: str | Path) -> list[Recording]:
-    """The recordings of a store, as `edp.logs.read_data_set` gives those of logs, without a sample in memory.
+    """Return the recordings of a store like `edp.logs.read_data_set`, without loading samples.
 
     Raises:
         DataError: no finished store, a file of it that is cut or was changed, or recordings that do not belong
@@ -64,7 +64,7 @@ def recording_of(entry: StoreEntry, index: StoreIndex, values: FloatArray) -> Re
 
 
 def check_store(folder: str | Path) -> StoreIndex:
-    """Read every sample and compare it with its hash; what was copied is then no longer hashed at each use.
+    """Read every sample and compare it with its hash. A checked copy is not hashed again at each use.
 
     Raises:
         DataError: no finished store, or a recording that is not what was stored; all of them are named.
@@ -81,7 +81,7 @@ def check_store(folder: str | Path) -> StoreIndex:
 
 
 def _mapped(folder: Path, file: RowsFile) -> FloatArray:
-    """The values of a file, shape ``(values,)``; what is written to them stays in this process."""
+    """Memory-map a data file, shape ``(values,)``. Changes remain in this process."""
     size = _status(folder, file).st_size
     path = rows_path(folder, file.key)
     if size != file.bytes or size % NUMBER_BYTES or size == 0:

@@ -15,7 +15,7 @@ from edp.storage.paths import is_file_at, status_of
 
 
 def local_store(address: str) -> Path:
-    """The folder of this machine that holds a copy of a store in a bucket; made, or gone on with, where it is missing.
+    """Return the local folder with a copy of a store in a bucket; a missing or incomplete copy is completed.
 
     The index holds the hash of every recording, and the copy's name is a hash of address and index: a store that was
     added to is another copy, and what a copy holds is what the index says, by every sample.
@@ -38,7 +38,7 @@ def local_store(address: str) -> Path:
 
 
 def _fill(bucket: BucketReader, address: str, index: StoreIndex, folder: Path, text: bytes) -> None:
-    """Copy what is missing; the index comes last, so that a copy that was stopped is none."""
+    """Copy the missing files; the index comes last, so that an incomplete copy is not taken for a store."""
     make_folder(folder / ROWS)
     missing = [file for file in index.files if _size(rows_path(folder, file.key)) != file.bytes]
     check_room(folder, sum(file.bytes for file in missing), address)
@@ -62,7 +62,7 @@ def _size(path: Path) -> int:
 
 @lru_cache(maxsize=64)
 def is_remote_store(address: str) -> bool:
-    """Whether a store lies at an address: its index does. Asked once by a process.
+    """Return whether a store index exists at an address. The result is cached per process.
 
     Raises:
         StorageError: the bucket refuses or does not answer.

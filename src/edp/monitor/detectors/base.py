@@ -1,4 +1,4 @@
-"""What a detector is: many streams of residuals side by side, one number each, and an alarm where it passes a limit."""
+"""Detectors: many parallel streams of residuals with one statistic each, and an alarm above a limit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Bools = NDArray[np.bool_]
 
 
 class Detector(ABC):
-    """A detector at work on `lanes` independent streams of `channels` residuals each.
+    """Running detector on `lanes` independent streams with `channels` residuals each.
 
     Residuals are standardised and uncorrelated on a healthy machine (`edp.monitor.whitening.Whitening`). One that is
     missing, NaN or infinite, says nothing and counts as 0.
@@ -30,7 +30,9 @@ class Detector(ABC):
         self.channels, self.lanes = channels, lanes
 
     def step(self, residuals: Array) -> Array:
-        """Take one row of every stream, shape (lanes, channels); the statistics, shape (lanes,), large for a fault.
+        """Process one row per stream, shape (lanes, channels).
+
+        Return the statistics, shape (lanes,), large for a fault.
 
         Raises:
             DataError: the rows have another shape.
@@ -46,7 +48,7 @@ class Detector(ABC):
 
     @abstractmethod
     def reset(self, lanes: Bools | None = None) -> None:
-        """Forget what these streams have brought, shape (lanes,); all of them by default."""
+        """Reset the given streams, shape (lanes,); all by default."""
 
 
 class DetectorSpec(ABC):
@@ -54,20 +56,20 @@ class DetectorSpec(ABC):
 
     @abstractmethod
     def build(self, channels: int, lanes: int = 1) -> Detector:
-        """A fresh detector."""
+        """Create a new detector."""
 
 
 DETECTORS: Registry[type[DetectorSpec]] = Registry("detector")
 
 
 def statistics(detector: Detector, sessions: Array) -> Array:
-    """Statistics of whole sessions from a reset on, without alarms: shape (time, lanes) of (time, lanes, channels)."""
+    """Return statistics of whole sessions, without alarms: shape (time, lanes) for (time, lanes, channels)."""
     detector.reset()
     return np.array([detector.step(rows) for rows in sessions]).reshape(len(sessions), detector.lanes)
 
 
 def in_order(terms: Array) -> Array:
-    """Sums over the last axis from the first term to the last, as C adds them; `sum` adds in pairs."""
+    """Sum over the last axis in order, like C; NumPy's `sum` adds in pairs."""
     if not terms.shape[-1]:
         return np.zeros(terms.shape[:-1])
     sums: Array = np.add.accumulate(terms, axis=-1)[..., -1]
@@ -84,7 +86,7 @@ class Alarm:
 
 
 def alarms(detector: Detector, sessions: Array, limit: float | Array) -> list[Alarm]:
-    """Alarms of sessions of shape (time, lanes, channels); a stream is reset at each of its alarms.
+    """Return the alarms of sessions with shape (time, lanes, channels); a stream is reset at each of its alarms.
 
     Args:
         detector: is reset first.

@@ -43,7 +43,7 @@ class _EDetector(Detector):
 @DETECTORS.register("e_detector")
 @dataclass(frozen=True)
 class EDetectorSpec(DetectorSpec):
-    """E-detector; its statistic is the logarithm of the e-process, so that a limit of log A is one of A rows.
+    """E-detector. Its statistic is the logarithm of the e-process, so that a limit of log A corresponds to A rows.
 
     Attributes:
         shifts: sizes of shifts that are bet on, in standard deviations.

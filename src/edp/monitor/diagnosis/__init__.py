@@ -1,1 +1,1 @@
-"""What an alarm means: which part and kind of fault, how large, how grave, and what it could be instead."""
+"""Diagnosis of alarms: component and kind of fault, size, severity, and alternatives."""

@@ -1,4 +1,4 @@
-"""What a fault is to the diagnosis: plain facts of a kind at a site, and how likely it is the cause of an alarm."""
+"""Fault classes for the diagnosis: properties of a kind at a site, and the probability of causing an alarm."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_SIZES = 32
 
 @dataclass(frozen=True)
 class FaultClass:
-    """A kind of fault at a site, to one side; the dictionary has signatures of it.
+    """Fault kind at a site in one direction; the dictionary holds its signatures.
 
     Attributes:
         kind: name of the kind.
@@ -49,13 +49,13 @@ class FaultClass:
         return ":".join((self.kind, *filter(None, (self.site,)), *sign))
 
     def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Convert to JSON types."""
         return asdict(self) | {"sizes": list(self.sizes)}
 
 
 @dataclass(frozen=True)
 class Cause:
-    """What an alarm may come from.
+    """Possible cause of an alarm.
 
     Attributes:
         kind: name of the kind of fault, or `NONE_OF_THESE`.
@@ -82,12 +82,12 @@ class Cause:
     grave: bool = False
 
     def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Convert to JSON types."""
         return asdict(self)
 
 
 def class_of(values: Any, where: str) -> FaultClass:
-    """A fault class from plain data.
+    """Create a fault class from plain data.
 
     Raises:
         DataError: a value is missing, too long, or of another kind than it must be.

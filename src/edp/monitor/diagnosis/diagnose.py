@@ -23,7 +23,7 @@ MOST_ROWS = 180
 
 
 def diagnosed(alarm: MonitorAlarm, dictionary: Dictionary, rows: Array, start: datetime | None = None) -> MonitorAlarm:
-    """The alarm with causes, sentence and severity.
+    """Return the alarm with causes, sentence and severity.
 
     Args:
         alarm: as the chain raised it.

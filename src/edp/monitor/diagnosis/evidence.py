@@ -1,4 +1,4 @@
-"""From conditioned rows since an onset to numbers that a fault is recognised by, and their scatter without one."""
+"""Features of conditioned rows since an onset, by which faults are recognised, and their healthy scatter."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ONSET = 6
 
 
 def features(rows: Array) -> Array:
-    """What each block says: its conditioned summaries and their sizes, shape (blocks, 2 * summaries).
+    """Return the features of each block: conditioned summaries and their magnitudes, shape (blocks, 2 * summaries).
 
     Sizes tell faults that come and go or change their sign with the motion, whose means vanish. A missing summary
     counts as healthy: 0, and as large as it usually is is unknown, so it stays NaN for `mean_features` to leave out.
@@ -42,7 +42,7 @@ def mean_features(rows: Array) -> Array:
 
 
 def parts_of(rows: Array, fresh: bool = True) -> tuple[Array | None, Array | None]:
-    """Rows at the onset and those after it; None where there are none.
+    """Return the rows at the onset and the later rows; None for an empty part.
 
     Args:
         rows: conditioned rows since the onset, shape (blocks, summaries).
@@ -54,7 +54,7 @@ def parts_of(rows: Array, fresh: bool = True) -> tuple[Array | None, Array | Non
 
 
 def check_stretches(lengths: Sequence[int]) -> None:
-    """Refuse healthy sessions that are too short for a diagnosis, by their numbers of blocks.
+    """Raise an error if healthy sessions have too few blocks for a diagnosis.
 
     Raises:
         DataError: too few stretches of `LONG` blocks.
@@ -111,18 +111,18 @@ class Scatter:
         return Scatter(mean, lasting, passing, matrix)
 
     def directions(self, mean: Array) -> Array:
-        """Mean features in the directions; what was never there counts as healthy."""
+        """Project mean features on the directions; missing features count as healthy."""
         away = np.asarray(mean, dtype=np.float64) - self.mean
         turned: Array = np.where(np.isfinite(away), away, 0.0) @ self.matrix
         return turned
 
     def variance(self, blocks: int) -> Array:
-        """Variance of the directions of a mean over so many blocks."""
+        """Return the variance of the directions for a mean over the given number of blocks."""
         return self.lasting + self.passing / max(blocks, 1)
 
 
 def _windows(sessions: Sequence[Array], length: int) -> Array:
-    """Mean features of stretches of so many blocks; rows with missing summaries count as healthy zeros."""
+    """Return the mean features of segments of `length` blocks; missing summaries count as healthy zeros."""
     means = []
     for session in sessions:
         rows = np.nan_to_num(np.asarray(session, dtype=np.float64), nan=0.0)

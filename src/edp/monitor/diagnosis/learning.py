@@ -1,4 +1,4 @@
-"""A dictionary from simulated fault sessions: signatures, and numbers that are chosen on sessions left out of them."""
+"""Fitting of a dictionary to simulated fault sessions: signatures, and parameters chosen on left-out sessions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MOST_JUDGED = 240
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFault:
-    """What a fault did in one session.
+    """Effect of a fault in one session.
 
     Attributes:
         draw: of the session.
@@ -73,7 +73,7 @@ def fit_dictionary(
     provenance: Mapping[str, Any],
     seed: int = 0,
 ) -> Dictionary:
-    """Signatures from all sessions; temperature, share of change and bounds from sessions that were left out.
+    """Fit signatures to all sessions; choose temperature, change fraction and bounds on left-out sessions.
 
     A left-out session is judged as an alarm would be: its change on top of a stretch of a healthy session.
 
@@ -100,7 +100,7 @@ def fit_dictionary(
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """A left-out session: what the dictionary without its draw compares with, and what an alarm would see of it."""
+    """Left-out session: candidates of the dictionary without its draw, and the evidence seen by an alarm."""
 
     tried: Candidates
     fault: SimulatedFault
@@ -128,7 +128,7 @@ def _left_out(
     healthy: Sequence[Array],
     seed: int,
 ) -> list[_Judged]:
-    """Sessions whose change is large enough to be found, each on top of a healthy stretch."""
+    """Return the sessions with a detectable change, each added to a healthy segment."""
     chance = np.random.default_rng([seed, 23])
     noise = [scatter.variance(blocks) for blocks in (ONSET, WINDOW)]
     long = [session for session in healthy if len(session) >= ONSET + WINDOW]
@@ -158,7 +158,7 @@ def _would_be_found(change: Array, noise: Sequence[Array]) -> bool:
 
 
 def _chosen(judged_sessions: Sequence[_Judged], whole: Dictionary) -> Dictionary:
-    """With the share of change and the temperature of the least logarithmic loss, and a misfit that few have."""
+    """Choose change fraction and temperature with the least logarithmic loss, and a rarely exceeded misfit bound."""
     best, least = whole, np.inf
     for changing in CHANGING:
         found_by = [likelihoods(case.tried, case.seen, changing) for case in judged_sessions]

@@ -1,4 +1,4 @@
-"""Which faults of the dictionary explain the rows since an onset, how large they would be, and how likely each is."""
+"""Matching of the rows since an onset with the dictionary: explaining faults, sizes and probabilities."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MOST_CAUSES = 8
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """How well each fault explains the evidence.
+    """Fit of each fault to the evidence.
 
     Attributes:
         probabilities: of each fault, shape (faults,); with `none` they sum to 1.
@@ -74,7 +74,7 @@ def match(dictionary: Dictionary, rows: Array, fresh: bool = True) -> Match:
 
 
 def match_directions(dictionary: Dictionary, seen: Sequence[Seen | None]) -> Match:
-    """`match` from the directions at the onset and after it on; None where there are no rows of a part."""
+    """Match from the directions at the onset and later; None for a part without rows."""
     matched = _matched(dictionary, seen, further=False)
     # Carried on, signatures are coarse: they are asked only where no size of the ladders explains the evidence.
     return matched if matched.none <= MOST_STRANGE else _matched(dictionary, seen, further=True)
@@ -109,7 +109,7 @@ def _all_candidates(dictionary: Dictionary, further: bool) -> Candidates:
 
 
 def candidates(dictionary: Dictionary, further: bool = True) -> Candidates:
-    """All that `match` compares with; `further`: with sizes beyond the ladders."""
+    """Return all candidates of `match`; `further` includes sizes beyond the ladders."""
     parts = [_of_fault(dictionary, number, fault, further) for number, fault in enumerate(dictionary.classes)]
     counts = np.array([len(sizes) for sizes, _ in parts])
     return Candidates(
@@ -176,7 +176,7 @@ def _of_fault(dictionary: Dictionary, number: int, fault: FaultClass, beyond: bo
 
 
 def causes_of(dictionary: Dictionary, matched: Match, most: int = MOST_CAUSES) -> tuple[Cause, ...]:
-    """The most likely causes, the first of them from the most likely part.
+    """Return the most probable causes, the first from the most probable component.
 
     A part may have many kinds of faults that look alike: what a mechanic looks at first is the part whose faults
     together are the most likely, and of it the likeliest fault.
@@ -194,7 +194,7 @@ def causes_of(dictionary: Dictionary, matched: Match, most: int = MOST_CAUSES) -
 
 
 def _by_part(causes: Sequence[Cause], parts: dict[str, float]) -> list[Cause]:
-    """The likeliest fault of each of the three likeliest parts, then all others by their probability."""
+    """Sort causes: the most probable fault of each of the three most probable components, then the others."""
     order = sorted(causes, key=lambda cause: (-cause.probability, cause.kind, cause.site))
     first = []
     for part in sorted(parts, key=lambda name: (-parts[name], name))[:3]:

@@ -16,7 +16,7 @@ SURE = 0.5
 
 
 def size_text(size: float, unit: str) -> str:
-    """A size with two to three digits and its unit, without its sign."""
+    """Format a size with two to three digits and its unit, without its sign."""
     value = abs(size)
     digits = max(0, 1 - math.floor(math.log10(value))) if value > 0.0 else 0
     text = number(value, min(digits, 4))
@@ -24,7 +24,7 @@ def size_text(size: float, unit: str) -> str:
 
 
 def cause_words(fault: FaultClass, size: float | None) -> str:
-    """What a fault of this size is, as a sentence without a full stop."""
+    """Describe a fault of this size in words, without a full stop."""
     text = fault.words
     if size is not None:
         over = size >= fault.neutral
@@ -39,7 +39,7 @@ def cause_words(fault: FaultClass, size: float | None) -> str:
 
 
 def clock(seconds: float, start: datetime | None = None) -> str:
-    """A moment of a recording: the time of day where its start is known, else the time from its start, h:mm:ss."""
+    """Format a time in a recording: time of day if its start is known, otherwise time since its start, h:mm:ss."""
     if start is not None:
         return f"{start + timedelta(seconds=round(seconds)):%H:%M:%S}"
     whole = max(0, round(seconds))

@@ -1,4 +1,4 @@
-"""How grave an alarm is: a note, a warning, or a reason to stop."""
+"""Severity of an alarm: note, warning or stop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ENOUGH = 0.5
 
 
 def severity(causes: Sequence[Cause]) -> Severity:
-    """The severity of an alarm with these causes, the most likely one first.
+    """Return the severity of an alarm with these causes, the most probable first.
 
     `stop`: faults by which a load may fall or a movement may not stop are more likely than not, and large. `note`: the
     most likely cause is hardly larger than what can be seen at all. All else, and what has no name, is a warning.

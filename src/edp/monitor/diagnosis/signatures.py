@@ -1,4 +1,4 @@
-"""The dictionary of a monitor: what each fault does to its residuals, at each size, by simulation."""
+"""Dictionary of a monitor: simulated effect of each fault on the residuals, at each size."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def remove_dictionary(folder: Path) -> None:
 
 
 def load_dictionary(folder: Path, summaries: Sequence[str]) -> Dictionary | None:
-    """Read the dictionary of a monitor; None where there is none.
+    """Read the dictionary of a monitor; None if there is none.
 
     Args:
         folder: of the monitor.

@@ -1,4 +1,4 @@
-"""What cannot be told apart with the present sensors, and which further sensor would separate it."""
+"""Faults that the present sensors cannot distinguish, and additional sensors that would separate them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST_SESSIONS = 3
 
 @dataclass(frozen=True)
 class Confusion:
-    """Two faults that cannot be told apart.
+    """Two indistinguishable faults.
 
     Attributes:
         first: kind and site of one, and `second` of the other.
@@ -40,7 +40,7 @@ class Confusion:
 
 
 def confusion_of(entry: Any, where: str) -> Confusion:
-    """A pair from plain data.
+    """Create a pair from plain data.
 
     Raises:
         DataError: it is none.
@@ -60,7 +60,7 @@ def confusion_of(entry: Any, where: str) -> Confusion:
 def confusions(
     names: Sequence[str], probabilities: Array, truth: Numbers, sensors: Mapping[str, Array]
 ) -> tuple[Confusion, ...]:
-    """Pairs of faults that cannot be told apart, the worst first.
+    """Return pairs of indistinguishable faults, the worst first.
 
     Args:
         names: of the faults.
@@ -94,7 +94,7 @@ def _behind(logits: Array, right: int, wrong: int) -> float:
 
 
 def _best_sensor(first: Numbers, second: Numbers, sensors: Mapping[str, Array]) -> tuple[str, float | None]:
-    """The channel with the fewest wrong answers between two groups of sessions; each is left out of its own mean."""
+    """Return the channel with the fewest errors between two groups of sessions, by leave-one-out means."""
     best: tuple[str, float | None] = "", None
     for name in sorted(sensors):
         values = sensors[name]
@@ -105,7 +105,7 @@ def _best_sensor(first: Numbers, second: Numbers, sensors: Mapping[str, Array]) 
 
 
 def _left_out(own: Array, other: Array) -> float:
-    """Share of sessions nearer to the mean of the others than to that of their own without them."""
+    """Return the fraction of sessions nearer to the other group's mean than to their own leave-one-out mean."""
     means = (own.sum(axis=0) - own) / (len(own) - 1)
     to_own = ((own - means) ** 2).sum(axis=1)
     to_other = ((own - other.mean(axis=0)) ** 2).sum(axis=1)

@@ -1,4 +1,4 @@
-"""Residuals of a machine, measured less expected: a source a file, entered in `RESIDUALS` by name."""
+"""Residuals of a machine (measured minus expected): one module per source, registered in `RESIDUALS`."""
 
 from edp.monitor.residuals.balances import BalancesSpec as BalancesSpec
 from edp.monitor.residuals.base import RESIDUALS, FitMaterial, ResidualSource, ResidualSpec, SourceParts, SourceState

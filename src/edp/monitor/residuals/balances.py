@@ -1,4 +1,4 @@
-"""Physical balances: a position against the integral of its velocity, a velocity against that of its acceleration.
+"""Physical balances: position minus integrated velocity, velocity minus integrated acceleration.
 
 What stores heat has no rate that is measured, but it cannot jump: a temperature is compared with itself some time ago.
 """
@@ -44,7 +44,7 @@ MOST_ROWS = 200_000
 
 
 class Balances(ResidualSource):
-    """Levels less the integrals of their rates, where what is older than `memory_s` fades.
+    """Levels minus the integrals of their rates, with an exponential memory of `memory_s`.
 
     With d[t] = x[t] - x[t-1] - gain v[t] dt the residual is e[t] = left e[t-1] + d[t], left = 1 - dt / memory_s: a
     leaky sum has no drift, and a step of the level stays visible for `memory_s`. At a tick at which level or rate is
@@ -186,7 +186,7 @@ class BalancesSpec(ResidualSpec):
 
 
 def slow_channels(channels: Sequence[Channel], sessions: Sequence[Recording]) -> list[Channel]:
-    """Channels that cannot jump and do change: of one that stands still there is nothing to tell."""
+    """Return channels that cannot jump and are not constant."""
     return [
         channel
         for channel in channels

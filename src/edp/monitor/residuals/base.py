@@ -1,4 +1,4 @@
-"""What a source of residuals is: raw channels go in tick by tick, measured less expected comes out."""
+"""Interface of residual sources: raw channels in sample by sample, measured minus expected out."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SISTERS = 11
 
 @dataclass(frozen=True, eq=False)
 class FitMaterial:
-    """What residuals are fitted to.
+    """Data for fitting residuals.
 
     Attributes:
         train: healthy sessions, all with `channels` at `rate_hz`.
@@ -61,7 +61,7 @@ class FitMaterial:
 
 @dataclass(frozen=True, eq=False)
 class SourceParts:
-    """A source as it lies on disk: plain values, arrays, and the networks that it runs.
+    """Serialised source: plain values, arrays, and its networks.
 
     Attributes:
         plain: JSON values.
@@ -120,7 +120,7 @@ class ResidualSource(ABC):
         return SourceState(last, np.zeros((streams, len(self.inputs)), dtype=bool), self._start(streams))
 
     def run(self, rows: Rows, state: SourceState) -> tuple[Rows, SourceState]:
-        """Residuals of a stretch.
+        """Return the residuals of a segment.
 
         Args:
             rows: raw inputs in SI units, shape (streams, ticks, inputs); NaN marks what is missing.
@@ -151,14 +151,14 @@ class ResidualSource(ABC):
 
     @property
     def _read_by(self) -> NDArray[np.bool_]:
-        """Which inputs each residual reads, shape (inputs, residuals)."""
+        """Return a mask of the inputs read by each residual, shape (inputs, residuals)."""
         return np.array([[name in reads for reads in self.reads] for name in self.inputs]).reshape(
             len(self.inputs), len(self.names)
         )
 
     @staticmethod
     def _filled(rows: Rows, there: NDArray[np.bool_], state: SourceState) -> tuple[Rows, Rows]:
-        """Rows in which the last value stands in for each missing one, and the last values behind them."""
+        """Return rows with missing values replaced by the last value, and the last values."""
         if there.all():
             return rows, rows[:, -1].copy()
         ticks = np.arange(1, rows.shape[1] + 1)[None, :, None]
@@ -169,7 +169,9 @@ class ResidualSource(ABC):
         return filled, filled[:, -1].copy()
 
     def of_sister(self, rng: np.random.Generator, tolerance: float) -> ResidualSource:
-        """The source as it would have to be for another machine of the same series; itself where it knows no machine.
+        """Return the source adjusted as if for another machine of the series.
+
+        Unchanged if it has no machine parameters.
 
         Args:
             rng: draws that machine.
@@ -183,20 +185,20 @@ class ResidualSource(ABC):
 
     @abstractmethod
     def _start(self, streams: int) -> Any:
-        """What the source itself carries, at the start."""
+        """Return the initial state of the source."""
 
     @abstractmethod
     def _run(self, rows: Rows, there: NDArray[np.bool_], own: Any) -> tuple[Rows, Any]:
-        """`run` on finite rows; `there` says which of their values were measured and did not have to be held."""
+        """Compute `run` on finite rows; `there` marks measured values, the others were held."""
 
     @abstractmethod
     def parts(self) -> SourceParts:
-        """All of it, for its files."""
+        """Return everything to be stored."""
 
     @classmethod
     @abstractmethod
     def of_parts(cls, parts: SourceParts) -> ResidualSource:
-        """The source that `parts` describes.
+        """Create the source from the result of `parts`.
 
         Raises:
             ValueError: values that cannot be; files are data from outside.
@@ -214,7 +216,7 @@ class ResidualSpec(ABC):
 
     @abstractmethod
     def fit(self, material: FitMaterial) -> ResidualSource | None:
-        """A source fitted to healthy sessions; None where these channels offer nothing to judge.
+        """Fit a source to healthy sessions; None if the channels are unsuitable.
 
         Raises:
             EdpError: material that cannot be used.
@@ -227,7 +229,7 @@ RESIDUALS: Registry[type[ResidualSpec]] = Registry("residual")
 
 
 def texts_of(values: Any, what: str) -> tuple[str, ...]:
-    """A list of texts from a file.
+    """Return a list of texts from a file after a check.
 
     Raises:
         ValueError: something else, or too many.
@@ -265,7 +267,7 @@ def residuals_of(source: ResidualSource, recordings: Sequence[Recording], stream
 
 
 def sisters_of(sources: Sequence[ResidualSource], tolerance: float, number: int) -> list[ResidualSource]:
-    """Sources as if a session were that of another machine of the series, drawn by the number of the session."""
+    """Return sources as if the session were of another machine of the series, seeded by the session number."""
     if not tolerance:
         return list(sources)
     rng = np.random.default_rng([number, SISTERS])
@@ -282,7 +284,7 @@ def rows_of(recording: Recording, names: Sequence[str]) -> Rows:
 
 
 def residual_labels(plain: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Inputs and units of a source from its plain values.
+    """Return inputs and units of a source from its plain values.
 
     Raises:
         ValueError: too many residuals, or something else than texts.
@@ -300,7 +302,7 @@ def mean_inputs(material: FitMaterial, inputs: Sequence[str]) -> Rows:
 
 
 def middle_of(parts: SourceParts) -> tuple[tuple[str, ...], Rows]:
-    """Inputs of a source, and what stands in for each that was never there.
+    """Return the inputs of a source and the substitutes for absent channels.
 
     Raises:
         ValueError: values that cannot be.

@@ -67,7 +67,7 @@ class CommitteeOptions:
             raise ConfigError(f"residuals: members = {self.members}; a multiple of {FOLDS} must hold")
 
     def trained(self, task: Task, material: FitMaterial, minutes: float) -> tuple[Bundle, Prepared]:
-        """A network for a task, and what it was trained on."""
+        """Train a network for a task and return it with its training data."""
         data = _prepared(task, material)
         lags = sorted({max(1, round(span * material.rate_hz)) for span in self.lags_s})
         backbone = CommitteeSpec(
@@ -83,7 +83,7 @@ class CommitteeOptions:
 
 
 def constant_channels(material: FitMaterial) -> set[str]:
-    """Channels that never change: there is nothing to tell about them, nor by them."""
+    """Return channels that never change, which can be neither monitored nor used as inputs."""
     rows = [session.select(material.names) for session in material.train]
     low, high = (np.stack([f(part, axis=0) for part in rows]) for f in (np.min, np.max))
     still = low.min(axis=0) == high.max(axis=0)
@@ -107,7 +107,7 @@ def _prepared(task: Task, material: FitMaterial) -> Prepared:
 
 
 def _shortened(series: Sequence[Series]) -> list[Series]:
-    """Series of `VALIDATED_TICKS` in all, the same share of each."""
+    """Shorten the series in equal proportion to `VALIDATED_TICKS` samples in total."""
     share = min(1.0, VALIDATED_TICKS / max(1, sum(part.samples for part in series)))
     cut = [part.samples if share == 1.0 else max(1000, int(part.samples * share)) for part in series]
     return [Series(p.name, p.inputs[:n], p.targets[:n]) for p, n in zip(series, cut, strict=True)]

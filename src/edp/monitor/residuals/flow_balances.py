@@ -1,4 +1,4 @@
-"""Balances of flow: what a cylinder's chamber must take in by its valve, against how fast its piston moves.
+"""Flow balances: flow into a cylinder chamber through its valve, compared with the piston velocity.
 
 A spool follows its command; how far it opens and the pressures on both sides of it tell the flow, whatever load or soil
 pushes. What is wrong with the valve, the seals, the oil, or one of the sensors leaves a rest.
@@ -41,6 +41,7 @@ from edp.monitor.residuals.flow_curves import (
 from edp.monitor.residuals.flow_fit import fit_chambers, fit_oil_range
 from edp.recording import Recording
 from edp.settings.bounds import MOST_ROWS, check_bounds, integer, span
+from edp.signals import KINDS, Kind
 from edp.wording import figure, percent
 
 PREFIX = "flow:"
@@ -68,7 +69,7 @@ class ChamberCurves:
     doubts: Singles
 
     def of_sister(self, rng: np.random.Generator, tolerance: float) -> ChamberCurves:
-        """The balance of another machine of the series; see `ResidualSource.of_sister`."""
+        """Return the balance of another machine of the series; see `ResidualSource.of_sister`."""
         paths, lines = len(self.values), len(self.lines)
         later, wider = (rng.uniform(-tolerance, tolerance, paths) for _ in range(2))
         values = opening_later(self.values.astype(np.float64), later) * (1.0 + wider[:, None])
@@ -92,7 +93,7 @@ class OilRange:
     high: float
 
     def beyond(self, values: Singles) -> NDArray[np.bool_]:
-        """Which temperatures are outside."""
+        """Return a mask of the temperatures outside the range."""
         outside: NDArray[np.bool_] = (values < np.float32(self.low)) | (values > np.float32(self.high))
         return outside
 
@@ -148,9 +149,10 @@ class FlowBalances(ResidualSource):
         share = float(self.oil.beyond(recording.column(name)).mean())
         if not share:
             return ""
+        low, high = (KINDS[Kind.TEMPERATURE].to_report(limit) for limit in (self.oil.low, self.oil.high))
         return (
-            f"balances of flow are silent in {percent(share)} of it: '{name}' is outside {figure(self.oil.low)} to "
-            f"{figure(self.oil.high)} K, which healthy logs cover"
+            f"balances of flow are silent in {percent(share)} of it: '{name}' is outside {figure(low)} to "
+            f"{figure(high)} degC, which healthy logs cover"
         )
 
     def _read(self, spots: ChamberPlaces) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What flows through a spool: where the spool is by its command, how far that opens which path, and what drives it.
+"""Flow through a spool: spool position from commands, opening of each path, and driving pressure.
 
 Single precision and a fixed order throughout, so that C gives the same numbers.
 """
@@ -39,7 +39,7 @@ BACK = 2
 
 @dataclass(frozen=True, eq=False)
 class SpoolModel:
-    """Where spools are by their commands: a dead time, two stages of second order, and play between them.
+    """Spool positions from commands: dead time, two second-order stages, and play between them.
 
     Attributes:
         extend: place of the command that extends, among the inputs, shape (spools,).
@@ -77,13 +77,13 @@ class SpoolModel:
         return int(np.floor(self.dead).max(initial=0.0)) + BACK + 2
 
     def demands(self, rows: Singles) -> Singles:
-        """Commands as shares of full ones, shape (..., spools)."""
+        """Return the commands as fractions of full scale, shape (..., spools)."""
         away = np.where(self.retract >= 0, rows[..., np.maximum(self.retract, 0)], np.float32(0.0))
         scaled: Singles = (rows[..., self.extend] - away) * self.gain
         return scaled
 
     def start(self, demand: Singles) -> list[Singles]:
-        """State at rest at a demand, shape (streams, spools): two numbers of each stage, and the play's."""
+        """Return the steady state for a demand, shape (streams, spools): two values per stage, and the play's."""
         stages = [
             np.stack([demand, demand * (self.stages[:, stage, 1] - self.stages[:, stage, 3])], axis=-1)
             for stage in (0, 1)
@@ -91,7 +91,7 @@ class SpoolModel:
         return [*stages, demand]
 
     def run(self, rows: Singles, state: Sequence[Singles]) -> tuple[Singles, list[Singles]]:
-        """Positions `BACK` ticks before each of the last ticks, as shares of travel.
+        """Return the positions `BACK` samples before each of the last samples, as fractions of travel.
 
         Args:
             rows: `memory` rows, and the ticks behind them, shape (streams, memory + ticks, inputs).
@@ -116,7 +116,7 @@ class SpoolModel:
 
 
 def stage_of(frequency_hz: float, rate_hz: float) -> Singles:
-    """b1, b2, a1, a2 of a low-pass of second order whose input stands still between ticks."""
+    """Return b1, b2, a1, a2 of a second-order low-pass with an input held between samples."""
     w = 2.0 * np.pi * frequency_hz
     b, a, _ = cont2discrete(([w * w], [1.0, 2.0 * DAMPING * w, w * w]), 1.0 / rate_hz, "zoh")
     return np.array([b[0, 1], b[0, 2], a[1], a[2]], np.float32)
@@ -157,14 +157,14 @@ def played(values: Singles, width: np.float32, before: Singles) -> tuple[Singles
 
 
 def root(drop: Singles) -> Singles:
-    """The root of a pressure difference in MPa, where it is positive: dp / (dp^2 + 0.01)^(1/4)."""
+    """Return the smooth root of a positive pressure difference in MPa: dp / (dp^2 + 0.01)^(1/4)."""
     positive = np.maximum(drop, np.float32(0.0))
     return np.asarray(positive / np.sqrt(np.sqrt(positive * positive + SMOOTH)), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class ChamberPlaces:
-    """Where the channels of a chamber's balance are among the inputs.
+    """Indices of the channels of a chamber's balance among the inputs.
 
     Attributes:
         velocity: of its cylinder.
@@ -194,13 +194,15 @@ class ChamberPlaces:
 
     @property
     def paths(self) -> int:
-        """Curves of it; see `paths_of`."""
+        """Number of curves; see `paths_of`."""
         return len(self.supplies) * len(self.spools) + 4
 
 
 def paths_of(spots: ChamberPlaces, rows: Singles, spools: Singles) -> list[tuple[Singles, Singles]]:
-    """Travel that opens each path, and the root of what drives it: in from the pumps, in from the other chamber, out to
-    the tank, out to the other chamber, what a cushion takes from the way to the tank, in by the second spool.
+    """Return the travel that opens each path and the root of its driving pressure.
+
+    Paths: in from the pumps, in from the other chamber, out to the tank, out to the other chamber, and the parts
+    blocked by a cushion.
 
     Args:
         spots: of the chamber.
@@ -224,14 +226,14 @@ def paths_of(spots: ChamberPlaces, rows: Singles, spools: Singles) -> list[tuple
 
 
 def shut_of(spots: ChamberPlaces, rows: Singles) -> Singles:
-    """Share of the outflow that a cushion may take, from nothing at its beginning to 1 at the end of the stroke."""
+    """Return the fraction of the outflow blocked by a cushion, from 0 at its beginning to 1 at the end."""
     near = _near(spots, rows, spots.end)
     shut: Singles = np.float32(1.0) - near * near * (np.float32(3.0) - near - near)
     return shut
 
 
 def _near(spots: ChamberPlaces, rows: Singles, end: float) -> Singles:
-    """Distance to an end of the stroke in lengths of the cushion, 1 at most; 1 without a stroke."""
+    """Return the distance to an end of the stroke in cushion lengths, at most 1; 1 without a stroke."""
     if spots.stroke < 0:
         return np.ones(rows.shape[:-1], np.float32)
     distance = np.abs(rows[..., spots.stroke] - np.float32(end)) * np.float32(1.0 / spots.cushion)
@@ -240,8 +242,10 @@ def _near(spots: ChamberPlaces, rows: Singles, end: float) -> Singles:
 
 
 def doubts_of(spots: ChamberPlaces, rows: Singles, rates: Singles, through: Singles) -> list[Singles]:
-    """What makes a balance uncertain, none of it negative: nothing in particular; fast compression, and that of soft
-    oil; a chamber that is drawn empty; either end of the stroke; a port relief; and much flow.
+    """Return the non-negative sources of uncertainty of a balance.
+
+    They are constant; fast compression, also of soft oil; an emptied chamber; the ends of the stroke; flow through
+    spools.
 
     Args:
         spots: of the chamber.
@@ -258,8 +262,9 @@ def doubts_of(spots: ChamberPlaces, rows: Singles, rates: Singles, through: Sing
 
 
 def lines_of(spots: ChamberPlaces, rows: Singles, rates: Singles) -> list[Singles]:
-    """Terms without a spool: what is constant; what the oil takes up as it is compressed, with the volume and with free
-    air in it; what is drawn in from the tank; leaks; and reliefs.
+    """Return the terms without a spool: constant; compression by volume and free air; suction from the tank; leaks.
+
+    Relief valves.
 
     Args:
         spots: of the chamber.
@@ -289,7 +294,7 @@ def slopes_of(values: Array) -> Array:
 
 
 def opening_later(values: Array, shares: Array) -> Array:
-    """Curves that begin to open later by shares of where they begin, shape (paths, knots); see `BEGUN`."""
+    """Return curves whose opening begins later by fractions of its position, shape (paths, knots); see `BEGUN`."""
     knots, later = KNOTS.astype(np.float64), np.empty_like(values)
     for path, (curve, share) in enumerate(zip(values, shares, strict=True)):
         begun = np.abs(curve) > BEGUN * np.abs(curve).max()
@@ -299,7 +304,7 @@ def opening_later(values: Array, shares: Array) -> Array:
 
 
 def opened(travel: Singles, values: Singles, slopes: Singles) -> Singles:
-    """A curve at a travel: straight between knots, constant behind the last.
+    """Evaluate a curve at a travel: linear between knots, constant after the last.
 
     Args:
         travel: any shape.

@@ -55,7 +55,7 @@ LEAST_TANK = 0.005
 def fit_chambers(
     material: FitMaterial, rows: int, trials: int, least: float
 ) -> tuple[tuple[str, ...], SpoolModel, list[Fitted]] | None:
-    """Balances of all chambers that sensors tell enough about; None without one.
+    """Fit the balances of all chambers with sufficient sensors; None without one.
 
     Returns:
         Names of the inputs that are read, the spools, and places, values, slopes, lines and doubts of each chamber.
@@ -95,7 +95,7 @@ def _axes_of(material: FitMaterial) -> list[Axis]:
 
 
 def _supplies_of(material: FitMaterial) -> tuple[int, ...]:
-    """Places of pressures that belong to no axis: those of pumps."""
+    """Return the indices of pressures without an axis, which are pump pressures."""
     of_axes = {name for axis in roles_of_channels(material.channels).axes for name in axis.pressures}
     pumps = [i for i, c in enumerate(material.channels) if c.kind is Kind.PRESSURE and c.name not in of_axes]
     return tuple(pumps[:4])
@@ -104,7 +104,7 @@ def _supplies_of(material: FitMaterial) -> tuple[int, ...]:
 def _places(
     axis: Axis, names: Sequence[str], supplies: tuple[int, ...], sessions: Sequence[Singles]
 ) -> list[ChamberPlaces]:
-    """Both chambers of an axis, with the spools of its own model: 0, and 1 for that of the second pump."""
+    """Return both chambers of an axis with the spools of its own model: 0, and 1 for the second pump's."""
     at = {name: i for i, name in enumerate(names)}
     head, rod = (at[name] for name in axis.pressures)
     stroke = at.get(axis.stroke, -1)
@@ -146,7 +146,7 @@ def _searched(
     rate_hz: float,
     trials: int,
 ) -> SpoolModel:
-    """The spools with which the curves tell the velocity best."""
+    """Return the spool model whose curves explain the velocity best."""
     chosen = _stretch(sessions, axis, names)
     stride = max(1, len(chosen) * len(chosen[0]) // SEARCHED_ROWS)
     at = {name: i for i, name in enumerate(names)}
@@ -173,14 +173,14 @@ def _searched(
 
 
 def _moved(start: Sequence[float], index: int) -> list[float]:
-    """A corner of the first simplex: two ticks, a fifth of a frequency, half of a play."""
+    """Return a corner of the initial simplex: shifts of dead time, frequency or play."""
     moved = list(start)
     moved[index] += (0.015, 1.5, 0.006, 0.015, 1.5)[index]
     return moved
 
 
 def _stretch(sessions: Sequence[Singles], axis: Axis, names: Sequence[str]) -> list[Singles]:
-    """Some sessions, of equal length, in which the axis is commanded most."""
+    """Return some sessions of equal length in which the axis is commanded most."""
     at = [list(names).index(name) for name in axis.command]
     usual = min(len(rows) for rows in sessions)
     count = max(1, min(len(sessions), SEARCHED_TICKS // usual))
@@ -195,7 +195,7 @@ Part = tuple[list[tuple[Singles, Singles]], list[Singles], Singles, Singles, Sin
 def _terms(
     spots: ChamberPlaces, model: SpoolModel, rows: Singles, rate_hz: float, keep: Callable[[Singles], Singles]
 ) -> Part:
-    """What a balance is made of at the ticks of a session that are kept, `BACK` ticks ago."""
+    """Return the terms of a balance at selected samples of a session, `BACK` samples ago."""
     whole = np.concatenate([np.repeat(rows[:1], model.memory, axis=0), rows])[None]
     spools, _ = model.run(whole, model.start(model.demands(rows[None, 0])))
     end, ticks = whole.shape[1], len(rows)
@@ -229,7 +229,7 @@ def _solved(columns: Array, target: Array) -> Array:
 
 
 def _left(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles], rate_hz: float, stride: int) -> float:
-    """Mean size of what a balance leaves on the sessions that it is fitted to, over that of the velocity."""
+    """Return the mean residual of a balance on its fitting sessions, relative to the mean velocity."""
     parts = [_terms(spots, model, rows, rate_hz, lambda v: v[50::stride]) for rows in sessions]
     columns, target = np.concatenate([_columns(part) for part in parts]), np.concatenate([part[2] for part in parts])
     target = spots.sign * target.astype(np.float64)
@@ -262,7 +262,7 @@ def _curves(spots: ChamberPlaces, model: SpoolModel, sessions: Sequence[Singles]
 
 
 def fit_oil_range(material: FitMaterial) -> tuple[str, float, float] | None:
-    """The thermometer of the oil, and the temperatures that healthy sessions cover; None without one.
+    """Return the oil temperature channel and the temperature range of healthy sessions; None without one.
 
     A channel of the vocabulary's name, or the only temperature there is.
     """
@@ -276,7 +276,7 @@ def fit_oil_range(material: FitMaterial) -> tuple[str, float, float] | None:
 
 
 def _doubts(columns: Array, off: Array) -> Array:
-    """How far a balance usually is off, as a sum of what makes it uncertain, none of it negative."""
+    """Fit the usual deviation of a balance as a non-negative sum of its sources of uncertainty."""
     usual = max(float(np.median(off)), 1e-12)
     size = np.maximum(columns.max(axis=0), 1e-12)
     scaled, _ = nnls(columns / size, off)
@@ -293,7 +293,7 @@ def _explained(
     rate_hz: float,
     fitted: Curves,
 ) -> float:
-    """Share of the mean size of a velocity that a balance tells."""
+    """Return the fraction of the mean velocity explained by a balance."""
     values, _, lines, _ = fitted
     factors = np.concatenate([values[:, 1:].ravel(), lines]).astype(np.float64)
     off = size = 0.0

@@ -1,4 +1,4 @@
-"""Which channels are judged together, and what must not be read for it."""
+"""Groups of channels that are monitored together, and the inputs excluded for each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_SINGLE = 24
 
 @dataclass(frozen=True)
 class Group:
-    """Channels that are judged together.
+    """Channels that are monitored together.
 
     Attributes:
         name: for messages.
@@ -37,7 +37,7 @@ def sensed_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
 
 
 def groups_of(channels: Sequence[Channel]) -> tuple[Group, ...]:
-    """Groups by Table A.1; of other machines every channel is one, or where there are many every kind."""
+    """Return the groups by Table A.1; for other machines one per channel, or per kind if there are many."""
     names = {channel.name for channel in channels}
     if len(names & {*TABLE_A1}) >= 9:
         return _excavator_groups(names)

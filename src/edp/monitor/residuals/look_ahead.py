@@ -1,4 +1,4 @@
-"""Look-ahead errors: what a network of `edp train` predicted some ticks ago, against what came."""
+"""Look-ahead errors: k-step-ahead predictions of an `edp train` network minus later measurements."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class LookAhead(ResidualSource):
 
 
 def _predicted(predictor: Predictor, x: torch.Tensor, state: Any) -> tuple[Rows, Rows, Any]:
-    """Predictions and half the widths of their first intervals, one where there are none; the state behind them."""
+    """Return predictions, half widths of the first intervals (1 without intervals) and the next state."""
     center, bounds, state = predictor.predict_with_intervals(x, state)
     values = center.numpy()
     if bounds is None:
@@ -167,7 +167,7 @@ class LookAheadSpec(CommitteeOptions, ResidualSpec):
         return LookAhead({str(i): b for i, b in enumerate(usable)}, inputs, mean_inputs(material, inputs))
 
     def _own(self, material: FitMaterial) -> Bundle | None:
-        """A network of all channels for what moves and for pressures, or where there are none for every channel."""
+        """Train a network from all channels for moving quantities and pressures, or for every channel without these."""
         constant = constant_channels(material)
         channels = [channel for channel in material.channels if channel.name not in constant]
         targets = [channel.name for channel in channels if channel.kind in AHEAD] or [c.name for c in channels]

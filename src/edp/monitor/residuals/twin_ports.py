@@ -1,4 +1,4 @@
-"""A twin with the ports of what is judged free: plant model against machine, the rest of the state measured."""
+"""Twin with free ports of the monitored group: plant model against machine, other states measured."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_PERIOD = 10_000_000
 
 
 class TwinPorts(ResidualSource):
-    """A twin run once for each group of its answers, whose ports are free while the others are measured.
+    """Twin run once per group of its outputs, with free ports for the group and measured ones for the others.
 
     Every `period` ticks the ports of the group read what is measured, so that free runs do not drift away; the residual
     of that tick still is against the free run up to it.
@@ -126,7 +126,7 @@ class TwinPorts(ResidualSource):
 @RESIDUALS.register("twin_ports")
 @dataclass(frozen=True, kw_only=True)
 class TwinPortsSpec(ResidualSpec):
-    """The first twin that the monitor is given, with ports free; without one there is nothing to judge.
+    """Uses the first twin given to the monitor, with free ports; without a twin there are no residuals.
 
     Attributes:
         free_s: time that the ports of a group run free before they are measured again, s.

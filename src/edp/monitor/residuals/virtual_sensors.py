@@ -1,4 +1,4 @@
-"""Virtual sensors: networks that tell each group of channels from the others, without its own past.
+"""Virtual sensors: networks that estimate each channel group from the others, without its own past.
 
 A network that is fed the past of a faulty channel follows the fault; one that never sees the channel cannot. Each group
 has a predictor of horizon 0: its residual is what was measured less what the others say.
@@ -46,7 +46,7 @@ MOST_EVERY = 1000
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """Of one network: ticks until it runs next, its last residuals (streams, judged), its memory."""
+    """Schedule of one network: samples until its next run, its last residuals (streams, judged), its state."""
 
     due: int
     residuals: Rows
@@ -135,7 +135,7 @@ class VirtualSensors(ResidualSource):
 @RESIDUALS.register("virtual_sensors")
 @dataclass(frozen=True, kw_only=True)
 class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
-    """Networks that tell each group of channels from the others: a linear map and a few perceptrons on changes.
+    """Networks that estimate each channel group from the others: a linear map and some perceptrons on changes.
 
     Attributes:
         least: share of a channel's mean deviation that a virtual sensor must explain on the sessions that choose; a
@@ -168,7 +168,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         return self.together(bundles, material)
 
     def groups(self, material: FitMaterial) -> tuple[Group, ...]:
-        """Channels that a network each judges together."""
+        """Return the channel groups with one network each."""
         if material.groups:
             groups: tuple[Group, ...] = tuple(Group(" and ".join(names), names) for names in material.groups)
         else:
@@ -179,7 +179,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         return tuple(group for group in groups if group.judged and self._fed(group, changing))
 
     def network(self, group: Group, material: FitMaterial, networks: int) -> Bundle | None:
-        """The network of a group, in its part of the time of so many; None where it explains none of its channels."""
+        """Train the network of a group with its part of the time budget; None if it explains no channel."""
         constant = constant_channels(material)
         changing = replace(material, channels=tuple(c for c in material.channels if c.name not in constant))
         if self.every > 1:
@@ -187,7 +187,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         return self._fitted(group, changing, 0.8 * material.minutes / networks)
 
     def together(self, bundles: dict[str, Bundle], material: FitMaterial) -> VirtualSensors | None:
-        """The source of these networks; None without any."""
+        """Create the source of these networks; None without any."""
         if not bundles:
             return None
         used = {name for b in bundles.values() for name in (*b.task.inputs, *b.task.targets)}
@@ -200,7 +200,7 @@ class VirtualSensorsSpec(CommitteeOptions, ResidualSpec):
         return tuple(channel for channel in material.channels if channel.name not in apart)
 
     def _fitted(self, group: Group, material: FitMaterial, minutes: float) -> Bundle | None:
-        """The network of a group; None where it explains none of its channels."""
+        """Train the network of a group; None if it explains no channel."""
         bundle, data = self.trained(self._task(group, group.judged, material), material, minutes)
         explained = _explained(bundle.predictor, data.validation or data.train)
         remaining = tuple(name for name, share in zip(group.judged, explained, strict=True) if share >= self.least)

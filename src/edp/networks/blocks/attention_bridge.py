@@ -25,7 +25,7 @@ BLOCK = 64
 @BLOCKS.register("attention_bridge")
 @dataclass(frozen=True, kw_only=True)
 class AttentionBridge:
-    """Self-attention and a feed-forward network on the channels, both behind a layer norm and beside a residual path.
+    """Self-attention and a feed-forward network on the channels, each after a layer norm and with a residual path.
 
     ``R' = R + MHA(LN(R))`` (eq. 3.10) and ``R'' = R' + FFN(LN(R'))`` (eq. 3.11); the FFN has ``2 C`` hidden units and
     GELU. Each tick attends to itself and the ``window - 1`` ticks before it, never to later ones. The thesis lets every
@@ -47,7 +47,7 @@ class AttentionBridge:
         check_bounds("attention_bridge", self, heads=integer(1, MOST_CHANNELS))
 
     def build(self, width: int, window: int) -> Streaming:
-        """The bridge on `width` channels."""
+        """Build the bridge on `width` channels."""
         if width % self.heads:
             fitting = [heads for heads in range(1, min(width, 16) + 1) if width % heads == 0]
             raise ConfigError(

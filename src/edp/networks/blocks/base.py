@@ -43,7 +43,7 @@ BranchMaker = Callable[[int], Streaming]
 
 @dataclass(frozen=True, eq=False)
 class OutputSpace:
-    """What a block at the output knows of the network's two ends.
+    """Sizes of the network's input and output, for blocks at the output.
 
     Attributes:
         features: scaled features.
@@ -115,7 +115,7 @@ class BypassSpec(BlockSpec, Protocol):
 
 
 class TaskView(Protocol):
-    """What a part may ask of the task before it agrees to be built."""
+    """Properties of a task that a part may check before it is built."""
 
     @property
     def mode(self) -> str: ...
@@ -128,7 +128,7 @@ class TaskView(Protocol):
 
 
 class ModelView(Protocol):
-    """What a part may ask of its neighbours before it agrees to be built."""
+    """Properties of a model that a part may check before it is built."""
 
     @property
     def backbone(self) -> object: ...

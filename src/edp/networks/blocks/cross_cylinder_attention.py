@@ -26,7 +26,7 @@ class CrossCylinderAttention:
     space: ClassVar[dict[str, Any]] = {}
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
-        """A single output has no other to attend to."""
+        """Return the conflict with a single output, which has no other output to attend to."""
         if len(task.targets) > 1:
             return None
         return (
@@ -35,7 +35,7 @@ class CrossCylinderAttention:
         )
 
     def build(self, hidden: int, outputs: int) -> Streaming:
-        """The layer on `outputs` rows of `hidden` features."""
+        """Build the layer on `outputs` rows of `hidden` features."""
         return _Across(hidden, outputs)
 
 

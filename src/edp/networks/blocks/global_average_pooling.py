@@ -1,4 +1,4 @@
-"""Global average pooling: the mean recurrent state over the window as further features (eq. 3.19)."""
+"""Global average pooling: the mean recurrent state over the window as additional features (eq. 3.19)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class GlobalAveragePooling:
         return max(1, width // 2)
 
     def build(self, width: int, window: int) -> Streaming:
-        """The pooling branch."""
+        """Build the pooling branch."""
         return _Pooling(width, window, self.extra(width))
 
 

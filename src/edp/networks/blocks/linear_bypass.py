@@ -50,7 +50,7 @@ class LinearBypass:
             raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
 
     def build(self, space: OutputSpace) -> Streaming:
-        """The skip connection, at zero; training puts the ridge solution in."""
+        """Build the skip connection with zero weights; training sets the ridge solution."""
         return Bypass(space.features, space.horizons, space.outputs, self)
 
 

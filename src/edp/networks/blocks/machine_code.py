@@ -1,4 +1,4 @@
-"""A few numbers that tell machines apart scale and shift the channels of the convolutions (FiLM, arXiv 1709.07871)."""
+"""Machine code: a few parameters per machine scale and shift the convolution channels (FiLM, arXiv 1709.07871)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MachineCode:
         check_bounds("machine_code", self, size=integer(1, MOST_UNITS))
 
     def build(self, width: int, window: int) -> Streaming:
-        """The block on `width` channels."""
+        """Build the block on `width` channels."""
         return CodedChannels(width, self.size)
 
 

@@ -43,7 +43,7 @@ class MultiScaleTcn:
             )
 
     def build(self, make_branch: BranchMaker) -> Streaming:
-        """The parallel stacks; output width is the sum of theirs."""
+        """Build the parallel stacks; the output width is the sum of their widths."""
         return _Parallel([make_branch(dilation) for dilation in self.first_dilations])
 
 

@@ -39,7 +39,7 @@ class SqueezeExcitation:
         check_bounds("squeeze_excitation", self, reduction=integer(1, MOST_CHANNELS))
 
     def build(self, width: int, window: int) -> Streaming:
-        """The block on `width` channels."""
+        """Build the block on `width` channels."""
         # A bottleneck of at least one unit, for networks narrower than the reduction.
         return _SqueezeExcitation(width, window, max(1, width // self.reduction))
 

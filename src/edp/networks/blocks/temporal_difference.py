@@ -1,4 +1,4 @@
-"""Temporal differencing: the change of the recurrent state over the last tick as further features (eq. 3.16)."""
+"""Temporal differencing: the change of the recurrent state over the last sample as additional features (eq. 3.16)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TemporalDifference:
         return width
 
     def build(self, width: int, window: int) -> Streaming:
-        """The differencing module."""
+        """Build the differencing module."""
         return _Difference(width)
 
 

@@ -46,7 +46,7 @@ class VelocitySkip:
         return None
 
     def build(self, space: OutputSpace) -> Streaming:
-        """The skip connection.
+        """Build the skip connection.
 
         Raises:
             ConfigError: a target that is not a feature.

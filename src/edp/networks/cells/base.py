@@ -1,4 +1,4 @@
-"""Recurrent layers: the registry, what a layer declares, and how layers are stacked."""
+"""Recurrent layers: registry, interface and stacking."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CELLS: Registry[type[CellSpec]] = Registry("recurrent layer")
 
 
 def check_cell(backbone: str, cell: CellSpec, zoneout: float, families: Sequence[str] = ()) -> None:
-    """Refuse a layer that a backbone cannot have, or zoneout on a layer that has none.
+    """Raise ConfigError for a layer that does not fit the backbone, or for zoneout on a layer without it.
 
     Raises:
         ConfigError: with the reason.

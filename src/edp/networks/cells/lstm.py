@@ -25,7 +25,7 @@ class LstmCell:
     zoneout: ClassVar[bool] = True
 
     def build(self, width_in: int, units: int, zoneout: float) -> Streaming:
-        """One layer; PyTorch's own where there is no zoneout."""
+        """Build one layer; without zoneout it is PyTorch's own."""
         return ZoneoutLstm(width_in, units, zoneout) if zoneout else StreamingLstm(width_in, units)
 
 
@@ -105,7 +105,7 @@ class ZoneoutLstm(Streaming):
 
 
 def zoneout_share(projected: Tensor, units: int, rate: float, training: bool) -> Shares:
-    """The share of new h and c that a layer takes: drawn in training, expected in evaluation."""
+    """Return the fraction of new h and c that a layer takes: random in training, its expectation in evaluation."""
     if not rate or not training:
         return 1.0 - rate
     ticks, batch = projected.shape[:2]
@@ -116,6 +116,6 @@ def zoneout_share(projected: Tensor, units: int, rate: float, training: bool) ->
 
 
 def lstm_costs(name: str, width: int, units: int, parameters: int) -> list[Cost]:
-    """The cost row of an LSTM layer; gates and states are element-wise and not counted."""
+    """Return the cost row of an LSTM layer; element-wise gates and states are not counted."""
     macs = 4 * units * (width + units)
     return [Cost(f"{name} {width}->{units}", parameters, per_column=macs, width_in=width, width_out=units)]

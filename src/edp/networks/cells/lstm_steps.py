@@ -140,7 +140,7 @@ def _each(share: Shares, ticks: int) -> tuple[Sequence[Tensor | float], Sequence
 
 
 def _derivatives(gates: Tensor, squashed: Tensor, cs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of c~ by the pre-activations of i, f, g ``(time, batch, 3, units)``; of h~ by that of o, and by what tanh saw."""
+    """Return derivatives of c~ by i, f, g pre-activations ``(time, batch, 3, units)``, of h~ by o's and tanh's."""
     o, i, f, g = gates.chunk(4, dim=2)
     # Derivatives of all ticks at once; only the product with the incoming gradient remains in the loop.
     by_c = torch.stack([g * i * (1 - i), cs[:-1] * f * (1 - f), i * (1 - g.square())], dim=2)
@@ -167,7 +167,7 @@ class _Norms:
         return y
 
     def held(self) -> list[Tensor]:
-        """Sums, means and scales of the sums, then means and scales of c, each over all ticks."""
+        """Return sums, means and scales of the sums, then means and scales of c, each over all samples."""
         columns = [*zip(*self.of_sums, strict=True), *zip(*self.of_cell, strict=True)]
         return [torch.stack(column) for column in columns]
 
@@ -198,7 +198,7 @@ class _NormsBackward:
         return torch.stack(self.made[::-1])
 
     def gradients(self, grads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """By the gain of the sums, and by gain and shift of c."""
+        """Return the gradients by the gain of the sums, and by gain and shift of c."""
         c_grads = torch.stack(self.c_grads[::-1])
         by_gain = (grads * self.normed).sum(dim=(0, 1))
         return by_gain, (c_grads * self.c_normed).sum(dim=(0, 1)), c_grads.sum(dim=(0, 1))

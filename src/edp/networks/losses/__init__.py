@@ -1,4 +1,4 @@
-"""Losses on standardised errors (thesis 3.2.2.5, 3.2.4.3): main losses, further terms, and weights; a file each."""
+"""Losses on standardised errors (thesis 3.2.2.5, 3.2.4.3): main losses, additional terms, weights; a module each."""
 
 from edp.networks.losses.base import LOSSES, LossSpec, Penalty, Prediction, masked_loss
 from edp.networks.losses.correlation import Correlation as Correlation

@@ -1,4 +1,4 @@
-"""What a loss reads, the registry of main losses, and their weighted mean over the ticks that count."""
+"""Inputs of a loss, the registry of main losses, and their weighted mean over the valid samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POINT, QUANTILES, NORMAL, LAPLACE = "point", "quantiles", "normal", "laplace"
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a network says, in standard deviations of the target.
+    """Output of a network in standard deviations of the target.
 
     Attributes:
         center: ``(batch, time, horizon, output)``: the prediction itself, a median or a mean.
@@ -39,12 +39,15 @@ class LossSpec(Protocol):
     """Kinds of output that it trains, names of `edp.networks.outputs.OUTPUTS`."""
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
-        """The loss of each prediction, ``(batch, time, horizon, output)``; `target` likewise, standardised."""
+        """Return the loss of each prediction, ``(batch, time, horizon, output)``.
+
+        `target` has this shape, standardised.
+        """
         ...
 
 
 class Penalty(ABC):
-    """A loss that reads the error of a point prediction and nothing else."""
+    """Loss that depends on the error of a point prediction only."""
 
     outputs: ClassVar[tuple[str, ...]] = (POINT,)
 
@@ -53,7 +56,7 @@ class Penalty(ABC):
         """Penalty of each error, same shape."""
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
-        """The penalty of the prediction's error."""
+        """Return the penalty of the prediction's error."""
         return self.penalty(answer.center - target)
 
 

@@ -36,7 +36,7 @@ class Correlation:
         check_weight("correlation", self.weight)
 
     def evaluate(self, course: Course) -> Tensor:
-        """Mean over horizons and outputs; outputs whose target stands still in this batch count as perfect."""
+        """Return the mean over horizons and outputs; outputs with a constant target in this batch count as perfect."""
         mask = course.valid[..., None, None]
         count = course.valid.sum().clamp(min=1)
 

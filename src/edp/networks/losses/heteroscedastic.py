@@ -37,7 +37,7 @@ class Heteroscedastic:
         check_bounds("heteroscedastic", self, beta=SHARE)
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
-        """The likelihood term of each prediction."""
+        """Return the likelihood term of each prediction."""
         error, log_variance = answer.center - target, answer.spread[..., 0, :]
         if answer.law == LAPLACE:
             # sqrt(2) turns the standard deviation into the scale of a Laplace law.

@@ -22,7 +22,7 @@ class Quantile:
     outputs: ClassVar[tuple[str, ...]] = (QUANTILES,)
 
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
-        """The mean pinball loss of each prediction's quantiles."""
+        """Return the mean pinball loss of each prediction's quantiles."""
         below = target - answer.center
         # The median's pinball loss times two is the absolute error, which keeps the scale of the point losses.
         total = below.abs()

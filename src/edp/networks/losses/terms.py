@@ -1,4 +1,4 @@
-"""Further terms of the training objective: what they read, and their registry."""
+"""Additional terms of the training objective: their inputs and their registry."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class TermSpec(Protocol):
     """Consecutive predictions that it compares."""
 
     def evaluate(self, course: Course) -> Tensor:
-        """The unweighted term, a mean over what it compares; zero where nothing can be compared."""
+        """Return the unweighted term, a mean over the compared elements; zero if none can be compared."""
         ...
 
 
@@ -54,7 +54,7 @@ TERMS: Registry[type] = Registry("term")
 
 
 def check_weight(name: str, weight: float) -> None:
-    """Refuse a weight that does nothing or rewards what the term penalises.
+    """Raise ConfigError for a weight without effect, or one that rewards what the term penalises.
 
     Raises:
         ConfigError: the weight is not positive.

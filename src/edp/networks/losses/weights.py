@@ -30,7 +30,7 @@ def horizon_weights(horizons: int, decay: float) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptiveWeights:
-    """Outputs weighted by the inverse of their running error, so that each has a like share of the loss.
+    """Output weights inverse to the running error, so that all outputs contribute similarly to the loss.
 
     With r_i the running mean absolute error of output i in standard deviations and ``a_i`` proportional to ``1 / r_i``,
     cut where it exceeds `max_ratio` times the smallest and with mean one, output i is weighted by
@@ -60,7 +60,7 @@ class AdaptiveWeights:
         return 1.0 - self.blend + self.blend * cut / cut.mean(dim=-1, keepdim=True)
 
     def follow(self, running: Tensor, error: Tensor, valid: Tensor) -> Tensor:
-        """The running errors after a batch with errors ``(batch, time, horizon, output)``."""
+        """Return the running errors after a batch with errors ``(batch, time, horizon, output)``."""
         count = valid.sum()
         mean = torch.where(valid[..., None, None], error.abs(), 0.0).sum(dim=(0, 1)) / count.clamp(min=1)
         # A batch without valid ticks must not pull the running error towards zero.

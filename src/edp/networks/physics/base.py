@@ -40,7 +40,7 @@ POSES = {
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsSpec(ABC):
-    """What every physics base must know.
+    """Common settings of all physics bases.
 
     Attributes:
         machine: name of a machine or path of its TOML file, read when a network is made; a bundle holds its numbers.
@@ -61,7 +61,7 @@ class PhysicsSpec(ABC):
             )
 
     def channels(self) -> tuple[str, ...]:
-        """Logged channels that the base reads."""
+        """Return the logged channels that the base reads."""
         return POSES[self.pose]
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
@@ -84,7 +84,7 @@ class PhysicsSpec(ABC):
         return None
 
     def digest(self) -> str:
-        """Content address of the machine's numbers.
+        """Return the content address of the machine's parameters.
 
         Raises:
             ConfigError: no such machine or file, or one that cannot be.
@@ -98,7 +98,7 @@ class PhysicsSpec(ABC):
 
     @abstractmethod
     def build(self, task: Task) -> PhysicsBase:
-        """The base without its machine's numbers."""
+        """Build the base without the machine's parameters."""
 
 
 class PhysicsBase(Streaming):
@@ -124,7 +124,7 @@ class PhysicsBase(Streaming):
         self.operations = frozenset({Operation.SQRT, *((Operation.SINE,) if spec.pose == "angles" else ())})
 
     def read(self) -> None:
-        """Take the machine's numbers, as a new network does.
+        """Read the machine's parameters, as for a new network.
 
         Raises:
             ConfigError: no such machine or file, or one that cannot be.
@@ -133,11 +133,11 @@ class PhysicsBase(Streaming):
         self.geometry.read(self.spec.machine)
 
     def settle(self, parts: Iterable[Tensor]) -> None:
-        """Take averages over training inputs ``(time, input)`` where the base has any; most have none."""
+        """Compute averages over training inputs ``(time, input)`` if the base needs any; most do not."""
 
     def usual(self) -> dict[str, tuple[float, float]]:
         # The middle of the strokes, since a middle of angles need not be a pose that the linkage reaches.
-        """Middle and width of what each channel that the base reads usually is, SI units."""
+        """Return middle and width of the usual range of each channel that the base reads, SI units."""
         pose = self.geometry.at_strokes(0.5 * self.geometry.axis("STROKE"))
         middle = torch.atan2(pose.sine, pose.cosine).tolist()
         stroke = self.geometry.axis("STROKE").tolist()
@@ -158,7 +158,7 @@ class PhysicsBase(Streaming):
         return like.new_zeros(batch, 1, AXES), like.new_zeros(batch, 1, 1)
 
     def pose(self, x: Tensor) -> Pose:
-        """The pose at each tick."""
+        """Return the pose at each sample."""
         values = self.take(x, POSES[self.spec.pose][:AXES])
         return self.geometry.at_angles(values) if self.spec.pose == "angles" else self.geometry.at_strokes(values)
 
@@ -191,10 +191,10 @@ class PhysicsBase(Streaming):
 
     @abstractmethod
     def arithmetic(self) -> int:
-        """Multiplications, divisions, roots, sines and the like of one tick, beyond those of the pose."""
+        """Number of multiplications, divisions, roots, sines etc. per sample, in addition to the pose."""
 
     def lower(self, build: Builder, x: str) -> str:
-        """Velocities, ``horizon * target`` numbers: the equations themselves, recorded."""
+        """Add the velocities, ``horizon * target`` elements, by recording the equations."""
         with build.inside("physics"):
             inputs = Symbol(build, x, (build.width(x),))
             # The equations are written for tensors; symbols stand in for them.

@@ -1,4 +1,4 @@
-"""What the force and the hybrid base share: torques at the joints, and how long an acceleration lasts."""
+"""Common part of the force and the hybrid base: joint torques and the duration of an acceleration."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Dynamic(PhysicsBase):
         return torque
 
     def standing(self, speed: Tensor) -> Tensor:
-        """How much of an axis stands, by Stribeck's curve: 1 at rest, 0 beyond its velocity, ``(batch, time, 3)``."""
+        """Return the standstill fraction per axis (Stribeck): 1 at rest, 0 at high velocity, ``(batch, time, 3)``."""
         # Stribeck's curve is smooth, so that gradients pass through zero velocity.
         return torch.exp(-(speed / self.geometry.axis("STRIBECK")).square())
 
@@ -116,7 +116,7 @@ class Dynamic(PhysicsBase):
         return ends.to(torque.dtype)
 
     def net_torque(self, x: Tensor, pose: Pose, rate: Tensor, speed: Tensor) -> Tensor:
-        """`torque` less friction; an axis that stands is held with up to its static friction."""
+        """Return `torque` minus friction; a standing axis is held with up to its static friction."""
         torque = self.torque(x, pose, rate)
         if self.spec.load != "all":
             return torque

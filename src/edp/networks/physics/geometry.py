@@ -1,4 +1,4 @@
-"""A machine's linkage and rigid bodies as differentiable tensor operations, its numbers kept as buffers.
+"""Linkage and rigid bodies of a machine as differentiable tensor operations, with the parameters stored as buffers.
 
 The same mechanism as `edp.sim.physics.linkage` and `edp.sim.physics.dynamics`, written anew for tensors: every quantity
 is a rational function of cosines and sines of the relative joint angles, with a square root where two circles meet.
@@ -50,7 +50,7 @@ def inverse(lever: Tensor) -> Tensor:
 
 
 def _meet(x: Tensor, y: Tensor, first2: Tensor, second2: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Where two circles meet, seen from the centre of the first; (x, y) leads to the other centre.
+    """Return the intersection of two circles relative to the centre of the first; (x, y) points to the other centre.
 
     `first2` and `second2` are the radii squared; circles that do not meet give the nearest point on the line.
     """
@@ -73,7 +73,7 @@ class Geometry(nn.Module):
         self.register_buffer("plant", torch.zeros(len(PLANT_NUMBERS) + len(SIDES)))
 
     def read(self, machine: str) -> None:
-        """Take the numbers of a machine by name or from a TOML file.
+        """Read the parameters of a machine by name or from a TOML file.
 
         Raises:
             ConfigError: no such machine or file, or one that cannot be.
@@ -93,20 +93,20 @@ class Geometry(nn.Module):
             self.plant.copy_(torch.tensor(numbers, dtype=torch.float64))
 
     def axis(self, name: str) -> Tensor:
-        """A number of each cylinder, ``(3,)``."""
+        """Return one parameter of each cylinder, ``(3,)``."""
         return self.axes[:, AXIS_NUMBERS.index(name)]
 
     def number(self, name: str) -> Tensor:
-        """A number of the linkage, ``()``."""
+        """Return one parameter of the linkage, ``()``."""
         return self.plant[(*PLANT_NUMBERS, *SIDES).index(name)]
 
     def at_angles(self, angles: Tensor) -> Pose:
-        """The pose at relative joint angles ``(..., 3)`` in rad."""
+        """Return the pose at relative joint angles ``(..., 3)`` in rad."""
         cosine, sine = torch.cos(angles), torch.sin(angles)
         return Pose(cosine, sine, *self.cylinders(cosine, sine))
 
     def at_strokes(self, strokes: Tensor) -> Pose:
-        """The pose at cylinder strokes ``(..., 3)`` in m from closed: the cosine law, and two pairs of circles."""
+        """Return the pose at cylinder strokes ``(..., 3)`` in m from closed: cosine law and two circle pairs."""
         length = strokes + self.axis("CLOSED")
         boom = self._corner("BOOM_BASE", "BOOM_ROD", length[..., 0])
         arm = self._corner("ARM_BASE", "ARM_ROD", length[..., 1])
@@ -204,7 +204,7 @@ class Geometry(nn.Module):
         return torch.stack((m11, m22, h3), dim=-1), torch.stack((m12, m13, m23), dim=-1)
 
     def gravity_torque(self, pose: Pose) -> Tensor:
-        """Torque that gravity asks of each joint, N m, ``(..., 3)``."""
+        """Return the torque that balances gravity at each joint, N m, ``(..., 3)``."""
         (c1, c2, c3), (s1, s2, s3) = pose.cosine.unbind(-1), pose.sine.unbind(-1)
         c12, s12 = c1 * c2 - s1 * s2, s1 * c2 + c1 * s2
         c13, s13 = c12 * c3 - s12 * s3, s12 * c3 + c12 * s3
@@ -233,13 +233,13 @@ class Geometry(nn.Module):
         return self.equivalent_mass(pose).mean(dim=0)
 
     def equivalent_mass(self, pose: Pose) -> Tensor:
-        """M_ii / J_i^2 in kg, ``(..., 3)``: what a cylinder moves where the other joints are free of torque from it."""
+        """Return M_ii / J_i^2 in kg, ``(..., 3)``: the mass moved by a cylinder if the other joints are torque-free."""
         own, _ = self.masses(self.couplings(pose)[0])
         return own / pose.lever.square()
 
 
 def _sides(angle: float, number: dict[str, float]) -> list[float]:
-    """`SIDES` of the branch on which the bucket stands at `angle`; there is no toggle on the way along a stroke."""
+    """Return `SIDES` of the bucket linkage branch at `angle`; the branch does not change along the stroke."""
     c, s = float(np.cos(angle)), float(np.sin(angle))
     lug = np.array([number["LUG_X"] * c - number["LUG_Y"] * s, number["LUG_X"] * s + number["LUG_Y"] * c])
     pivot, pin = np.array([number["PIVOT_X"], number["PIVOT_Y"]]), np.array([number["PIN_X"], 0.0])

@@ -14,7 +14,7 @@ from edp.networks.physics.geometry import Pose
 @PHYSICS.register("kinematic")
 @dataclass(frozen=True, kw_only=True)
 class KinematicSpec(PhysicsSpec):
-    """`z = J(q) q'` for every horizon (eq. 3.7): the velocity stays what the joints show."""
+    """Kinematic base `z = J(q) q'` for every horizon (eq. 3.7): the present joint velocity persists."""
 
     def build(self, task: Task) -> PhysicsBase:
         return Kinematic(self, task)

@@ -16,7 +16,7 @@ from edp.ir.layers import Activate, BinaryOperation, Function, ScaleShift, Stand
 
 
 class Symbol:
-    """Numbers of one tick in the making; what is computed with it is added to a graph.
+    """Symbolic values of one sample; operations on them are added to a graph.
 
     It stands where equations expect a tensor ``(batch, time, ...)``, without batch and time. Comparisons give 1 or 0.
 
@@ -33,18 +33,18 @@ class Symbol:
 
     @classmethod
     def __torch_function__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Called by torch for its functions and for operators with a tensor on the left."""
+        """Handle torch functions and operators with a tensor on the left; called by torch."""
         name = function.__name__.strip("_")
         if name not in FUNCTIONS:
             raise ExportError(f"torch's {name} has no form as layers; write the equation with {', '.join(FUNCTIONS)}")
         return FUNCTIONS[name](*args, **(kwargs or {}))
 
     def layer(self, kind: type, name: str, *inputs: str, shape: tuple[int, ...], **options: Any) -> Symbol:
-        """The value of a new layer."""
+        """Add a layer and return its value."""
         return Symbol(self.build, self.build.add(kind, name, *inputs, **options), shape)
 
     def spread(self, shape: tuple[int, ...]) -> Symbol:
-        """The numbers repeated as broadcasting does."""
+        """Broadcast the elements to a shape."""
         if shape == self.shape:
             return self
         size = int(np.prod(self.shape))
@@ -52,7 +52,7 @@ class Symbol:
         return Symbol(self.build, self.build.pick("repeated", self.value, columns), shape)
 
     def activate(self, function: Function) -> Symbol:
-        """A function of each number."""
+        """Apply a function to each element."""
         size = int(np.prod(self.shape))
         return self.layer(Activate, str(function), self.value, shape=self.shape, function=function, size=size)
 
@@ -78,11 +78,11 @@ class Symbol:
         return Symbol(self.build, picked, places.shape)
 
     def unbind(self, dim: int) -> list[Symbol]:
-        """The numbers of the last dimension."""
+        """Return the elements of the last dimension."""
         return [self[..., i] for i in range(self.shape[-1])]
 
     def unsqueeze(self, dim: int) -> Symbol:
-        """A dimension of length 1 more."""
+        """Insert a dimension of length 1."""
         at = dim + len(self.shape) + 1
         return Symbol(self.build, self.value, (*self.shape[:at], 1, *self.shape[at:]))
 
@@ -91,7 +91,7 @@ class Symbol:
         return self.spread(shape)
 
     def to(self, dtype: object) -> Symbol:
-        """The same numbers: there is one kind only."""
+        """Return the value unchanged, since there is only one type."""
         return self
 
     def square(self) -> Symbol:
@@ -156,20 +156,20 @@ def _both(operation: BinaryOperation, a: Symbol, b: Symbol) -> Symbol:
 
 def _meet(a: Any, b: Any) -> tuple[Symbol, np.ndarray]:
     # Exactly one of the two is a value here; two values are handled by the callers.
-    """The one that is a value and the other one's numbers, in their common shape."""
+    """Return the symbolic operand and the elements of the constant operand, in their common shape."""
     constant, value = (_array(b), a) if isinstance(a, Symbol) else (_array(a), b)
     shape = np.broadcast_shapes(value.shape, constant.shape)
     return value.spread(shape), np.broadcast_to(constant, shape)
 
 
 def _constant(like: Symbol, numbers: np.ndarray) -> Symbol:
-    """Known numbers as a value; one that is not finite still spoils them."""
+    """Return constants as a symbolic value; non-finite elements of `like` still propagate."""
     # Times zero keeps NaN: an invalid input must not turn into a valid constant.
     return like.affine(0.0, numbers)
 
 
 def add(a: Any, b: Any) -> Symbol:
-    """Sum, of which one may be known numbers."""
+    """Add two operands, one of which may be constant."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.ADD, a, b)
     value, constant = _meet(a, b)
@@ -177,7 +177,7 @@ def add(a: Any, b: Any) -> Symbol:
 
 
 def subtract(a: Any, b: Any) -> Symbol:
-    """Difference, of which one may be known numbers."""
+    """Subtract two operands, one of which may be constant."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.SUBTRACT, a, b)
     value, constant = _meet(a, b)
@@ -185,7 +185,7 @@ def subtract(a: Any, b: Any) -> Symbol:
 
 
 def multiply(a: Any, b: Any) -> Symbol:
-    """Product, of which one may be known numbers."""
+    """Multiply two operands, one of which may be constant."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.MULTIPLY, a, b)
     value, constant = _meet(a, b)
@@ -193,7 +193,7 @@ def multiply(a: Any, b: Any) -> Symbol:
 
 
 def divide(a: Any, b: Any) -> Symbol:
-    """Quotient, of which one may be known numbers."""
+    """Divide two operands, one of which may be constant."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(BinaryOperation.DIVIDE, a, b)
     value, constant = _meet(a, b)
@@ -204,7 +204,7 @@ def divide(a: Any, b: Any) -> Symbol:
 
 
 def maximum(a: Any, b: Any) -> Symbol:
-    """The larger one of each pair; one side may be known numbers."""
+    """Return the larger element of each pair; one operand may be constant."""
     return _extreme(BinaryOperation.MAXIMUM, a, b)
 
 
@@ -226,7 +226,7 @@ def sign(a: Symbol) -> Symbol:
 
 
 def stack(parts: Sequence[Any], dim: int = 0) -> Symbol:
-    """Single numbers as the last dimension, some of them known."""
+    """Stack single elements along the last dimension; some may be constant."""
     like = next(part for part in parts if isinstance(part, Symbol))
     symbols = [part if isinstance(part, Symbol) else _constant(like, _array(part)) for part in parts]
     return Symbol(like.build, like.build.join("stacked", *(part.value for part in symbols)), (len(symbols),))

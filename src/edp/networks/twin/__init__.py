@@ -1,4 +1,4 @@
-"""TwinPlant models that run free: commands in, velocities, strokes and pressures out, measured or fed back."""
+"""Plant models for free-run simulation: commands as inputs; velocities, strokes and pressures, measured or fed back."""
 
 from edp.networks.twin import (  # noqa: F401  registers the formulations
     arx,

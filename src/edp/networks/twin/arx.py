@@ -24,7 +24,7 @@ PENALTY = 1e-6
 @TWINS.register("arx")
 @dataclass(frozen=True, kw_only=True)
 class Arx:
-    """A floor for every twin: ARX, fitted one tick ahead and run free.
+    """ARX model, fitted one step ahead and simulated in free run: the baseline of every twin.
 
     Attributes:
         lags: ticks that it reads.
@@ -41,7 +41,7 @@ class Arx:
         check_bounds("arx", self, lags=integer(1, MOST_TICKS), prefix_ticks=PREFIX)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
-        """Fitted by least squares; there is nothing to draw."""
+        """Fit by least squares; no random numbers are used."""
         solved, commands = solved_columns(channels), len(channels.commands)
         rows = [Series(s.name, np.concatenate([s.inputs, s.targets], axis=1), s.targets[:, solved]) for s in train]
         task = LagTask((1,), tuple(commands + column for column in solved), self.lags)
@@ -51,18 +51,18 @@ class Arx:
         return self.build(channels, scales, arrays)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """Weights by lag, channel and answer, and intercepts."""
+        """Return the shapes of the weights by lag, channel and output, and of the intercepts."""
         solved = len(solved_columns(channels))
         rows = self.lags * (len(channels.commands) + len(channels.answers))
         return {"weight": (rows, solved), "intercept": (solved,)}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> Twin:
-        """The model with these numbers."""
+        """Build the model with these parameters."""
         return ArxTwin(channels, scales, self, {name: arrays[name] for name in self.shapes(channels)})
 
 
 class ArxTwin(Twin):
-    """State: ``answer`` in SI units, and the rows before this tick, newest first ``(batch, lags - 1, channel)``."""
+    """State: ``answer`` (outputs) in SI units, and the previous rows, newest first ``(batch, lags - 1, channel)``."""
 
     def __init__(self, channels: TwinChannels, scales: TwinScales, spec: Arx, numbers: Mapping[str, Array]) -> None:
         super().__init__(channels, scales, spec.prefix_ticks)

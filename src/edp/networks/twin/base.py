@@ -1,4 +1,4 @@
-"""Twins: plant models that answer commands with the state of the machine, measured or fed back, for as long as told."""
+"""Twins: plant models that simulate the machine from commands, with outputs measured or fed back."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Twin(ABC):
 
     @abstractmethod
     def initial_state(self, command: Array, measured: Array) -> TwinState:
-        """State of machines that have rested with this command ``(batch, command)`` and state ``(batch, answer)``."""
+        """Return the steady state of machines for this command ``(batch, command)`` and state ``(batch, answer)``."""
 
     @abstractmethod
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
@@ -57,10 +57,10 @@ class Twin(ABC):
 
     @abstractmethod
     def arrays(self) -> dict[str, Array]:
-        """All of its numbers by name, scales included, for its file."""
+        """Return all parameters by name, including scales, for the model file."""
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
-        """Layers of its own: scaled velocities and pressures as they are before bounds act.
+        """Add the twin's own layers: scaled velocities and pressures before bounds.
 
         Args:
             build: the layers in the making.
@@ -76,14 +76,14 @@ class Twin(ABC):
         )
 
     def lower_answers(self, build: Builder, commands: str, fed: str) -> str:
-        """Layers of its own and of the bounds: all answers, scaled; arguments and errors are those of `lower`."""
+        """Add the twin's own layers and the bounds: all outputs, scaled; arguments and errors as in `lower`."""
         with build.inside("cell"):
             proposed = self.lower(build, commands, fed)
         with build.inside("answers"):
             return bounded_layers(build, self, fed, proposed)
 
     def graph(self) -> Graph:
-        """A tick as layers with a feedback edge, from which exported forms are made (see `plant_graph`).
+        """Return one sample as layers with a feedback edge, the basis of exported forms (see `plant_graph`).
 
         Raises:
             ExportError: the formulation has no such form.
@@ -91,7 +91,7 @@ class Twin(ABC):
         return plant_graph(self)
 
     def reset(self, commands: Array, measured: Array) -> TwinState:
-        """State after a measured stretch.
+        """Return the state after a measured segment.
 
         Args:
             commands: ``(batch, tick, command)``, at least `prefix_ticks` of them.
@@ -127,7 +127,7 @@ class Twin(ABC):
         return answers[:, 0], state
 
     def rollout(self, commands: Array, state: TwinState, measured: Array | None = None) -> tuple[Array, TwinState]:
-        """Many ticks: row t of the answers is the machine one tick after row t of the commands.
+        """Simulate many samples: row t of the outputs is the machine one sample after row t of the commands.
 
         Args:
             commands: ``(batch, tick, command)``.
@@ -159,7 +159,7 @@ class Twin(ABC):
         return self._run(commands, np.where(np.isfinite(measured), measured, np.float32(np.nan)), state)
 
     def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
-        """Free runs of one machine that are the first of them up to a tick each: what a search over commands asks for.
+        """Simulate variants of one run that equal the first run up to a given sample each, for a search over commands.
 
         Args:
             commands: ``(run, tick, command)``, those of a run the first one's before it branches off.
@@ -175,7 +175,7 @@ class Twin(ABC):
         return self.rollout(commands, {name: np.repeat(rows, len(commands), 0) for name, rows in state.items()}, fed)[0]
 
     def runner(self) -> TwinRunner:
-        """The twin as it is now, ready for one machine tick by tick."""
+        """Return the twin with its present parameters, ready for one machine sample by sample."""
         return TwinRunner(self)
 
     def scaled(self, answers: Array) -> Array:
@@ -187,11 +187,11 @@ class Twin(ABC):
         return np.asarray((commands - self.scales.command_offset) / self.scales.command_width, dtype=np.float32)
 
     def drive(self, commands: Array) -> Array:
-        """What a training on free runs reads of commands ``(tick, command)`` in SI units, a row a tick."""
+        """Return the inputs of free-run training for commands ``(tick, command)`` in SI units, one row per sample."""
         return self.scaled_commands(commands)
 
     def bounded(self, feedback: Array, velocity: Array, pressure: Array) -> Array:
-        """Answers ``(batch, answer)`` within the bounds, SI units.
+        """Return outputs ``(batch, answer)`` limited to the bounds, SI units.
 
         A stroke is the integral of its velocity by the trapezoidal rule; at an end stop it stays, and the velocity
         into the stop is zero.
@@ -219,7 +219,7 @@ class Twin(ABC):
             raise DataError(f"{what} of shape {values.shape} came; {expected} (batch, tick, channel) must hold")
 
     def _check_start(self, start: Array) -> None:
-        """Refuse a start of which nothing is known, or where the machine cannot be."""
+        """Raise an error for a start with unknown values or beyond the end stops."""
         for which, channel in enumerate(self.channels.answers):
             values = start[:, which]
             if not np.isfinite(values).all():
@@ -241,7 +241,7 @@ class Twin(ABC):
             )
 
     def within_stops(self, start: Array) -> NDArray[np.bool_]:
-        """Whether a twin can start there ``(batch,)``: no stroke of ``(batch, answer)`` far beyond an end stop."""
+        """Return whether a twin can start at ``(batch, answer)``: no stroke is far beyond an end stop."""
         return np.asarray((self._beyond(start) <= BEYOND).all(axis=1))
 
     def _beyond(self, start: Array) -> Array:
@@ -249,7 +249,7 @@ class Twin(ABC):
 
 
 class TwinRunner:
-    """A twin with its numbers as they were, for one machine tick by tick: what can be prepared once is.
+    """Twin with fixed parameters for one machine sample by sample; constant data are prepared once.
 
     Values are those of the twin's own methods but for rounding. A controller asks so a hundred times a second.
 
@@ -270,7 +270,7 @@ class TwinRunner:
         return self.twin.branches(commands, state, measured, first)
 
     def neighbours(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
-        """`branches` whose commands are near those of the first run: what derivatives of a plan are made of.
+        """Return `branches` for commands near those of the first run, from which derivatives of a plan are computed.
 
         Where it is far cheaper, the load of the machine follows them to first order: the first run is exact, and what
         the others differ from it by is small against what they move.
@@ -297,15 +297,15 @@ class TwinSpec(Protocol):
         ...
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
-        """A twin of these training stretches: fitted, or ready to be trained on free runs."""
+        """Return a twin for these training segments: fitted, or initialised for free-run training."""
         ...
 
     def shapes(self, channels: TwinChannels) -> Mapping[str, tuple[int, ...]]:
-        """Shape of each of its arrays beside the scales."""
+        """Return the shape of each array, without the scales."""
         ...
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> Twin:
-        """The twin that has these arrays."""
+        """Build the twin with these arrays."""
         ...
 
 
@@ -327,7 +327,7 @@ def _beyond(channels: TwinChannels, scales: TwinScales, start: Array) -> Array:
 
 
 def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) -> list[tuple[Series, int]]:
-    """Evenly spread starts of runs of `length` ticks, at most `each` in a stretch; none beyond an end stop.
+    """Return evenly spaced starts of runs with `length` samples, at most `each` per segment, none beyond an end stop.
 
     Raises:
         DataError: all of them lie beyond.

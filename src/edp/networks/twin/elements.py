@@ -1,4 +1,4 @@
-"""Tanks, masses and lags as differential equations of few numbers, for small systems that are no excavator."""
+"""Tanks, masses and lags as differential equations with few parameters, for small systems other than excavators."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ElementsBox:
             check_count("elements", name, getattr(self, name), MOST_ELEMENTS)
 
     def parts(self, channels: TwinChannels) -> Parts:
-        """Connected elements.
+        """Return the connected elements.
 
         Raises:
             ConfigError: a port that is not connected, or a channel that no element has.
@@ -78,18 +78,18 @@ class ElementsBox:
         return parts
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> ElementsTwin:
-        """With plausible numbers."""
+        """Return a twin with typical parameters."""
         numbers = [n.nominal for n in lumped_numbers(self.parts(channels), channels, scales)]
         return self.build(channels, scales, {"numbers": np.array(numbers, np.float32)})
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """All numbers."""
+        """Return the shape of the parameter vector."""
         parts = self.parts(channels)
         tanks = sum(6 if tank.level else 5 for tank in parts.tanks)
         return {"numbers": (tanks + 5 * len(parts.masses) + 3 * len(parts.lags),)}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> ElementsTwin:
-        """The elements with these numbers."""
+        """Build the elements with these parameters."""
         twin = ElementsTwin(channels, scales, self, arrays["numbers"].astype(np.float64))
         if not (twin.numbers[[n.positive for n in twin.table]] > 0).all():
             raise ValueError("one of its numbers is not positive")
@@ -97,7 +97,7 @@ class ElementsBox:
 
 
 class ElementsTwin(Twin):
-    """State: ``answer`` in SI units, and ``hidden`` levels of the tanks that are not measured ``(batch, tank)``."""
+    """State: ``answer`` (outputs) in SI units, and ``hidden`` levels of the unmeasured tanks ``(batch, tank)``."""
 
     def __init__(self, channels: TwinChannels, scales: TwinScales, spec: ElementsBox, numbers: Doubles) -> None:
         super().__init__(channels, scales, spec.prefix_ticks)
@@ -111,12 +111,12 @@ class ElementsTwin(Twin):
         self.wiring = self._wiring()
 
     def with_numbers(self, numbers: Doubles) -> ElementsTwin:
-        """The same elements with other numbers, rounded as they are kept."""
+        """Return the elements with other parameters, rounded to the stored precision."""
         rounded = numbers.astype(np.float32).astype(np.float64)
         return ElementsTwin(self.channels, self.scales, self.spec, rounded)
 
     def starting_levels(self, numbers: Values) -> Values:
-        """Of the tanks that are not measured ``(..., tank)``."""
+        """Return the initial levels of the unmeasured tanks ``(..., tank)``."""
         return np.stack([numbers[..., self.places[name, "start"]] for name in self.hidden], axis=-1)
 
     def initial_state(self, command: Array, measured: Array) -> TwinState:
@@ -126,7 +126,7 @@ class ElementsTwin(Twin):
         return {"answer": measured.astype(np.float32), "hidden": hidden}
 
     def reset(self, commands: Array, measured: Array) -> TwinState:
-        """State after a measured stretch; levels that are not measured are those that explain it best."""
+        """Return the state after a measured segment; unmeasured levels are those that explain it best."""
         state = super().reset(commands, measured)
         if not self.hidden:
             return state
@@ -151,7 +151,10 @@ class ElementsTwin(Twin):
         return self.rollout(np.asarray(commands, np.float32), start, np.asarray(measured, np.float32))[1]
 
     def free_run(self, numbers: Values, commands: Doubles, answer: Values, hidden: Values) -> Values:
-        """Answers ``(batch, tick, answer)`` by numbers ``(number,)`` or ``(batch, number)``; complex: with slopes."""
+        """Simulate outputs ``(batch, tick, answer)`` for parameters ``(number,)`` or ``(batch, number)``.
+
+        Complex ones give derivatives.
+        """
         kind = np.result_type(numbers, answer, hidden, np.float64)
         lanes = np.broadcast_to(numbers, (len(answer), len(self.table)))
         values = (np.ascontiguousarray(part, dtype=kind) for part in (lanes, answer, hidden))
@@ -159,7 +162,7 @@ class ElementsTwin(Twin):
         return np.asarray(free_run(own, np.ascontiguousarray(commands, np.float64), first, levels, self.wiring))
 
     def _wiring(self) -> Wiring:
-        """How the elements are connected, as compiled code reads it."""
+        """Return the connections of the elements for compiled code."""
         parts, channels, scales = self.elements, self.channels, self.scales
         names, unseen = [tank.name for tank in parts.tanks], iter(range(len(self.hidden)))
         lags = [(self.inputs[lag.command], self.columns[lag.pressure], self._first(lag.name)) for lag in parts.lags]

@@ -1,4 +1,4 @@
-"""What a twin says of the ticks to come: an observer follows the measured machine, and each tick looks ahead from it.
+"""Forecasts of a twin: an observer follows the measured machine, and each sample starts a prediction from it.
 
 The observer is Luenberger's with one gain. Before tick t every port reads
 
@@ -35,7 +35,7 @@ MOST_AHEAD = 1000
 
 
 def check_horizons(horizons: Sequence[int]) -> None:
-    """Refuse look-aheads that cannot be: none, a tick twice, or one that is no number of ticks.
+    """Raise ConfigError for invalid horizons: none, a duplicate, or a value that is not a number of samples.
 
     Raises:
         ConfigError: the one that cannot be.
@@ -59,7 +59,7 @@ def check_gain(gain: float) -> None:
 
 
 def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -> float:
-    """The gain of `GAINS` with the least error of velocities at the nearest and farthest horizon, relative to others'.
+    """Return the gain of `GAINS` with the least relative velocity error at the nearest and farthest horizon.
 
     Args:
         twin: any formulation.
@@ -86,7 +86,7 @@ def choose_gain(twin: Twin, series: Sequence[Series], horizons: Sequence[int]) -
 
 
 def forecast(twin: Twin, commands: Array, measured: Array, horizons: Sequence[int], gain: float = 1.0) -> Array:
-    """Answers of a twin some ticks ahead of each tick of a stretch, from rows up to that tick.
+    """Return the k-step-ahead outputs of a twin at each sample of a segment, from rows up to that sample.
 
     Args:
         twin: any formulation.
@@ -135,7 +135,7 @@ def _begin(twin: Twin, measured: Array) -> int:
 
 
 def _ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: int) -> Array:
-    """Free runs from each state with its command held ``(moment, tick, answer)``."""
+    """Simulate from each state with its command held constant, ``(moment, tick, answer)``."""
     constant_commands = np.repeat(commands[:, None], ticks, axis=1)
     fed = np.full((len(commands), ticks, ports.shape[1]), np.nan, np.float32)
     fed[:, 0] = ports
@@ -143,7 +143,7 @@ def _ahead(twin: Twin, commands: Array, states: TwinState, ports: Array, ticks: 
 
 
 def _stacked(states: Sequence[TwinState]) -> TwinState:
-    """States of single machines as one of a batch, rounded as a twin keeps them."""
+    """Join states of single machines to a batch, rounded to the twin's precision."""
     return {
         name: np.concatenate([np.asarray(state[name], np.float32) for state in states], axis=0) for name in states[0]
     }

@@ -51,7 +51,7 @@ REST_MPA = 2.0
 @TWINS.register("greybox")
 @dataclass(frozen=True, kw_only=True)
 class GreyBox:
-    """Elements of a hydraulic machine; without any, names and kinds of the channels say what there is.
+    """Elements of a hydraulic machine; by default they are derived from names and kinds of the channels.
 
     Attributes:
         cylinders: with their channels.
@@ -110,7 +110,7 @@ class GreyBox:
                 )
 
     def elements(self, channels: TwinChannels) -> Elements:
-        """Connected elements.
+        """Return the connected elements.
 
         Raises:
             ConfigError: a port that is not connected, or pressures that no element has.
@@ -125,7 +125,7 @@ class GreyBox:
         return elements
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> GreyTwin:
-        """With plausible numbers; where all is measured, its load balances the forces that were measured."""
+        """Return a twin with typical parameters; if everything is measured, its load balances the measured forces."""
         elements = self.elements(channels)
         front = KnownLinkage.read(self.linkage, elements, channels, scales) if self.linkage else None
         table = self.table(elements, channels, scales, front)
@@ -140,7 +140,7 @@ class GreyBox:
         return twin.with_numbers(values)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """All numbers, and the full command of each valve."""
+        """Return the shapes of all parameters, and of the full-scale command of each valve."""
         elements = self.elements(channels)
         travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.actuators)
         own = KnownLinkage.SHAPES if self.linkage else {}
@@ -150,7 +150,7 @@ class GreyBox:
         return {"numbers": (len(table.numbers),), "full": (len(elements.valves),), **own}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
-        """The grey box with these numbers; nothing of a linkage's machine is read again."""
+        """Build the grey box with these parameters; the machine file of a linkage is not read again."""
         elements = self.elements(channels)
         table = self.table(elements, channels, scales, KnownLinkage.of(arrays) if self.linkage else None)
         numbers = arrays["numbers"].astype(np.float64)
@@ -163,12 +163,12 @@ class GreyBox:
         return GreyTwin(channels, scales, self, (table, wiring), numbers, arrays["full"])
 
     def _network(self, channels: TwinChannels, seed: int) -> dict[str, Array]:
-        """Arrays of a network on top, untrained; here none."""
+        """Return the untrained arrays of an additional network; none here."""
         return {}
 
     @property
     def degrees(self) -> tuple[int, int]:
-        """Of the polynomials of inertia and gravity."""
+        """Degrees of the polynomials of inertia and gravity."""
         return self.inertia_degree, self.potential_degree
 
     @property
@@ -179,7 +179,7 @@ class GreyBox:
     def table(
         self, elements: Elements, channels: TwinChannels, scales: TwinScales, front: KnownLinkage | None
     ) -> NumberTable:
-        """Its numbers, with starting values from what the scales of the data show."""
+        """Return the parameter table, with initial values from the scales of the data."""
         names = [channel.name for channel in channels.answers]
         count = len(channels.velocities)
 
@@ -202,13 +202,13 @@ def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
 
 
 def _full(commands: Array) -> float:
-    """The largest command; a command that never moved is full at 1."""
+    """Return the largest command; 1 for a command that never moved."""
     return float(np.abs(commands).max()) or 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class RunTarget:
-    """What errors of free runs are summed up against, in units of the grey box.
+    """Reference of the summed free-run errors, in units of the grey box.
 
     Attributes:
         truth: ``(lane, tick, answer)``; row t is the machine after the command of tick t.
@@ -231,7 +231,7 @@ class RunTarget:
 
 
 class GreyTwin(Twin):
-    """State: ``answer`` in SI units, and in units of `edp.networks.twin.grey.layout` what the elements remember."""
+    """State: ``answer`` (outputs) in SI units, and the element states in units of `edp.networks.twin.grey.layout`."""
 
     def __init__(
         self,
@@ -247,12 +247,12 @@ class GreyTwin(Twin):
         self.numbers, self.full = numbers, full
 
     def with_numbers(self, numbers: Doubles) -> GreyTwin:
-        """The same elements with other numbers, rounded as they are kept."""
+        """Return the elements with other parameters, rounded to the stored precision."""
         rounded = numbers.astype(np.float32).astype(np.float64)
         return GreyTwin(self.channels, self.scales, self.spec, (self.table, self.wiring), rounded, self.full)
 
     def with_stretches(self, stretches: int) -> GreyTwin:
-        """The same machine with opening curves of as many stretches or more: its answers stay what they are."""
+        """Return the machine with subdivided opening curves; its outputs do not change."""
         spec = replace(self.spec, stretches=stretches)
         if spec.curve % self.table.stretches:
             raise ValueError(f"stretches = {stretches}; a multiple of {self.table.stretches} must hold")
@@ -265,7 +265,7 @@ class GreyTwin(Twin):
 
     @property
     def units(self) -> Doubles:
-        """Of each answer in SI units: pressures in MPa are numbers of the size of the others."""
+        """SI value of the unit of each output: pressures are in MPa, so that all have similar magnitudes."""
         return np.where(self.wiring.ports[:, 0] == 2, 1e6, 1.0)
 
     @property
@@ -287,14 +287,14 @@ class GreyTwin(Twin):
         return self.wiring.nodes + actuators, actuators, actuators, len(self.table.pump_at)
 
     def demands(self, commands: Array) -> Doubles:
-        """Signed commands of the valves as shares of full ``(batch, tick, valve)``, extension positive."""
+        """Return the signed valve commands as fractions of full scale ``(batch, tick, valve)``, extension positive."""
         extend, retract = self.wiring.sides.T
         signed = commands[..., extend].astype(np.float64)
         signed -= np.where(retract >= 0, commands[..., retract], 0.0)
         return np.ascontiguousarray(np.clip(signed / self.full, -1.0, 1.0))
 
     def rest(self, demands: Doubles, measured: Array) -> tuple[Doubles, ...]:
-        """States of machines at rest: y, strokes, bristles, displacements, valves and history.
+        """Return steady states: y, strokes, bristles, displacements, valves and history.
 
         Args:
             demands: ``(batch, valve)``.
@@ -351,7 +351,7 @@ class GreyTwin(Twin):
         judge: RunTarget | None = None,
         network: tuple[Cell, Trace] = (NO_CELL, NO_TRACE),
     ) -> None:
-        """`edp.networks.twin.grey.run.run_lanes` with these elements: a free run, or the errors of one."""
+        """Call `edp.networks.twin.grey.run.run_lanes` with these elements: a free run, or the errors of one."""
         nothing = np.zeros((0, 0, 0))
         judged = judge or RunTarget(nothing, np.zeros(len(self.wiring.ports)), 1.0, (0, 0, 1), NO_SUMS)
         limits = (self.scales.low / self.units, self.scales.high / self.units, self.units)

@@ -22,7 +22,7 @@ TICKS = integer(1, MOST_ROWS)
 
 @dataclass(frozen=True, eq=False)
 class FreeRunIntervals:
-    """Half widths of the intervals of each answer by horizon, for runs in which every port is free.
+    """Half widths of the intervals of each output by horizon, for runs with all ports free.
 
     Between knots they are linear in the logarithm of the horizon; beyond the last one they stay, and so does the
     promise: it is kept up to the last knot only.
@@ -54,18 +54,21 @@ class FreeRunIntervals:
             raise ValueError("the widths of its intervals shrink with the horizon, or are no numbers")
 
     def at(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Half widths ``(tick, answer)`` at these horizons, SI units; tick 1 is the first answer of a free run."""
+        """Return half widths ``(tick, answer)`` at these horizons, SI units.
+
+        Tick 1 is the first output of a free run.
+        """
         at_log, knots_log = np.log(np.maximum(ticks, 1)), np.log(self.ticks)
         return np.stack([np.interp(at_log, knots_log, column) for column in self.half_width.T], axis=1)
 
     def to_plain(self) -> dict[str, Any]:
-        """As values that fit into JSON."""
+        """Convert to JSON types."""
         widths = [[float(value) for value in row] for row in self.half_width]
         return {"coverage": self.coverage, "ticks": list(self.ticks), "half_width": widths, "runs": self.runs}
 
     @staticmethod
     def from_plain(entry: Mapping[str, Any], channels: TwinChannels) -> FreeRunIntervals:
-        """What `to_plain` gave.
+        """Create intervals from the result of `to_plain`.
 
         Raises:
             ValueError: not the intervals of a twin with these channels.
@@ -79,7 +82,7 @@ class FreeRunIntervals:
 
 
 def calibrate(errors: Array, coverage: float) -> FreeRunIntervals:
-    """Split-conformal half widths by horizon, from free runs that chose and trained nothing.
+    """Return split-conformal half widths by horizon, from free runs not used for training or selection.
 
     At each knot the width is the quantile of the absolute errors around it whose level is ``ceil((n + 1) coverage) /
     n`` of the n runs that reach it, the finite-sample level of split conformal prediction; the largest error where

@@ -1,4 +1,4 @@
-"""What settings may ask for: a formulation, or the choice among several of them."""
+"""Twin kinds available in settings: a single formulation, or a choice among several."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ for _name, _formulation in TWINS.items():
 @KINDS.register("auto")
 @dataclass(frozen=True, kw_only=True)
 class AutoTwin:
-    """Several formulations are fitted, and free runs of what each fit left out choose (cross-validation).
+    """Several twin kinds are fitted, and the best free runs on left-out data decide (cross-validation).
 
     Attributes:
         candidates: formulations, the simplest first.
@@ -60,7 +60,10 @@ class AutoTwin:
 
     @property
     def tried(self) -> tuple[str, ...]:
-        """Every candidate in the order of trial; known elements stand where they are named, else before networks."""
+        """Every candidate in the order of trial.
+
+        Given elements are tried where they are listed, otherwise before networks.
+        """
         if self.elements is None or "elements" in self.candidates:
             return self.candidates
         before = self.candidates.index("recurrent") if "recurrent" in self.candidates else len(self.candidates)

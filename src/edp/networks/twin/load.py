@@ -64,7 +64,7 @@ class LoadEstimate:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what was estimated."""
+        """Reset the estimate."""
         self._expected, self._age = None, 0
         if self._runner.resistance is not None:
             self._runner.resistance = np.zeros_like(self._runner.resistance)
@@ -72,7 +72,7 @@ class LoadEstimate:
     def expect(
         self, command: NDArray[np.float32], row: NDArray[np.float32], before: TwinState, after: TwinState
     ) -> None:
-        """Note what the model says of a tick.
+        """Store the model's prediction of a sample.
 
         Args:
             command: of it ``(command,)``.
@@ -89,7 +89,7 @@ class LoadEstimate:
         self._age += 1
 
     def update(self, measured: Array) -> None:
-        """Bring the estimate up to date with velocities that are measured now; NaN leaves it as it is."""
+        """Update the estimate with measured velocities; NaN leaves the estimate unchanged."""
         resistance, expected = self._runner.resistance, self._expected
         if expected is None or resistance is None or not np.isfinite(measured).all():
             return

@@ -21,7 +21,7 @@ MEASURED = 0.5
 
 
 def plant_graph(twin: Twin) -> Graph:
-    """A tick of a twin, from SI inputs to SI answers.
+    """Return one sample of a twin as a graph, from SI inputs to SI outputs.
 
     Inputs are the commands, a measured value for each answer, and a flag for each: 1 where the port reads what was
     measured, 0 where it reads the last answer. A measured value must be finite even where nobody reads it. After a
@@ -47,7 +47,7 @@ def plant_graph(twin: Twin) -> Graph:
 
 
 def _ports(build: Builder, twin: Twin, commands: int) -> tuple[str, str]:
-    """What the ports read, scaled, and the layer that holds the last answers."""
+    """Add the scaled port readings and the layer that holds the last outputs."""
     scales, size = twin.scales, len(twin.channels.answers)
     one = np.ones(size)
     logged = build.pick("logged", INPUT, range(commands, commands + size))
@@ -79,7 +79,7 @@ def bounded_layers(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
 
 
 def stopped_strokes(build: Builder, twin: Twin, fed: str, velocity: str, columns: list[int]) -> tuple[str, str]:
-    """Velocities of these columns that do not go into an end stop, and the strokes that they add up to; all scaled."""
+    """Add velocities of these columns without motion into an end stop, and the resulting strokes; all scaled."""
     scales, count = twin.scales, len(twin.channels.velocities)
     low, high = ((end - scales.answer_offset) / scales.answer_width for end in (scales.low, scales.high))
     both = build.combine("both_ends", ADD, build.pick("velocity_before", fed, columns), velocity)

@@ -53,7 +53,7 @@ LEAST_NOISE = 1e-2
 @TWINS.register("n4sid")
 @dataclass(frozen=True, kw_only=True)
 class N4sid:
-    """A floor for every twin: subspace identification of velocities and pressures; strokes are integrals.
+    """Subspace identification of velocities and pressures with integrated strokes: a baseline of every twin.
 
     The order is the one whose free runs on a fifth of the training recordings, kept back meanwhile, have the least
     error; a single order is taken as it is. Poles outside the unit circle are reflected into it, and those slower than
@@ -79,7 +79,7 @@ class N4sid:
         check_count("n4sid", "orders", self.orders, 100, least=1)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
-        """Fitted by projections; there is nothing to draw.
+        """Fit by projections; no random numbers are used.
 
         Raises:
             DataError: recordings that are too short for `horizon`.
@@ -112,7 +112,7 @@ class N4sid:
         return {"order": (1,), **sizes}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> Twin:
-        """The model with these numbers."""
+        """Build the model with these parameters."""
         order = int(arrays["order"][0])
         if not 1 <= order <= max(self.orders):
             raise ValueError(f"its order is {order}; 1 to {max(self.orders)} must hold")
@@ -120,7 +120,7 @@ class N4sid:
 
 
 class N4sidTwin(Twin):
-    """State: ``answer`` in SI units, and ``states`` of the model ``(batch, order)``.
+    """State: ``answer`` (outputs) in SI units, and ``states`` of the model ``(batch, order)``.
 
     What a port reads corrects the states by the Kalman gain; a free port reads its own last answer, which lies where
     the model put it but for its bounds, and then corrects nothing.
@@ -190,7 +190,7 @@ def _with_one(commands: Array) -> Doubles:
 
 @dataclass(frozen=True, eq=False)
 class _Projections:
-    """What a model of any order needs of the data.
+    """Data projections from which a model of any order is computed.
 
     Attributes:
         horizon: rows of past and of future.
@@ -208,7 +208,7 @@ class _Projections:
 
     @staticmethod
     def of(pairs: Sequence[Pair], horizon: int) -> _Projections:
-        """One QR factorisation of all windows, stacked over the stretches.
+        """Compute one QR factorisation of all windows, stacked over the segments.
 
         Raises:
             DataError: fewer windows than one has numbers.
@@ -237,7 +237,7 @@ class _Projections:
         return _Projections(horizon, tuple(pairs), left, sizes, by_past)
 
     def model(self, order: int) -> dict[str, Doubles]:
-        """A, B, C and K of an order, or of the highest that the data tell from rounding."""
+        """Return A, B, C and K of an order, limited to the highest order above rounding errors."""
         order = min(order, int((self.sizes > LEAST_SHARE * self.sizes[0]).sum()))
         answers = self.pairs[0][1].shape[1]
         root = np.sqrt(self.sizes[:order] / self.sizes[0])
@@ -273,7 +273,7 @@ def _windows(pairs: Sequence[Pair], horizon: int) -> Iterator[Pair]:
 
 
 def _states(pairs: Sequence[Pair], horizon: int, to_states: Doubles) -> tuple[Doubles, Doubles, Doubles, Doubles]:
-    """States as the past tells them at the middle of each window and a tick later, and its command and output."""
+    """Return estimated states in the middle of each window and one sample later, with command and output."""
     columns: list[tuple[Doubles, ...]] = []
     for u, y in _windows(pairs, horizon):
         pasts = [
@@ -296,7 +296,7 @@ def _stable(a: Doubles) -> Doubles:
 
 
 def _inputs_of(pairs: Sequence[Pair], a: Doubles, c: Doubles) -> Doubles:
-    """B by least squares: outputs of stretches are linear in it, and in the state at their start, which drops out."""
+    """Return B by least squares. Outputs are linear in B and in the initial state, which is eliminated."""
     order, commands, answers = len(a), pairs[0][0].shape[1], len(c)
     length = min(STRETCH_TICKS, max(len(u) for u, _ in pairs))
     starts = [(u, y, first) for u, y in pairs for first in range(0, len(u) - length + 1, length)]
@@ -324,7 +324,7 @@ def _inputs_of(pairs: Sequence[Pair], a: Doubles, c: Doubles) -> Doubles:
 
 
 def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
-    """Steady Kalman gain of the noise that is left in states ``(row, state)`` and outputs ``(row, answer)``."""
+    """Return the steady Kalman gain for the residual noise of states ``(row, state)`` and outputs ``(row, answer)``."""
     # Here, since every command with a network imports this module, and scipy.linalg takes time.
     from scipy.linalg import solve_discrete_are
 
@@ -350,7 +350,7 @@ def _scaled(channels: TwinChannels, scales: TwinScales, series: Sequence[Series]
 
 
 def _divided(train: Sequence[Series], least: int) -> tuple[list[Series], list[Series]]:
-    """Every fifth recording kept back; of a single one its last fifth."""
+    """Hold out every fifth recording; for a single recording its last fifth."""
     if len(train) >= KEPT_BACK:
         judged = [part for i, part in enumerate(train) if i % KEPT_BACK == KEPT_BACK - 1 and part.samples >= least]
         if judged:
@@ -364,7 +364,7 @@ def _divided(train: Sequence[Series], least: int) -> tuple[list[Series], list[Se
 
 
 def _free_error(twin: Twin, judged: Sequence[Series]) -> float:
-    """Mean absolute error of free runs, each solved answer in its deviations."""
+    """Return the mean absolute free-run error, each output scaled by its standard deviation."""
     ticks = min(round(JUDGED_S * twin.channels.rate_hz), max(part.samples for part in judged) - twin.prefix_ticks - 1)
     length, prefix = twin.prefix_ticks + ticks, twin.prefix_ticks
     runs = even_starts(twin, judged, length + 1, JUDGED_EACH)

@@ -31,7 +31,7 @@ FLAG = "_measured"
 
 
 class TwinPlant(Predictor):
-    """What commands, measured values and flags make of a machine one tick later, in SI units; it cannot be trained.
+    """Machine one sample later from commands, measured values and flags, in SI units; it cannot be trained.
 
     In single precision it is the twin; in double precision its layers, which shows what they mean. After a reset it
     rests at the means of the training data, so that a stream that was never measured starts somewhere.
@@ -76,7 +76,7 @@ class TwinPlant(Predictor):
         return self.twin.initial_state(command, answer)
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Answers in SI units, ``(batch, time, 1, answer)``, and the next state."""
+        """Return outputs in SI units, ``(batch, time, 1, answer)``, and the next state."""
         rows = x.detach().cpu().numpy()
         if x.dtype == torch.float64:
             new = deepcopy(state)
@@ -89,7 +89,7 @@ class TwinPlant(Predictor):
         return torch.from_numpy(answers)[:, :, None], new
 
     def predict_with_intervals(self, x: Tensor, state: State) -> tuple[Tensor, Tensor | None, State]:
-        """What `predict` gives; there are no intervals."""
+        """Return the result of `predict`, without intervals."""
         answers, new = self.predict(x, state)
         return answers, None, new
 
@@ -102,7 +102,7 @@ class TwinPlant(Predictor):
         raise ExportError("a twin gives answers only; train it with edp twin, look into it with edp rollout")
 
     def graph(self) -> Graph:
-        """The layers of the twin.
+        """Return the layer graph of the twin.
 
         Raises:
             ExportError: its formulation has no such form.
@@ -134,7 +134,7 @@ class IntegerTwinPlant(IntegerPredictor, TwinPlant):
 
 
 def plant_inputs(channels: TwinChannels) -> tuple[Channel, ...]:
-    """What is fed at each tick: commands, measured answers, and a flag for each of these."""
+    """Return the inputs of each sample: commands, measured outputs, and a flag for each of these."""
     names = {channel.name for channel in channels.commands + channels.answers}
     flags = []
     for answer in channels.answers:

@@ -1,4 +1,4 @@
-"""A recurrent network with feedback ports: it reads commands and the state of the machine, and answers its change."""
+"""Recurrent network with feedback ports: it reads commands and machine state, and outputs the state change."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MEMBER_SEED = 1000
 @TWINS.register("recurrent")
 @dataclass(frozen=True, kw_only=True)
 class Recurrent:
-    """A GRU with feedback ports, trained on its own free runs (`edp.training.free_run`).
+    """GRU with feedback ports, trained on its own free runs (`edp.training.free_run`).
 
     Several members are networks that are trained apart; the twin answers with the mean of their changes. As they read
     the same ports, they are one network, whose weights between members are zero.
@@ -66,13 +66,16 @@ class Recurrent:
             )
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> RecurrentTwin:
-        """An untrained one; its weights follow from the seed."""
+        """Return an untrained twin with weights given by the seed."""
         static = self.static_map(channels, scales, train)
         seeds = [member_seed(seed, i) for i in range(self.members)]
         return averaged([self.member(channels, scales, static, one) for one in seeds])
 
     def static_map(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series]) -> StaticTwin | None:
-        """The map that it is pulled to, fitted to the training stretches; None where it has none."""
+        """Return the static map towards which the twin is pulled, fitted to the training segments.
+
+        None without a map.
+        """
         return self._map_spec.start(channels, scales, train, 0) if self.valve_map else None
 
     def member(self, channels: TwinChannels, scales: TwinScales, static: StaticTwin | None, seed: int) -> RecurrentTwin:
@@ -83,7 +86,7 @@ class Recurrent:
         return RecurrentTwin(channels, scales, self.prefix_ticks, network, static)
 
     def alone(self) -> Recurrent:
-        """Options of one of its members."""
+        """Options of a single member."""
         return replace(self, units=self.units // self.members, members=1)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
@@ -94,7 +97,7 @@ class Recurrent:
         return shapes | {MAP + name: shape for name, shape in self._map_shapes(channels).items()}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> RecurrentTwin:
-        """The twin with these weights."""
+        """Build the twin with these weights."""
         network = self._network(channels)
         network.load_state_dict({name: torch.from_numpy(np.array(arrays[name])) for name in network.state_dict()})
         numbers = {name: arrays[MAP + name] for name in self._map_shapes(channels)}
@@ -147,13 +150,13 @@ class RecurrentTwin(Twin):
         return state
 
     def drive(self, commands: Array) -> Array:
-        """The scaled commands, and behind them with a static map what it says of them, as its answers are scaled."""
+        """Return the scaled commands; with a static map, followed by its scaled outputs."""
         if self.static is None:
             return self.scaled_commands(commands)
         return np.concatenate([self.scaled_commands(commands), self._scaled_map(self.static.along(commands))], axis=1)
 
     def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
-        """Scaled answers ``(time, batch, answer)`` with gradients by the weights, from measured starts.
+        """Simulate scaled outputs ``(time, batch, answer)`` from measured starts, with gradients by the weights.
 
         Args:
             commands: what `drive` made of them ``(time, batch, number)``.
@@ -197,7 +200,7 @@ class RecurrentTwin(Twin):
         return RecurrentRunner(self)
 
     def map_along(self, commands: Array, state: TwinState) -> tuple[Array, Array]:
-        """What the static map says of commands ``(tick, lane, command)``, scaled and tick first; and its memory after.
+        """Return the scaled outputs of the static map for commands ``(tick, lane, command)``, and its next memory.
 
         Args:
             commands: SI units.
@@ -210,7 +213,7 @@ class RecurrentTwin(Twin):
         return np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1)), memory[:1]
 
     def _scaled_map(self, solved: Array) -> Array:
-        """Scaled answers ``(..., answer)`` of what the map says ``(..., all but strokes)``, zero for strokes."""
+        """Scale map outputs ``(..., all but strokes)`` to ``(..., answer)``, zero for strokes."""
         columns, scales = solved_columns(self.channels), self.scales
         answers = np.zeros((*solved.shape[:-1], len(self.channels.answers)), np.float32)
         answers[..., columns] = (solved - scales.answer_offset[columns]) / scales.answer_width[columns]
@@ -236,7 +239,7 @@ class RecurrentTwin(Twin):
         return build.combine("proposed", BinaryOperation.ADD, before, change)
 
     def _lowered(self, build: Builder, read: str, rows: slice) -> str:
-        """The memory of a member, with these rows of h."""
+        """Add the memory of a member with these rows of h."""
         network = self.network
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
         gates = np.concatenate([np.arange(network.units)[rows] + gate * network.units for gate in range(3)])
@@ -254,7 +257,7 @@ class RecurrentTwin(Twin):
         )
 
     def member_rows(self) -> list[slice]:
-        """Rows of h of each member; all of them as one where members read one another, as after a further training."""
+        """Return the rows of h of each member; a single range if members are connected by further training."""
         units, weight = self.network.units, self.network.h_weight.detach().numpy()
         width = units // self.members
         rows = [slice(first, first + width) for first in range(0, units, width)]
@@ -270,7 +273,7 @@ class RecurrentTwin(Twin):
 
 
 class RecurrentRunner(TwinRunner):
-    """See `TwinRunner`: weights that read commands in SI units and answer in scaled ones, side by side in memory."""
+    """Runner with weights for SI commands and scaled outputs in contiguous memory; see `TwinRunner`."""
 
     def __init__(self, twin: RecurrentTwin) -> None:
         super().__init__(twin)
@@ -302,7 +305,10 @@ class RecurrentRunner(TwinRunner):
         return after
 
     def _run(self, rows: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> tuple[Array, TwinState]:
-        """Answers ``(lane, tick, answer)`` to commands ``(tick, lane, command)``; the state of lane 0 after them."""
+        """Simulate ``(lane, tick, answer)`` for commands ``(tick, lane, command)``.
+
+        Also return the final state of run 0.
+        """
         twin, (_, count, units) = self._twin, self._sizes
         mapped, memory = twin.map_along(rows, state)
         read = twin.scaled(measured)
@@ -320,7 +326,7 @@ def member_seed(seed: int, which: int) -> int:
 
 
 def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
-    """One twin that answers with the mean of the changes of twins of equal width, over the same channels.
+    """Return one twin whose state change is the mean of those of equally wide twins over the same channels.
 
     All of them read the same ports, and what an answer adds up from h is linear: so their mean is one network, whose
     gates are theirs side by side and whose answers have their weights over the number of twins.
@@ -354,7 +360,7 @@ def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
 
 
 def _mean_map(twins: Sequence[RecurrentTwin]) -> StaticTwin | None:
-    """The map to which their mean is pulled: theirs, weighted by how strongly each member is pulled to its own."""
+    """Return the mean of the members' maps, weighted by how strongly each member is pulled to its own."""
     maps = [twin.static for twin in twins if twin.static is not None]
     if not maps:
         return None

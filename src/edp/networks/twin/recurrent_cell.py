@@ -1,4 +1,4 @@
-"""The cell of a twin with feedback ports, with the gradients of its weights: a GRU whose answers are changes."""
+"""Cell of a twin with feedback ports and its weight gradients: a GRU that outputs changes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from edp.networks.twin.steps import run_backward, run_forward
 
 
 class CellWeights(nn.Module):
-    """Weights of a cell that reads commands and `read` further numbers, and answers `answers` of them; zero."""
+    """Weights of a cell with commands, `read` more inputs and `answers` outputs, initially zero."""
 
     def __init__(self, commands: int, read: int, answers: int, units: int) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class CellWeights(nn.Module):
         self.out_bias = nn.Parameter(torch.zeros(answers))
 
     def draw(self, seed: int, answers: float) -> None:
-        """Draw weights with PyTorch's uniform bound, those of the answers times `answers`."""
+        """Set random weights with PyTorch's uniform bound; output weights are multiplied by `answers`."""
         generator, bound = torch.Generator().manual_seed(seed), 1.0 / math.sqrt(self.units)
         with torch.no_grad():
             for name, weight in self.named_parameters():
@@ -44,12 +44,12 @@ class CellWeights(nn.Module):
 
     @property
     def looped(self) -> tuple[nn.Parameter, ...]:
-        """What the compiled loop reads: all but the commands' part and the bias of the gates."""
+        """Parameters that the compiled loop reads: all except the command weights and the bias of the gates."""
         return self.feedback_weight, self.h_weight, self.inner_bias, self.out_weight, self.out_bias
 
 
 class TwinNetwork(CellWeights):
-    """The cell over scaled numbers, time first.
+    """Cell over scaled values, time first.
 
     Args:
         commands: number of them.
@@ -72,7 +72,7 @@ class TwinNetwork(CellWeights):
         bounds: Bounds,
         mapped: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Answers ``(time, batch, answer)`` and the h after them ``(batch, units)``.
+        """Return outputs ``(time, batch, answer)`` and the final h ``(batch, units)``.
 
         Args:
             commands: ``(time, batch, command)``.
@@ -89,7 +89,10 @@ class TwinNetwork(CellWeights):
         return result[0], result[1]
 
     def pulls(self, bounds: Bounds) -> Tensor:
-        """Share of the way to the map by which each answer is pulled in a tick, 0 for strokes; empty without a map."""
+        """Return the fraction by which each output is pulled to the map per sample, 0 for strokes.
+
+        Empty without a map.
+        """
         if self.pull is None:
             return torch.zeros(0)
         strokes = torch.zeros(len(bounds.trapezoid))
@@ -99,7 +102,10 @@ class TwinNetwork(CellWeights):
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Of scaled answers: change by unit of output, low, high ``(answer,)``, trapezoid ``(stroke,)``; velocities."""
+    """Bounds of scaled outputs: change per unit of output, low, high ``(answer,)``, trapezoid ``(stroke,)``.
+
+    Velocities.
+    """
 
     change: Array
     low: Array
@@ -109,7 +115,7 @@ class Bounds:
 
     @staticmethod
     def of(channels: TwinChannels, scales: TwinScales) -> Bounds:
-        """The bounds of a twin in its own numbers."""
+        """Return the bounds of a twin in its scaled units."""
         offset, width = scales.answer_offset, scales.answer_width
         low, high = (np.ascontiguousarray((end - offset) / width) for end in (scales.low, scales.high))
         change = np.ascontiguousarray(scales.change_width / width)
@@ -117,12 +123,12 @@ class Bounds:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """As the compiled loop reads them."""
+        """Return the arrays for the compiled loop."""
         return self.change, self.low, self.high, self.trapezoid
 
 
 def buffers(ticks: int, batch: int, answers: int, units: int) -> tuple[Array, ...]:
-    """What `run_forward` writes: answers, fed values, where no bound acts, gates, inner sums, and h."""
+    """Allocate the outputs of `run_forward`: outputs, fed values, mask of inactive bounds, gates, inner sums, and h."""
     shapes = [(ticks, answers)] * 3 + [(ticks, 3 * units), (ticks, units), (ticks + 1, units)]
     return tuple(np.empty((time, batch, width), np.float32) for time, width in shapes)
 
@@ -173,7 +179,7 @@ class _Steps(torch.autograd.Function):
 
 
 def weight_gradients(read: Array, hs: Array, by_gates: Array, by_inner: Array, by_out: Array) -> tuple[Tensor, ...]:
-    """Gradients of `CellWeights.looped`, from what a cell read, its h, and the adjoint's gradients; tick first."""
+    """Return the gradients of `CellWeights.looped` from cell inputs, h and the adjoint's gradients; time first."""
     units = by_inner.shape[2]
 
     # Gradients of the weights need all ticks at once: one large product replaces one small product a tick.

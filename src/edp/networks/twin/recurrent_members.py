@@ -1,4 +1,4 @@
-"""A recurrent twin taken apart into its members, and set up anew for the recordings of another machine."""
+"""Separation of a recurrent twin into members, and its re-scaling for recordings of another machine."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PUSHED = 0.5
 
 
 def scales_for(twin: RecurrentTwin, own: TwinScales, train: list[Series]) -> TwinScales:
-    """Scales of a twin that goes on with other recordings: its numbers keep their meaning, its bounds follow these.
+    """Return scales for continued training on other recordings: units stay the same, bounds follow the data.
 
     A stroke ends where these recordings come to the same outermost place at least twice, or stay there though a lever
     pushes on; an end that they do not show so is the farther one of theirs and the twin's. Velocities and pressures
@@ -76,7 +76,10 @@ def _longest(there: np.ndarray) -> int:
 
 
 def _pushes(channels: TwinChannels, axis: int, train: Sequence[Series]) -> list[np.ndarray]:
-    """Signed command of an actuator in each stretch, extension positive, as a share of its largest; or nothing."""
+    """Return the signed command of an actuator per segment, extension positive, as a fraction of its largest.
+
+    Empty if unknown.
+    """
     names = [channel.name for channel in channels.commands]
     every = channels.commands + channels.answers
     axes = {one.velocity: one.command for one in roles_of_channels(every).axes}
@@ -89,20 +92,20 @@ def _pushes(channels: TwinChannels, axis: int, train: Sequence[Series]) -> list[
 
 
 def _visits(there: np.ndarray, apart: int) -> int:
-    """Visits to a place, of a stretch that says tick by tick whether it is there."""
+    """Count the visits to a place from a mask over the samples of a segment."""
     ticks = np.flatnonzero(there)
     return int(len(ticks) > 0) + int((np.diff(ticks) > apart).sum())
 
 
 def with_scales(twin: RecurrentTwin, scales: TwinScales) -> RecurrentTwin:
-    """The same twin within other bounds, with weights of its own."""
+    """Return a copy of the twin with other bounds."""
     network = _copied(twin.network)
     static = twin.static and StaticTwin(twin.channels, scales, twin.prefix_ticks, twin.static.numbers)
     return RecurrentTwin(twin.channels, scales, twin.prefix_ticks, network, static, twin.members)
 
 
 def separated(twin: RecurrentTwin) -> list[RecurrentTwin]:
-    """The members of an average, which is their average again; the twin itself where they are one network.
+    """Return the members of an averaged twin; the twin itself if it is a single network.
 
     What the average keeps of all members alone (constants of the answers, pulls, the map) each of them has.
     """
@@ -131,7 +134,7 @@ def _member(twin: RecurrentTwin, rows: slice) -> RecurrentTwin:
 
 
 def _copied(network: TwinNetwork) -> TwinNetwork:
-    """A network with the same weights in memory of its own."""
+    """Return a copy of a network."""
     pulled = 0 if network.pull is None else len(network.pull)
     answers = network.out_bias.shape[0]
     copy = TwinNetwork(network.command_weight.shape[1], answers, network.units, pulled)

@@ -1,4 +1,4 @@
-"""A network on top of a grey box: what the equations leave, as a correction of their changes from tick to tick."""
+"""Network in addition to a grey box: it corrects the changes that the equations do not explain."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Residual(GreyBox):
         return super().shapes(channels) | {name: tuple(weight.shape) for name, weight in network.named_parameters()}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> ResidualTwin:
-        """The twin with these numbers and weights."""
+        """Build the twin with these parameters and weights."""
         network = _network(channels, self.units)
         network.load_state_dict({name: torch.from_numpy(np.array(arrays[name])) for name in network.state_dict()})
         return ResidualTwin(super().build(channels, scales, arrays), network)
@@ -87,13 +87,13 @@ class Residual(GreyBox):
 
 
 def _network(channels: TwinChannels, units: int) -> CellWeights:
-    """It reads ports, and changes of all but the strokes, which are integrals."""
+    """Return the network, which reads ports and the changes of all outputs except strokes, which are integrals."""
     solved = len(solved_columns(channels))
     return CellWeights(len(channels.commands), len(channels.answers) + solved, solved, units)
 
 
 class ResidualTwin(GreyTwin):
-    """State: that of the grey box, and ``h`` of the network ``(batch, units)``."""
+    """State: the grey-box state, and ``h`` of the network ``(batch, units)``."""
 
     def __init__(self, grey: GreyTwin, network: CellWeights) -> None:
         parts = (grey.table, grey.wiring)
@@ -101,15 +101,15 @@ class ResidualTwin(GreyTwin):
         self.network = network
 
     def with_numbers(self, numbers: Doubles) -> ResidualTwin:
-        """The same elements and network with other numbers of the grey box, rounded as they are kept."""
+        """Return the elements and network with other grey-box parameters, rounded to the stored precision."""
         return ResidualTwin(super().with_numbers(numbers), self.network)
 
     def with_stretches(self, stretches: int) -> ResidualTwin:
-        """The same machine and network with opening curves of as many stretches or more."""
+        """Return the machine and network with subdivided opening curves."""
         return ResidualTwin(super().with_stretches(stretches), self.network)
 
     def without_network(self) -> ResidualTwin:
-        """The grey box alone: a network that answers zero."""
+        """Return the grey box with a network whose output is zero."""
         network = _network(self.channels, self.network.units)
         network.load_state_dict(self.network.state_dict())
         with torch.no_grad():
@@ -122,7 +122,7 @@ class ResidualTwin(GreyTwin):
         return super().initial_state(command, measured) | {"h": h}
 
     def cell(self, projected: Array, h: Array) -> Cell:
-        """The network as compiled code reads it, in units of the grey box; see `edp.networks.twin.grey.run.run_lanes`.
+        """Return the network for compiled code, in units of the grey box; see `edp.networks.twin.grey.run.run_lanes`.
 
         Args:
             projected: the commands' part of the gates ``(tick, lane, 3 units)``.
@@ -144,7 +144,7 @@ class ResidualTwin(GreyTwin):
         return answers, after | {"h": h}
 
     def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
-        """Scaled answers ``(time, batch, answer)`` with gradients by the weights of the network, from measured starts.
+        """Simulate scaled outputs ``(time, batch, answer)`` from measured starts, with gradients by the weights.
 
         Args:
             commands: scaled ``(time, batch, command)``.

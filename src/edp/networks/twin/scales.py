@@ -1,4 +1,4 @@
-"""Numbers between SI units and a twin's own: offsets, widths, and the bounds within which its answers stay."""
+"""Scales between SI units and a twin's internal units: offsets, widths, and output bounds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HIGHEST = 1.1
 
 @dataclass(frozen=True, eq=False)
 class TwinScales:
-    """What is fitted to the training data once; every array float32, SI units.
+    """Scales fitted to the training data once; every array is float32 in SI units.
 
     Attributes:
         command_offset: ``(command,)``.
@@ -43,7 +43,7 @@ class TwinScales:
     high: Array
 
     def arrays(self) -> dict[str, Array]:
-        """The fields by name."""
+        """Return the fields by name."""
         return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     @staticmethod
@@ -54,7 +54,7 @@ class TwinScales:
 
     @staticmethod
     def of(arrays: Mapping[str, Array]) -> TwinScales:
-        """From arrays by name, further ones aside.
+        """Create scales from arrays by name; other arrays are ignored.
 
         Raises:
             ValueError: a width that is not positive, or bounds in the wrong order.
@@ -75,7 +75,7 @@ class TwinScales:
 
 
 def fit_scales(channels: TwinChannels, train: Sequence[Series]) -> TwinScales:
-    """Scales and bounds of the training stretches.
+    """Fit scales and bounds to the training segments.
 
     End stops are the ends of the strokes that were seen: a twin does not leave where it was trained.
     """
@@ -105,6 +105,6 @@ def fit_scales(channels: TwinChannels, train: Sequence[Series]) -> TwinScales:
 
 
 def _widths(values: NDArray[np.float64], constant: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root mean squares; `constant` where nothing moves."""
+    """Return root mean squares; `constant` for columns that do not move."""
     deviations = np.sqrt(np.square(values).mean(axis=0))
     return np.where(deviations > CONSTANT * np.asarray(constant), deviations, np.asarray(constant))

@@ -26,7 +26,7 @@ PENALTY = 1e-6
 @TWINS.register("static")
 @dataclass(frozen=True, kw_only=True)
 class StaticMap:
-    """A floor for every twin: what the commands alone say, without any memory but a delay.
+    """Static map from commands to velocities and pressures with a delay as its only memory: a baseline of every twin.
 
     Each command enters by a polygon with `knots` corners over its range, so dead bands and saturation are followed; the
     polygons of all commands add up. The delay with the smallest error on the training data is kept.
@@ -49,7 +49,7 @@ class StaticMap:
         check_count("static map", "delays", self.delays, 100, least=1)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> StaticTwin:
-        """Fitted by least squares; there is nothing to draw."""
+        """Fit by least squares; no random numbers are used."""
         low = np.min([series.inputs.min(axis=0) for series in train], axis=0)
         high = np.max([series.inputs.max(axis=0) for series in train], axis=0)
         # A command that never moved has no range; its polygon is flat.
@@ -67,18 +67,18 @@ class StaticMap:
         return self.build(channels, scales, arrays | _solved(solution, best))
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """Corners, rises of each answer from corner to corner, intercepts, and the delay."""
+        """Return the shapes of corners, rises of each output between corners, intercepts, and the delay."""
         commands, solved = len(channels.commands), len(solved_columns(channels))
         corners = (self.knots, commands)
         return {"corners": corners, "rise": (self.knots * commands, solved), "intercept": (solved,), "delay": (1,)}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> StaticTwin:
-        """The map with these numbers."""
+        """Build the map with these parameters."""
         return StaticTwin(channels, scales, self.prefix_ticks, {name: arrays[name] for name in self.shapes(channels)})
 
 
 class StaticTwin(Twin):
-    """State: ``answer`` in SI units, and the commands of the delay ``(batch, delay, command)``."""
+    """State: ``answer`` (outputs) in SI units, and the commands of the delay ``(batch, delay, command)``."""
 
     def __init__(
         self, channels: TwinChannels, scales: TwinScales, prefix_ticks: int, numbers: Mapping[str, Array]
@@ -94,7 +94,7 @@ class StaticTwin(Twin):
             raise ValueError("its corners do not rise evenly")
 
     def refitted(self, train: Sequence[Series]) -> StaticTwin:
-        """The map of other stretches, with the corners and the delay of this one."""
+        """Return the map fitted to other segments, with the corners and the delay of this map."""
         solved = solved_columns(self.channels)
         corners = self.numbers["corners"]
         rows = [Series(s.name, polygon(s.inputs, corners), s.targets[:, solved]) for s in train]
@@ -104,7 +104,7 @@ class StaticTwin(Twin):
 
     @staticmethod
     def mean(maps: Sequence[StaticTwin], weights: Array) -> StaticTwin:
-        """The map that says the weighted mean of what maps with the same corners and delay say.
+        """Return the weighted mean of maps with equal corners and delay.
 
         Args:
             maps: at least one.
@@ -132,7 +132,7 @@ class StaticTwin(Twin):
         return answers, {"answer": answer, "commands": later}
 
     def mapped(self, commands: Array, before: Array) -> tuple[Array, Array]:
-        """What the map says of commands, SI units, as yet without bounds.
+        """Return the outputs of the map for commands, SI units, without bounds.
 
         Args:
             commands: ``(batch, tick, command)``.
@@ -148,7 +148,7 @@ class StaticTwin(Twin):
         return np.stack(rows, axis=1) + numbers["intercept"], earlier[:, ticks:]
 
     def along(self, commands: Array) -> Array:
-        """What the map says along one stretch of commands ``(tick, command)``: ``(tick, all answers but strokes)``.
+        """Return the outputs of the map along commands ``(tick, command)``: ``(tick, all answers but strokes)``.
 
         All ticks in one product: quicker than `mapped`, and up to rounding the same.
         """

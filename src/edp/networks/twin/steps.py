@@ -34,7 +34,10 @@ compiler = Compiler("twin", lambda: (Path(__file__),), {"nogil": True, "error_mo
 
 @compiler.compiled
 def _tanh(x: np.float32) -> np.float32:
-    """The rational function of Eigen and XLA, within 3e-7: loops over it become vector instructions, unlike libm's."""
+    """Return the rational approximation of tanh used by Eigen and XLA, within 3e-7.
+
+    It is vectorised, unlike libm's function.
+    """
     bounded = min(max(x, np.float32(-7.90531110763549805)), np.float32(7.90531110763549805))
     square = bounded * bounded
     top = square * np.float32(-2.76076847742355e-16) + np.float32(2.00018790482477e-13)
@@ -70,7 +73,7 @@ def gates_of(into: Array, up: Array, bias: Array, h: Array, gates: Array, inner:
 def _answer(
     fed: Array, change: Array, low: Array, high: Array, trapezoid: Array, velocities: int, answer: Array, free: Array
 ) -> None:
-    """Answers within the bounds, and 1 where none acts ``(batch, answer)``."""
+    """Compute outputs within the bounds, and a mask of inactive bounds ``(batch, answer)``."""
     batch, answers = fed.shape
     strokes = len(trapezoid)
     for row in range(batch):
@@ -156,7 +159,7 @@ def run_branches(
     answers: Array,
     last_h: Array,
 ) -> None:
-    """Run lanes free that are one lane up to the tick at which each branches off: what is alike is computed once.
+    """Simulate branches of one run in free run; the common part before each branch is computed once.
 
     Args:
         inputs: commands in SI units ``(time, lane, command)``, and what the static map says ``(time, lane, answer)``,
@@ -224,7 +227,7 @@ def run_branches(
 def gates_back(
     by_h: Array, from_out: Array, gates: Array, inner: Array, h: Array, grads: tuple[Array, Array, Array]
 ) -> None:
-    """The adjoint of `gates_of`.
+    """Compute the adjoint of `gates_of`.
 
     Args:
         by_h: gradient by the next h ``(batch, units)``; written: by h, but for its part in the products.
@@ -263,7 +266,7 @@ def run_backward(
     saved: tuple[Array, ...],
     grads: tuple[Array, ...],
 ) -> None:
-    """The adjoint of `run_forward`, from the last tick to the first.
+    """Compute the adjoint of `run_forward`, from the last sample to the first.
 
     Args:
         grad_answers: gradient by the answers ``(time, batch, answer)``.

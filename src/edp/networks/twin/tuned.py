@@ -1,4 +1,4 @@
-"""A grey box whose numbers follow the machine: what wears and warms is learned from its own free runs, within bounds.
+"""Grey box with on-board adaptation: wear and temperature are learned from its own free runs, within bounds.
 
 An observer follows the machine as in `edp.networks.twin.forecast`. Every `learn_ticks` ticks the stretch that has just
 been measured is run again, freely, from the observer's state at its beginning with the commands that came: once with
@@ -79,7 +79,7 @@ NUMBER_GROUPS.register("oil")(NumberGroup(powers=OIL, deviation=1.0, shared=True
 
 @dataclass(frozen=True, kw_only=True)
 class TunedSpec:
-    """How fast and how far numbers follow.
+    """Speed and limits of the parameter adaptation.
 
     Attributes:
         groups: of `NUMBER_GROUPS`, what is learned.
@@ -115,7 +115,7 @@ class TunedSpec:
 
 
 def group_matrix(twin: GreyTwin, groups: Sequence[str]) -> tuple[tuple[str, ...], Doubles, Doubles, Doubles]:
-    """Labels, numbers that each group moves ``(number, group)``, deviations and changes by a kelvin ``(group,)``.
+    """Return labels, parameters moved by each group ``(number, group)``, deviations, changes per kelvin ``(group,)``.
 
     Raises:
         ConfigError: the twin has no number of a group.
@@ -184,7 +184,7 @@ class TunedTwin:
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Tell that ticks are missing: the observer begins anew at the next one; what was learned stays."""
+        """Report missing samples: the observer restarts at the next sample; the adaptation stays."""
         self._renew(np.zeros(len(self._speeds)))
         self._state: TwinState | None = None
         self._commands: list[Array] = []
@@ -203,11 +203,11 @@ class TunedTwin:
 
     @property
     def factors(self) -> dict[str, float]:
-        """Of each group, against the machine as it was."""
+        """Return the factor of each group relative to the original machine."""
         return dict(zip(self.labels, np.exp(self.by_oil + self.logs).tolist(), strict=True))
 
     def step(self, command: Array, measured: Array, oil_c: float = math.nan) -> None:
-        """Take one tick in.
+        """Process one sample.
 
         Args:
             command: ``(command,)``; one that is missing interrupts, since nothing is known of what moves then.
@@ -241,7 +241,7 @@ class TunedTwin:
         self._state = after
 
     def forecast(self, ticks: int) -> Doubles | None:
-        """Velocities so many ticks ahead with the command held ``(velocity,)``; None at the start."""
+        """Return velocities `ticks` samples ahead with the command held ``(velocity,)``; None at the start."""
         if self._now is None or self._ticks <= self.twin.prefix_ticks:
             return None
         command, state, row = self._now
@@ -249,7 +249,7 @@ class TunedTwin:
         return np.asarray(self._runner.branches(commands, state, row, first)[0, -1, self._speeds])
 
     def _warm(self, oil_c: float) -> None:
-        """Move the numbers by what the temperature of the oil makes of them."""
+        """Adjust the parameters to the oil temperature."""
         apart = oil_c - self.spec.oil_c
         if not (abs(apart) <= 2.0 * HOTTEST_C and abs(oil_c) <= HOTTEST_C):
             return
@@ -264,7 +264,7 @@ class TunedTwin:
         return np.asarray(own + np.float32(self.spec.gain) * (measured - own), dtype=np.float32)
 
     def _take(self, measured: Array) -> None:
-        """Note what a stretch has come to, and learn at its end."""
+        """Store a sample of the segment, and learn at the end of the segment."""
         if self._begin is None or not self._commands:
             return
         self._measured.append(measured[self._speeds])
@@ -276,7 +276,7 @@ class TunedTwin:
         self._begin = None
 
     def _errors(self, truth: Doubles, logs: Doubles) -> Doubles:
-        """Of the present stretch with these numbers, SI units ``(tick, velocity)``."""
+        """Return the errors of the present segment with these factors, SI units ``(tick, velocity)``."""
         if self._begin is None:
             raise ValueError("no stretch has begun")
         state, row, forces = self._begin
@@ -305,7 +305,7 @@ class TunedTwin:
         self._renew(np.array(self._runner.resistance))
 
     def _unit(self, error: Doubles) -> Doubles:
-        """What errors lately were ``(velocity,)``, SI units, with this stretch; never nothing."""
+        """Return the recent error level ``(velocity,)`` including this segment, SI units; always positive."""
         self._judged = min(self._judged + 1, LATELY)
         self._square = self._square + ((error**2).mean(axis=0) - self._square) / self._judged
         return np.asarray(np.sqrt(np.maximum(self._square, self._floor)))

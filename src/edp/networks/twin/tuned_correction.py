@@ -1,4 +1,4 @@
-"""A network's predictions and the forecasts of a grey box that follows the machine, mixed by what they were worth."""
+"""Combination of network predictions with forecasts of an adapted grey box, weighted by their recent errors."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ class TunedCorrection:
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Tell that ticks are missing: what was predicted before them is not judged; what was learned stays."""
+        """Report missing samples: earlier predictions are not compared; learned weights stay."""
         self.tuned.interrupt()
         self._rows: list[list[tuple[Doubles, Doubles]]] = [[] for _ in self._horizons]
 
     def step(self, command: Array, measured: Array, prediction: Array, oil_c: float = math.nan) -> Array:
-        """Take a tick in and correct what was predicted from it.
+        """Process one sample and correct the prediction made from it.
 
         Args:
             command: of the twin ``(command,)``; one that is missing interrupts.
@@ -99,7 +99,7 @@ class TunedCorrection:
         return moved.astype(np.float32)
 
     def _judge(self, present: Doubles) -> None:
-        """Learn from what was predicted and forecast of this tick what each is worth."""
+        """Update the weights from the errors of predictions and forecasts for this sample."""
         for h, k in enumerate(self._horizons):
             if len(self._rows[h]) < k:
                 continue

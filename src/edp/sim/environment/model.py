@@ -1,4 +1,4 @@
-"""What a controller may know of a machine by its data sheet: the nominal commands of its levers, and its kinematics."""
+"""Data-sheet model of a machine for controllers: nominal lever commands and kinematics."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ ENTRY, VECTOR_ENTRY = "edp.sim.environment:ExcavatorEnv", "edp.sim.environment:V
 
 
 def register() -> None:
-    """Register ``edp/Excavator-M22-v0`` and the like, one a built-in machine; again is no error."""
+    """Register ``edp/Excavator-M22-v0`` etc., one per built-in machine; repeated calls are allowed."""
     for machine in machine_names():
         name = f"edp/Excavator-{machine}-v0"
         if name not in gymnasium.registry:

@@ -1,4 +1,4 @@
-"""Compiles what environments run, before the first of them."""
+"""Compilation of the code of environments before the first one."""
 
 from __future__ import annotations
 

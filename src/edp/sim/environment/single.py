@@ -125,7 +125,7 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self.model.strokes(poses)
 
     def snapshot(self) -> Moment:
-        """This moment of plant, sensors and counters, exactly; nothing that follows changes it.
+        """Return an exact snapshot of plant, sensors and counters, which later steps do not change.
 
         Raises:
             ConfigError: no episode has begun.
@@ -149,7 +149,7 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return observation
 
     def branch(self, seed: int) -> None:
-        """Give sensors and soil fresh randomness from here on; the present stays as it is.
+        """Give sensors and soil new random numbers from now on; the present state stays.
 
         Raises:
             ConfigError: no episode has begun.
@@ -168,7 +168,7 @@ class ExcavatorEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def spaces(channels: tuple[Channel, ...]) -> tuple[Any, Any]:
-    """Of observations, between the plausible limits of each channel's kind, and of lever positions."""
+    """Return the spaces of observations, within the plausibility limits of each channel's kind, and of levers."""
     limits = np.array([KINDS[channel.kind].plausible for channel in channels], dtype=np.float32)
     observations = gymnasium.spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float32)
     return observations, gymnasium.spaces.Box(-1.0, 1.0, (at.AXES,), np.float32)

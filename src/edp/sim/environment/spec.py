@@ -1,4 +1,4 @@
-"""What an environment simulates and shows, checked before the first step."""
+"""Settings of an environment: simulation and observations, checked before the first step."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class EnvironmentSpec:
         return 1.0 if isinstance(self.randomise, bool) else float(self.randomise)
 
     def scenario(self, seed: int) -> Scenario:
-        """The scenario of one episode.
+        """Return the scenario of one episode.
 
         Raises:
             ConfigError: it cannot be.
@@ -127,11 +127,11 @@ class EnvironmentSpec:
 
     @property
     def columns(self) -> NDArray[np.int64]:
-        """Where each value of an observation comes from, see `edp.sim.episodes.tick.SOURCES`."""
+        """Return the source of each observation value, see `edp.sim.episodes.tick.SOURCES`."""
         return np.array([self.source(name) for name in self.observed], dtype=np.int64)
 
     def source(self, name: str) -> int:
-        """Where a channel's value comes from.
+        """Return the source of a channel's value.
 
         Raises:
             ConfigError: there is no such channel, or only in soil.
@@ -150,7 +150,7 @@ class EnvironmentSpec:
 
 
 def settings_of(settings: EnvironmentSpec | None, changes: Mapping[str, Any]) -> EnvironmentSpec:
-    """Settings, the usual ones where None, with changes laid over them.
+    """Return the settings (default if None) with the changes applied.
 
     Raises:
         ConfigError: a change names no setting (the closest is offered), or is out of range.

@@ -1,4 +1,4 @@
-"""How an environment's next episode begins: its settings, what `reset` overrides of them, and a drawn machine."""
+"""Start of an environment's next episode: settings, overrides of `reset`, and a random machine."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MOST_SEED = 2**31 - 1
 def episode_start(
     spec: EnvironmentSpec, seed: int, options: Mapping[str, Any] | None
 ) -> tuple[EpisodeStart, dict[str, Any]]:
-    """The start of an episode, and what its `info` says of it.
+    """Return the start of an episode, and its description for `info`.
 
     Raises:
         ConfigError: an option is unknown (the closest is offered) or out of range.
@@ -67,7 +67,7 @@ def episode_start(
 
 
 def checked_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
-    """Which lanes begin anew, shape ``(lanes,)``; all of them where no mask is given.
+    """Return the mask of environments that restart, shape ``(lanes,)``; all of them without a mask.
 
     Raises:
         ConfigError: another shape or type, or no lane at all.
@@ -84,7 +84,7 @@ def checked_mask(lanes: int, mask: Any) -> NDArray[np.bool_]:
 
 
 def checked_seed(seed: Any) -> int | None:
-    """A seed as Gymnasium takes it.
+    """Return a seed checked for Gymnasium.
 
     Raises:
         ConfigError: it is no whole number, or negative.
@@ -97,7 +97,7 @@ def checked_seed(seed: Any) -> int | None:
 
 
 def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
-    """The machine of the family that this seed draws."""
+    """Return the random machine of the family for this seed."""
     low, high = spec.masses_t
     # A family of its own for each seed, so that its first member has any mass.
     family = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0]) % 10**9

@@ -1,4 +1,4 @@
-"""What is true at an instant, by the names of channels; nothing is computed before it is asked for."""
+"""Ground truth at an instant by channel name; values are computed on access."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @cache
 def sources(in_soil: bool) -> Mapping[str, tuple[int, float]]:
-    """Column and sign of each name in a row of the log; sign 0 for those that are shown as they are."""
+    """Return column and sign of each name in a log row; sign 0 for unchanged values."""
     width = at.LOG_GROUND + (at.GROUND_POINTS if in_soil else 0)
     columns = {name: (column, 0.0) for name, column in truth_columns(width).items()}
     names = list(TABLE_A1)
@@ -30,7 +30,7 @@ def sources(in_soil: bool) -> Mapping[str, tuple[int, float]]:
 
 
 class Truth(Mapping[str, Any]):
-    """Noise-free channels in SI units: those of Table A.1 but accelerations, and those that `simulate` logs beside it.
+    """Noise-free channels in SI units: Table A.1 without accelerations, and the additional ones logged by `simulate`.
 
     Args:
         rows: the present row of the plant's log, shape (columns,), or one for each of many machines.
@@ -54,7 +54,7 @@ class Truth(Mapping[str, Any]):
         self._faults, self._shares = tuple(FAULT_CHANNELS)[:faults], shares
 
     def __getitem__(self, name: str) -> Any:
-        """A number, or an array of shape (machine,)."""
+        """Return a number, or an array of shape (machine,)."""
         if name in self._faults and self._shares is not None:
             share = self._shares()[:, self._faults.index(name)]
             return float(share[0]) if self._rows.ndim == 1 else share

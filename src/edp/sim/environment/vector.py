@@ -142,7 +142,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         return self._present[0].copy(), np.zeros(self.num_envs), never, truncated, infos
 
     def snapshot(self, index: int) -> Moment:
-        """This moment of one machine; `ExcavatorEnv.restore` takes it as well.
+        """Return a snapshot of one machine; `ExcavatorEnv.restore` accepts it, too.
 
         Raises:
             ConfigError: no episode has begun there.
@@ -150,7 +150,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         return self._episodes.moment(index)
 
     def restore(self, index: int, snapshot: Moment) -> NDArray[np.float32]:
-        """Make one machine what it was at a moment, of this environment or of another.
+        """Restore one machine to a snapshot of this or another environment.
 
         Returns:
             Its observation of that moment, shape (channel,).
@@ -209,7 +209,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
 def _side_by_side(
     count: int, settings: EnvironmentSpec | Sequence[EnvironmentSpec] | None, changes: dict[str, Any]
 ) -> list[EnvironmentSpec]:
-    """The settings of each machine.
+    """Return the settings of each machine.
 
     Raises:
         ConfigError: their number, channels or rates do not fit.

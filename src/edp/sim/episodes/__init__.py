@@ -1,1 +1,1 @@
-"""Machines under way, many in one compiled call a tick: plant, sensors and what is shown of them."""
+"""Batched simulation of machines in one compiled call per sample: plant, sensors and observations."""

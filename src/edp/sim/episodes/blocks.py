@@ -1,4 +1,4 @@
-"""Where everything of one episode lies: a row of numbers that changes, and a row that was drawn before it began.
+"""Memory layout of an episode: a row of changing values, and a row of random values drawn before it begins.
 
 A copy of the two rows is the episode at that moment, exactly. Blocks of the rows have sizes of their own in each
 episode (a machine's reach, its dead times, the latency of its bus), so that each row begins with a table of them.
@@ -40,20 +40,20 @@ ENTRY = 3
 
 @pasted
 def table(index: int, memory: Array, row: Array) -> Array:
-    """A block of two axes of `row`; `memory` is the changing row, which has the table."""
+    """Return a two-dimensional block of `row`; the table of blocks is in `memory`, the changing row."""
     first, count, width = int(memory[ENTRY * index]), int(memory[ENTRY * index + 1]), int(memory[ENTRY * index + 2])
     return row[first : first + count * width].reshape(count, width)
 
 
 @pasted
 def line(index: int, memory: Array, row: Array) -> Array:
-    """A block of one axis of `row`."""
+    """Return a one-dimensional block of `row`."""
     first, count = int(memory[ENTRY * index]), int(memory[ENTRY * index + 1]) * int(memory[ENTRY * index + 2])
     return row[first : first + count]
 
 
 def rows_of(parts: Mapping[int, Array]) -> tuple[Array, Array]:
-    """The two rows that hold these blocks, one value an index."""
+    """Return the two rows that hold these blocks, given one array per index."""
     head, changing, drawn = np.zeros((BLOCKS, ENTRY)), [np.zeros(0)], [np.zeros(0)]
     ends = [BLOCKS * ENTRY, 0]
     for index in range(BLOCKS):
@@ -66,7 +66,7 @@ def rows_of(parts: Mapping[int, Array]) -> tuple[Array, Array]:
 
 
 def view(index: int, memory: Array, drawn: Array) -> Array:
-    """A block as a view, shape (rows, columns)."""
+    """Return a block as a view, shape (rows, columns)."""
     first, count, width = (int(v) for v in memory[ENTRY * index : ENTRY * index + ENTRY])
     row = memory if index < CHANGING else drawn
     return row[first : first + count * width].reshape(count, width)

@@ -1,4 +1,4 @@
-"""Episodes in rows: each begins with its own machine, soil and seed; all go on by a tick in one compiled call."""
+"""Episodes in rows: each has its own machine, soil and seed; all advance in one compiled call."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _FAULTY = (
 
 @dataclass(frozen=True)
 class EpisodeStart:
-    """How one episode begins.
+    """Start of an episode.
 
     Attributes:
         scenario: machine, soil, rate, seed and length; its excitation is not used.
@@ -58,7 +58,7 @@ class EpisodeStart:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """One episode at one instant: its rows, which nothing that follows changes, and how it began."""
+    """Snapshot of one episode: its rows, independent of later steps, and its start."""
 
     start: EpisodeStart
     columns: NDArray[np.int64]
@@ -87,7 +87,7 @@ class Episodes:
         self._all = np.ones(count, dtype=np.bool_)
 
     def begin(self, index: int, start: EpisodeStart, out: tick.Out) -> None:
-        """Begin an episode anew; what is seen of it goes to `out`.
+        """Restart an episode; its observation is written to `out`.
 
         Raises:
             ConfigError: the machine's dead times are too long.
@@ -102,7 +102,7 @@ class Episodes:
         return observations, np.empty((self.count, tick.LOG_WIDTH)), np.zeros(self.count, dtype=np.bool_)
 
     def step(self, levers: Array, out: tick.Out, active: NDArray[np.bool_] | None = None) -> None:
-        """One tick of the active episodes with lever positions of shape (count, 3); what is seen goes to `out`.
+        """Advance the active episodes by one sample with levers of shape (count, 3); observations are written to `out`.
 
         Raises:
             ConfigError: a lever is not a finite number; no episode has moved.
@@ -129,7 +129,7 @@ class Episodes:
         return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
 
     def shares(self) -> Callable[[], Array] | None:
-        """What gives, whenever it is called, how much of each fault is there now; None where no episode has faults.
+        """Return a function that computes the present fraction of each fault; None without faults.
 
         The shares are from 0 to 1, shape (episode, fault), NaN beyond the faults of an episode.
         """
@@ -148,7 +148,7 @@ class Episodes:
         return bool(self.memory[index, first + blocks.TICK] >= self.memory[index, first + blocks.SAMPLES] - 1.0)
 
     def moment(self, index: int) -> Moment:
-        """This instant of an episode."""
+        """Return a snapshot of an episode."""
         start = self.starts[index]
         if start is None:
             raise ConfigError(f"episode {index} has not begun; reset it first")
@@ -157,7 +157,7 @@ class Episodes:
         return Moment(start, self.columns, self.memory[index].copy(), drawn)
 
     def go_to(self, index: int, moment: Moment) -> None:
-        """Make an episode what it was at a moment, to the bit.
+        """Restore an episode to a snapshot, bit for bit.
 
         Raises:
             ConfigError: the moment is of episodes that show other channels.
@@ -169,7 +169,7 @@ class Episodes:
         self._put(index, moment.start, moment.memory.copy(), moment.drawn)
 
     def show(self, index: int, out: tick.Out) -> None:
-        """What was seen of an episode last, into `out`."""
+        """Write the last observation of an episode to `out`."""
         observations, rows, ended = out
         observations[index] = blocks.view(blocks.SHOWN, self.memory[index], self.drawn[index])[-1]
         row = blocks.view(blocks.ROW, self.memory[index], self.drawn[index])[0]
@@ -177,7 +177,7 @@ class Episodes:
         ended[index] = self.ended(index)
 
     def redraw(self, index: int, seed: np.random.SeedSequence) -> None:
-        """Fresh randomness of sensors and soil from here on; what was shown and what the edge is in now stays."""
+        """Draw new random numbers of sensors and soil from now on; the present observation and soil contact stay."""
         start = self.starts[index]
         if start is None:
             raise ConfigError(f"episode {index} has not begun; reset it first")
@@ -200,7 +200,7 @@ class Episodes:
         self._put(index, start, self.memory[index].copy(), drawn)
 
     def _put(self, index: int, start: EpisodeStart, memory: Array, drawn: Array) -> None:
-        """Give an episode these rows; all rows become as long as the longest."""
+        """Set the rows of an episode; all rows are extended to the longest."""
         self.starts[index] = start
         self.most_faults = max(len(each.scenario.faults) for each in self.starts if each is not None)
         if self.count == 1:
@@ -241,7 +241,7 @@ def _shares_of(plans: Sequence[tuple[tuple[FaultSpec, ...], float]], ticks: NDAr
 
 
 def _sensor_draws(start: EpisodeStart, noise: np.random.SeedSequence, chance: np.random.SeedSequence) -> Array:
-    """What is random in the sensors of an episode and in their faults, shape (samples, columns)."""
+    """Return the random numbers of the sensors of an episode and of their faults, shape (samples, columns)."""
     scenario = start.scenario
     rng = np.random.default_rng(noise) if scenario.sensor_noise else None
     healthy = draws.draw(start.machine, scenario.samples, scenario.rate_hz, rng)
@@ -256,7 +256,7 @@ def _losses(start: EpisodeStart, samples: int, seed: np.random.SeedSequence) -> 
 
 
 def _changes(start: EpisodeStart, plant: Plant) -> Array:
-    """What faults make of the plant's numbers, as the block of changes has it."""
+    """Return the changes of plant parameters by faults, in the form of the change block."""
     changes = MachineCourse(start.scenario.faults, numbers_of(plant)).changes(start.scenario.samples)
     changes[:, blocks.BLOCK] = np.array(_FAULTY, dtype=float)[changes[:, blocks.BLOCK].astype(np.int64)]
     return changes
@@ -282,7 +282,7 @@ def _sensor_parts(start: EpisodeStart) -> dict[int, Array]:
 
 
 def _rows(start: EpisodeStart, width: int) -> tuple[Array, Array]:
-    """Both rows of an episode at rest at its start; `width` is that of its observations."""
+    """Return both rows of an episode in steady state at its start; `width` is the number of observations."""
     scenario, machine = start.scenario, start.machine
     ground, strokes = start_of(scenario, machine)
     if start.strokes is not None:

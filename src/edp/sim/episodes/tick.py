@@ -35,7 +35,7 @@ def finite(value: float) -> bool:
 
 @pasted
 def scratch_of(scratch: Array) -> tuple[Array, ...]:
-    """The work arrays of `integrator.new_work`, cut from one array of at least `SCRATCH` values."""
+    """Return the work arrays of `integrator.new_work`, as parts of one array of at least `SCRATCH` values."""
     ends = (
         places.FROZEN,
         places.FROZEN + 3,
@@ -66,7 +66,7 @@ MOST_PAST = 256
 
 @pasted
 def setup_of(memory: Array, drawn: Array, scratch: Array) -> Setup:
-    """What the plant's step takes: axes, plant, work and the arrays of the ground."""
+    """Return the arguments of the plant's step: axes, plant, work and ground arrays."""
     ground = (
         blocks.line(blocks.SOIL_NUMBERS, memory, memory),
         blocks.table(blocks.SOIL_TABLES, memory, drawn),
@@ -105,7 +105,7 @@ def move(memory: Array, lever: Array, setup: Setup, room: Array) -> int:
 
 @inlined
 def change(memory: Array, drawn: Array) -> None:
-    """Give the plant the numbers that faults have made by this tick."""
+    """Update the plant parameters to the faults of this sample."""
     numbers, changes = blocks.line(blocks.NUMBER, memory, memory), blocks.table(blocks.CHANGES, memory, drawn)
     done = int(numbers[blocks.CHANGED])
     while done < changes.shape[0] and changes[done, blocks.AT_TICK] <= numbers[blocks.TICK]:
@@ -142,7 +142,7 @@ def look(memory: Array, drawn: Array, setup: Setup, work: Array) -> None:
 
 @inlined
 def show(memory: Array, drawn: Array, columns: NDArray[np.int64], index: int, out: Out) -> None:
-    """The observation of this tick: what was measured, `DELAY` ticks late, and the one before where one was lost."""
+    """Write the observation of this sample: the measurement delayed by `DELAY` samples, or the previous one if lost."""
     observation, log_row = out[0][index], out[1][index]
     numbers, shown = blocks.line(blocks.NUMBER, memory, memory), blocks.table(blocks.SHOWN, memory, memory)
     measured, row = blocks.line(blocks.MEASURED, memory, memory), blocks.line(blocks.ROW, memory, memory)
@@ -175,7 +175,7 @@ def step_all(
     scratch: Array,
     out: Out,
 ) -> tuple[int, int]:
-    """A tick of every active episode; the first that failed, and how.
+    """Advance every active episode by one sample; return the first failure and its kind.
 
     Args:
         memory: rows that change, shape (episode, ...).
@@ -217,7 +217,7 @@ def step_all(
 
 @compiled
 def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Array, index: int, out: Out) -> None:
-    """What is seen of episode `index` before its first tick; `memory` and `drawn` are its rows."""
+    """Write the observation of episode `index` before its first sample; `memory` and `drawn` are its rows."""
     rest, work = scratch[9 + at.SPOOLS * (MOST_PAST + 2) :], scratch[3:9].reshape(2, 3)
     setup = setup_of(memory, drawn, rest)
     change(memory, drawn)
@@ -226,5 +226,5 @@ def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Arra
 
 
 def new_scratch() -> Array:
-    """The scratch that `step_all` and `begin` take."""
+    """Return the scratch array for `step_all` and `begin`."""
     return np.zeros(9 + at.SPOOLS * (MOST_PAST + 2) + SCRATCH)

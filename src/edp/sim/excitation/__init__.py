@@ -1,4 +1,4 @@
-"""Excitation in the loop: who moves the levers, and how; one file and one registration a family."""
+"""Excitation: algorithms that move the levers; one module and one registration per family."""
 
 from edp.sim.excitation import (
     aprbs,

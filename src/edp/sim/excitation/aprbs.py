@@ -51,7 +51,7 @@ class Aprbs(Excitation):
         return float(self._rng.uniform(0.3, 1.7) * mean)
 
     def block(self, view: View) -> Array:
-        """Levers up to the next step of any of them; a tenth of a second at a time in a chirp."""
+        """Return the levers up to the next step of any lever; 0.1 s at a time during a chirp."""
         if self._chirp < 0 and self._until_chirp <= 0.0:
             self._begin_chirp(view)
         for i, hold in enumerate(self._holds):
@@ -89,7 +89,7 @@ class Aprbs(Excitation):
         self._sign = 1.0 if view.strokes[self._chirp] < 0.5 else -1.0
 
     def _sweep(self, samples: int, stroke: float) -> Array:
-        """The next samples of the chirp: exponential in frequency, so that every octave takes the same time."""
+        """Return the next samples of the chirp, exponential in frequency, so that every octave takes the same time."""
         low, high = self.CHIRP_HZ
         if (stroke > self.TURN[1] and self._sign > 0) or (stroke < self.TURN[0] and self._sign < 0):
             self._sign = -self._sign
@@ -105,7 +105,7 @@ class Aprbs(Excitation):
         return np.asarray(values)
 
     def redraw(self, unused: int) -> None:
-        """Steps last anew; a chirp goes on from where it was cut."""
+        """Redraw the duration of the present steps; a chirp continues where it was cut."""
         for hold in self._holds:
             hold.redraw(unused)
         if self._chirp >= 0:

@@ -1,4 +1,4 @@
-"""What every way of moving the levers shares: the registry, the lean towards mid stroke, and holds of random length."""
+"""Common base of excitations: registry, drift towards mid stroke, and holds of random duration."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Excitation:
         return AXES + MOTORS if cls.swings else AXES
 
     def block(self, view: View) -> Array:
-        """The next lever targets in [-1, 1], shape (samples, `levers`), given what is seen now."""
+        """Return the next lever targets in [-1, 1], shape (samples, `levers`), for the present view."""
         raise TypeError(f"{type(self).__name__} does not say what it does next; give it a `block`")
 
     def redraw(self, unused: int) -> None:
-        """Forget the last `unused` samples of the latest block, and how long what is being done was to last.
+        """Discard the last `unused` samples of the latest block, and redraw the duration of the present action.
 
         A branch of the future calls this: what the operator does now stays, for how much longer is drawn anew from
         what the time held so far leaves possible.
@@ -63,14 +63,14 @@ def extend_probability(stroke: float, pull: float = 1.1) -> float:
 
 
 def held(levels: Sequence[float] | Array, samples: int) -> Array:
-    """The same levers at every sample, shape (samples, levers)."""
+    """Return constant levers, shape (samples, levers)."""
     targets = np.empty((samples, len(levels)))
     targets[:] = levels
     return targets
 
 
 class Hold:
-    """Something that lasts for a uniformly drawn time.
+    """Timer with a uniformly random duration.
 
     Attributes:
         left: samples left.
@@ -83,7 +83,7 @@ class Hold:
         self.left = 0
 
     def start(self, low_s: float, high_s: float) -> int:
-        """Begin a new one of `low_s` to `high_s` seconds; returns its samples."""
+        """Start a duration between `low_s` and `high_s` seconds, and return its number of samples."""
         self._low, self._high, self._held = low_s, high_s, 0
         self.left = max(1, round(self._rng.uniform(low_s, high_s) * self._rate))
         return self.left
@@ -95,7 +95,7 @@ class Hold:
         return samples
 
     def redraw(self, unused: int) -> None:
-        """Take back `unused` samples and draw what is left, given the time held so far."""
+        """Return `unused` samples and redraw the remaining duration, given the elapsed time."""
         self.spend(-unused)
         if self.left > 0:
             # What has lasted so long already cannot have been drawn shorter.

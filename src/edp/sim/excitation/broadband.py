@@ -11,7 +11,7 @@ from edp.sim.view import View
 
 @EXCITATIONS.register("broadband")
 class Broadband(Excitation):
-    """All levers at once, each a sum of sines of one size from `LOW_HZ` to `HIGH_HZ` with phases of its own.
+    """Multisine on all levers at once with equal amplitudes from `LOW_HZ` to `HIGH_HZ` and independent phases.
 
     A course lasts `COURSE_S`, in which every sine completes whole periods; phases, sizes and the pose that the levers
     lean to are then drawn anew. Of `DRAWS` draws of phases that with the least peak is taken, so that most of the
@@ -40,7 +40,7 @@ class Broadband(Excitation):
         self._done = 0
 
     def block(self, view: View) -> Array:
-        """A tenth of a second of the course."""
+        """Return 0.1 s of the signal."""
         if self._done >= len(self._course):
             self._begin()
         count = min(max(1, round(self.PIECE_S * self._rate)), len(self._course) - self._done)
@@ -54,7 +54,7 @@ class Broadband(Excitation):
         return np.clip(piece, -1.0, 1.0)
 
     def _begin(self) -> None:
-        """Draw another course."""
+        """Draw another signal."""
         rng, samples = self._rng, max(1, round(self.COURSE_S * self._rate))
         seconds = np.arange(samples) / self._rate
         # No sine above what the rate can show; at low rates fewer of them are left, one at least.
@@ -74,5 +74,5 @@ class Broadband(Excitation):
         self._done = 0
 
     def redraw(self, unused: int) -> None:
-        """The course goes on from where it was cut: all of it is what is being done now."""
+        """Continue the signal where it was cut, since the whole signal is the present action."""
         self._done -= unused

@@ -20,11 +20,11 @@ class Combined(Excitation):
         self._streams = [AxisStream(rng, rate_hz, axis=axis) for axis in range(AXES)]
 
     def block(self, view: View) -> Array:
-        """Levers up to the next change of any of them."""
+        """Return the levers up to the next change of any lever."""
         return self.until_a_change(view.strokes)
 
     def until_a_change(self, strokes: Sequence[float] | Array) -> Array:
-        """The same, given each lever's place between its ends as a share."""
+        """Return the levers up to the next change, given each lever's position between its ends as a fraction."""
         for stream, stroke in zip(self._streams, strokes, strict=True):
             if stream.hold.left == 0:
                 stream.next(stroke)
@@ -34,6 +34,6 @@ class Combined(Excitation):
         return held([stream.level for stream in self._streams], samples)
 
     def redraw(self, unused: int) -> None:
-        """Each lever's hold lasts anew."""
+        """Redraw the duration of each lever's hold."""
         for stream in self._streams:
             stream.hold.redraw(unused)

@@ -57,7 +57,7 @@ class Dig(Tracked):
         self._full_kg = self.FULL * machine.bucket.capacity * LOOSE_DENSITY
 
     def next_leg(self, view: View) -> Array:
-        """The leg of the next phase."""
+        """Return the motion of the next phase."""
         rng = self._rng
         self._phase = APPROACH if self._phase == DUMP else self._phase + 1
         if self._phase == APPROACH:
@@ -81,7 +81,7 @@ class Dig(Tracked):
         return self.stroke_leg(self._dump(view), rng.uniform(*self.MOVE))
 
     def _plan(self, view: View) -> bool:
-        """Choose surface, depth and the line of the drag; False where none was found in reach."""
+        """Choose surface, depth and drag line; returns False if none is within reach."""
         rng, reach = self._rng, self.reach_m
         for _ in range(self.TRIES):
             self._surface = view.ground if view.ground == view.ground else rng.uniform(*self.MIME_M)
@@ -99,7 +99,7 @@ class Dig(Tracked):
         return False
 
     def _curl(self, view: View) -> Array:
-        """Close the bucket and lift it, as far as it can be."""
+        """Close the bucket and lift it as far as possible."""
         rng = self._rng
         closed = math.radians(rng.uniform(*self.CURLED_DEG))
         tip = (view.tip_x, self._surface + rng.uniform(*self.LIFT_M), closed)

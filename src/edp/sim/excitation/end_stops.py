@@ -29,7 +29,7 @@ class EndStops(Excitation):
         self._levels = np.zeros(AXES)
 
     def block(self, view: View) -> Array:
-        """A stretch of a run until the end is reached, a hold of 0.5-1 s there, then a short combined move."""
+        """Return a part of the motion to the end stop, a hold of 0.5-1 s there, then a short combined move."""
         if self._hold.left == 0:
             self._next(view)
         samples = self._hold.spend(self._hold.left)
@@ -63,5 +63,5 @@ class EndStops(Excitation):
             self._hold.start(self.STRETCH_S, self.STRETCH_S)
 
     def redraw(self, unused: int) -> None:
-        """A hold or move lasts anew; a stretch keeps its length."""
+        """Redraw the duration of a hold or move; a motion to the stop keeps its length."""
         self._hold.redraw(unused)

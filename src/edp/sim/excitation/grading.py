@@ -42,7 +42,7 @@ class Grading(Tracked):
         self._passes, self._raised = 0, True
 
     def next_leg(self, view: View) -> Array:
-        """A pass over the line, or the way to a new one: up, across, and down to it."""
+        """Return a pass over the line, or the way to a new one: up, across, and down to it."""
         rng = self._rng
         if self._passes > 0:
             self._raised = False

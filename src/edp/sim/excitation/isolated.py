@@ -31,5 +31,5 @@ class Isolated(Excitation):
         return targets
 
     def redraw(self, unused: int) -> None:
-        """The rest of the move lasts anew."""
+        """Draw a new random duration for the remainder of the current move."""
         self._stream.hold.redraw(unused)

@@ -1,4 +1,4 @@
-"""What the levers of a machine do: where its dead bands end, and the lever that gives a cylinder a speed."""
+"""Lever characteristics of a machine: ends of the dead bands, and the lever for a cylinder speed."""
 
 from __future__ import annotations
 

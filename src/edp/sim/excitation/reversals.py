@@ -51,5 +51,5 @@ class Reversals(Excitation):
         self._hold.start(*self.FLIP_S)
 
     def redraw(self, unused: int) -> None:
-        """The flip or pause lasts anew."""
+        """Redraw the duration of the flip or pause."""
         self._hold.redraw(unused)

@@ -11,14 +11,14 @@ from edp.sim.view import View
 
 
 class MotorStream(AxisStream):
-    """A lever of swing or travel: held longer than those of the front, since more mass moves."""
+    """Lever of swing or travel: held longer than front levers, because of the larger mass."""
 
     HOLD_S = (0.6, 3.0)
 
 
 @EXCITATIONS.register("six_levers")
 class SixLevers(Combined):
-    """Six independent levers: `combined`, and beside it swing, left and right track."""
+    """Six independent levers: `combined` together with swing, left and right track."""
 
     swings = True
     MID_STROKE = 0.5
@@ -29,5 +29,5 @@ class SixLevers(Combined):
         self._streams += [MotorStream(rng, rate_hz) for _ in range(MOTORS)]
 
     def block(self, view: View) -> Array:
-        """Levers up to the next change of any of them."""
+        """Return the levers up to the next change of any lever."""
         return self.until_a_change([*view.strokes, *[self.MID_STROKE] * MOTORS])

@@ -38,7 +38,10 @@ class SwingDig(Dig):
         self._tracks = np.zeros(2)
 
     def next_leg(self, view: View) -> Array:
-        """The leg of the next phase, or a stay where the swing is not yet there; swing and travel follow the phase."""
+        """Return the motion of the next phase, or a wait while the swing is not there.
+
+        Swing and travel follow the phase.
+        """
         if self._phase in (APPROACH, CURL) and abs(self._swing_goal - view.swing) > self.NEAR_RAD:
             return self.stroke_leg(self._queue[-1], 1.0)
         leg = super().next_leg(view)

@@ -65,11 +65,11 @@ class Tracked(Excitation):
         self._queue = np.zeros((1 + max(1, round(self.LEAD_S / step)), AXES))
 
     def next_leg(self, view: View) -> Array:
-        """The leg to follow when the last one is done; from `cartesian_leg` or `stroke_leg`."""
+        """Return the next motion after the last one is done; created with `cartesian_leg` or `stroke_leg`."""
         raise TypeError(f"{type(self).__name__} plans no legs; give it a `next_leg`")
 
     def steer(self, view: View) -> None:
-        """Change the leg under way, from what is seen; does nothing by default."""
+        """Adjust the present motion to the view; the default has no effect."""
 
     def block(self, view: View) -> Array:
         """Levers over one control step, from the last ones in a straight line to the new ones."""
@@ -117,7 +117,7 @@ class Tracked(Excitation):
         return self.kinematics.pose_at(self._queue[-1])
 
     def line_fits(self, start: tuple[float, ...], goal: tuple[float, ...], margin: float = 0.04) -> bool:
-        """Whether every pose of a Cartesian leg can be reached, `margin` (share of stroke) away from all ends."""
+        """Return whether all poses of a Cartesian motion are reachable with a `margin` (fraction of stroke)."""
         # Seven poses: strokes bend little along a straight leg.
         for q in np.linspace(0.0, 1.0, 7):
             x, y, attitude = (a + q * (b - a) for a, b in zip(start, goal, strict=True))
@@ -132,7 +132,7 @@ class Tracked(Excitation):
         return all(self.kinematics.pose_at(start + q * (goal - start))[1] > floor for q in (0.25, 0.5, 0.75, 1.0))
 
     def stroke_leg(self, goal: Array, speed: float) -> Array:
-        """From the present reference to strokes, the slowest cylinder at `speed` in shares of stroke per second."""
+        """Return the motion from the present reference to strokes, with `speed` in fractions of stroke per second."""
         start = self._queue[-1]
         return np.array([*start, *goal, float(np.abs(goal - start).max()) / speed + self.RAMP_S, 0.0])
 

@@ -1,4 +1,4 @@
-"""What a fault is: its kind, where it sits, how large it is, since when, and how it comes and goes."""
+"""Fault specification: kind, site, size, onset and time course."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ class MachineNumbers:
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """What changes, in the order of `edp.sim.faults.course.BLOCKS`."""
+        """Changeable arrays, in the order of `edp.sim.faults.course.BLOCKS`."""
         return self.axes, self.plant, self.delays, self.coarse, self.fine, self.soil
 
     def copy(self) -> MachineNumbers:
-        """The same with arrays of its own."""
+        """Return a copy with its own arrays."""
         copies = [array.copy() for array in self.arrays]
         return MachineNumbers(self.machine, self.rate_hz, self.half_steps_s, *copies)
 
@@ -113,20 +113,20 @@ class FaultKind(ABC):
 
     @property
     def unit(self) -> str:
-        """The unit of bounds and ladder; empty where there is no size."""
+        """Unit of bounds and ladder; empty for faults without a size."""
         return next(iter(self.units), "")
 
     def component(self, site: str) -> str:
-        """The part that is at fault, such as ``boom valve``: kinds of one part are not told apart by it."""
+        """Return the faulty component, such as ``boom valve``; kinds of one component share it."""
         return at_site(self.part, site)
 
 
 class MachineFault(FaultKind):
-    """A fault of the machine: numbers of the plant change."""
+    """Machine fault, which changes plant parameters."""
 
     @abstractmethod
     def change(self, numbers: MachineNumbers, site: str, size: float) -> None:
-        """Put the fault into the numbers of a machine, in place.
+        """Apply the fault to the parameters of a machine, in place.
 
         Args:
             numbers: of a sound machine, or of one with other faults.
@@ -140,7 +140,7 @@ class MachineFault(FaultKind):
 
 
 class SensorFault(FaultKind):
-    """A fault of what is shown: one value of a tick changes, or two change places.
+    """Sensor fault: one observed value per sample changes, or two are swapped.
 
     Attributes:
         operation: what happens, one of `edp.sim.sensors.alterations`.
@@ -150,10 +150,10 @@ class SensorFault(FaultKind):
 
     @abstractmethod
     def channels(self, site: str) -> tuple[int, ...]:
-        """Which values, numbers of `edp.sim.sensors.chain.SENSED`; for noise, columns of its draws."""
+        """Return the affected values as indices of `edp.sim.sensors.chain.SENSED`; for noise, columns of its draws."""
 
     def parameter(self, sizes: Array, rate_hz: float, chance: np.random.Generator) -> Array:
-        """What the operation takes at each tick, 0 for nothing, from sizes in SI units, shape (time,)."""
+        """Return the operation's parameter at each sample (0: none) from sizes in SI units, shape (time,)."""
         return sizes
 
 
@@ -217,12 +217,12 @@ class FaultSpec:
 
     @property
     def neutral(self) -> float:
-        """The size that is no fault, in SI units."""
+        """Size without effect, in SI units."""
         kind = FAULTS[self.kind]
         return kind.neutral * kind.units.get(kind.unit, 1.0)
 
     def plain(self) -> dict[str, Any]:
-        """As plain data; `FaultSpec(**fault.plain()) == fault`. What is not stated is left out."""
+        """Convert to plain data; `FaultSpec(**fault.plain()) == fault`. Default values are omitted."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {key: value for key, value in values.items() if key == "kind" or value not in (None, "", 0.0)} | (
             # A size of zero is a size.
@@ -231,7 +231,7 @@ class FaultSpec:
 
 
 def at_site(text: str, site: str) -> str:
-    """A text with the words of a site in it."""
+    """Return a text with the words of a site inserted."""
     axis, _, side = site.partition("_")
     whole = "both pumps" if site == "both" else site.replace("_", " ")
     words = {"{site}": whole, "{axis}": axis, "{side}": side, "{pair}": f"{axis} and {side}"}
@@ -241,7 +241,7 @@ def at_site(text: str, site: str) -> str:
 
 
 def among(name: str, options: Iterable[str]) -> str:
-    """A suffix for messages on a name that is none of the options: the closest one, and all of them."""
+    """Return a suffix for messages on an unknown name: the closest option, and all of them."""
     hint = closest(name, options)
     listed = ", ".join(options)
     return f"{hint}; there are {listed}" if hint.startswith("; did") else f"; there are {listed}"

@@ -1,4 +1,4 @@
-"""Faults in time: how much of each is there at a tick, and what follows for the plant and for what is shown."""
+"""Time course of faults: the present fraction of each, and the effect on plant and observations."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def shares_at(faults: Sequence[FaultSpec], ticks: NDArray[np.int64], rate_hz: fl
 
 
 def sizes_of(fault: FaultSpec, shares: Array) -> Array:
-    """Sizes in SI units at these shares of the full one."""
+    """Return the sizes in SI units at the given fractions of full size."""
     # At share 0 exactly the neutral size: nothing may be changed by rounding.
     return np.where(shares > 0.0, fault.neutral + shares * (fault.full - fault.neutral), fault.neutral)
 
 
 def of_machine(faults: Sequence[FaultSpec]) -> tuple[FaultSpec, ...]:
-    """Those that change numbers of the plant."""
+    """Return the faults that change plant parameters."""
     return tuple(fault for fault in faults if isinstance(FAULTS[fault.kind], MachineFault))
 
 
@@ -59,7 +59,7 @@ def spare_s(faults: Sequence[FaultSpec]) -> float:
 
 
 def numbers_of(plant: Plant) -> MachineNumbers:
-    """The numbers of a plant, live."""
+    """Return the live parameters of a plant."""
     (_, coarse_s, _, coarse), (_, fine_s, _, fine) = plant.clocks
     halves = 0.5 * coarse_s, 0.5 * fine_s
     return MachineNumbers(
@@ -68,7 +68,7 @@ def numbers_of(plant: Plant) -> MachineNumbers:
 
 
 class MachineCourse:
-    """What faults make of the numbers of one plant, tick by tick; a function of the tick alone.
+    """Parameters of one plant under faults; a function of the sample index only.
 
     Args:
         faults: those of the scenario; faults of sensors are left out.
@@ -87,14 +87,14 @@ class MachineCourse:
         ]
 
     def write(self, tick: int, live: MachineNumbers) -> None:
-        """Give a plant the numbers of a tick, in place."""
+        """Write the parameters of a sample to a plant, in place."""
         numbers = self._numbers(shares_at(self.faults, np.array([tick]), live.rate_hz)[0])
         for array, new, touched in zip(live.arrays, numbers.arrays, self._touched, strict=True):
             if len(touched):
                 array.reshape(-1)[touched] = new.reshape(-1)[touched]
 
     def pieces(self, first: int, behind: int) -> Iterator[tuple[int, int]]:
-        """Runs of ticks, (first, one behind the last), in which no number changes."""
+        """Yield runs of samples, (first, stop), with constant parameters."""
         shares = shares_at(self.faults, np.arange(first, behind), self._sound.rate_hz)
         ends = np.flatnonzero((shares[1:] != shares[:-1]).any(axis=1)) + 1
         starts = [0, *ends.tolist(), behind - first]
@@ -127,7 +127,7 @@ class MachineCourse:
 
 
 class SensorCourse:
-    """What faults make of the values that are shown in one recording.
+    """Effect of sensor faults on the observations of one recording.
 
     Args:
         faults: those of the scenario; faults of the machine are left out.
@@ -144,7 +144,7 @@ class SensorCourse:
         self.table = np.array(rows, dtype=float).reshape(len(rows), alterations.COLUMNS)
 
     def drawn(self, healthy: Array, rate_hz: float, chance: np.random.Generator) -> Array:
-        """What is random in a recording, with the noise of the faults, and behind it a column a row of the table.
+        """Return the random numbers of a recording with the faults' noise, then one column per row of the table.
 
         Args:
             healthy: of `edp.sim.sensors.draws.draw`, shape (time, draws).

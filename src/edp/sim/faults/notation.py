@@ -20,7 +20,7 @@ _NUMBER = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)(.
 
 
 def parse_fault(text: str) -> FaultSpec:
-    """A fault from text; the grammar is `GRAMMAR`, with a unit behind each number.
+    """Parse a fault from text; the grammar is `GRAMMAR`, with a unit after each number.
 
     Raises:
         ConfigError: what came, and the form, kinds, sites or units there are.
@@ -61,7 +61,7 @@ def parse_fault(text: str) -> FaultSpec:
 
 
 def fault_text(fault: FaultSpec) -> str:
-    """The text of a fault; `parse_fault(fault_text(fault)) == fault`."""
+    """Return the text of a fault; `parse_fault(fault_text(fault)) == fault`."""
     size = "" if fault.size is None else f"{fault.size!r}{fault.unit}"
     head = ":".join(part for part in (fault.kind, fault.site, size) if part)
     onset = f"@{fault.onset_s!r}s" if fault.onset_s else ""
@@ -71,7 +71,7 @@ def fault_text(fault: FaultSpec) -> str:
 
 
 def faults_of(faults: Any, where: str) -> tuple[FaultSpec, ...]:
-    """Faults from what a caller writes: specs, texts and tables, as many as a recording may have.
+    """Convert user input (specs, texts and tables) to faults, limited to the number that a recording may have.
 
     Raises:
         ConfigError: one cannot be, they are too many, or it is no list; `where` names what they are of.

@@ -17,7 +17,7 @@ _DRAWN = (
 
 
 def falsified_channels(kind: str, site: str) -> tuple[str, ...]:
-    """Channels whose shown values a fault changes; none where it is one of the machine.
+    """Return the channels whose readings a fault changes; empty for machine faults.
 
     Args:
         kind: name in `FAULTS`.

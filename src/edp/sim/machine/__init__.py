@@ -1,1 +1,1 @@
-"""Machines: their parameters, the files that hold them, and families drawn around one."""
+"""Machines: parameters, machine files, and random families around one machine."""

@@ -108,7 +108,7 @@ def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float
 def scaled_machine(
     base: Machine, mass_t: float, draws: Draws, name: str = "", base_mass_t: float = BASE_MASS_T
 ) -> Machine:
-    """A machine of another mass by the laws above.
+    """Scale a machine to another mass by the laws above.
 
     Args:
         base: the parameter set to scale.
@@ -166,7 +166,7 @@ def scaled_machine(
 
 
 def _motor(motor: Any, s: float, sweep: float, weight: float) -> Any:
-    """A motor by its exponents of displacement and inertia; pressures stay, forces go with the displacement."""
+    """Scale a motor by its exponents of displacement and inertia; pressures stay, forces scale with displacement."""
     forces = ("displacement", "coulomb", "viscous", "brake")
     changed = {key: getattr(motor, key) * s**sweep for key in forces}
     flows = {key: (getattr(motor, key)[0] * s**2, getattr(motor, key)[1]) for key in ("meter_in", "meter_out")}

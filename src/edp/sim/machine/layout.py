@@ -1,4 +1,4 @@
-"""Where each number lies in the flat arrays that the compiled code reads and writes.
+"""Positions of all parameters in the flat arrays of the compiled code.
 
 Compiled functions take four arrays: `axes` (one row per cylinder), `plant` (one value per name), `state`
 (the 19 plant states, and 12 of the lines behind them) and `valves` (one row per spool: boom, arm, bucket, then their

@@ -1,4 +1,4 @@
-"""A machine: the numbers of one excavator front. Files of them are read and checked in `machine_files`."""
+"""Machine: parameters of one excavator front. Machine files are read and checked in `machine_files`."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Cylinders:
 
 @dataclass(frozen=True)
 class Friction:
-    """LuGre parameters; Coulomb and static force as a share of head area times 34.3 MPa."""
+    """LuGre parameters; Coulomb and static force as a fraction of head area times 34.3 MPa."""
 
     coulomb_fraction: float
     static_fraction: float
@@ -178,7 +178,7 @@ class Valves:
 
 @dataclass(frozen=True)
 class Bucket:
-    """What the bucket is to the soil; SI units.
+    """Soil-related parameters of the bucket; SI units.
 
     Attributes:
         width: cutting width.
@@ -201,7 +201,7 @@ class Bucket:
 
 @dataclass(frozen=True)
 class Chassis:
-    """How the undercarriage gives way; SI units.
+    """Compliance of the undercarriage; SI units.
 
     Attributes:
         boom_foot_height: above level ground.
@@ -280,7 +280,7 @@ class SwingMotor(Motor):
 
 @dataclass(frozen=True)
 class Sensors:
-    """What sensors and bus do to the truth; SI units, degrees where the name says so; a size of zero turns it off.
+    """Errors of sensors and bus; SI units, degrees where the name states it; zero disables an error.
 
     Attributes:
         velocity: white noise of each cylinder velocity, rms.

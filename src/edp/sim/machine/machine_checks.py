@@ -1,4 +1,4 @@
-"""What must hold of a machine before it is simulated; every message names file, key, value and bound."""
+"""Requirements on a machine before simulation; every message names file, key, value and bound."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ParameterBound:
     integer: bool = False
 
     def holds(self, value: float) -> bool:
-        """Whether the value lies within."""
+        """Return whether the value is within the bound."""
         fits = (value > self.low if self.above else value >= self.low) and value <= self.high
         if self.above and self.low == 0.0 and value < LEAST_POSITIVE:
             return False
@@ -241,7 +241,7 @@ def _leaves(machine: Machine) -> Iterator[tuple[str, str, str, Any]]:
 
 
 def _check_numbers(value: float | tuple[float, ...], bound: ParameterBound, where_key: str) -> None:
-    """A number, or every number of a list."""
+    """Check a number, or every number of a list."""
     if isinstance(value, tuple):
         labels = CYLINDERS if len(value) == len(CYLINDERS) else range(len(value))
         for label, entry in zip(labels, value, strict=True):
@@ -258,7 +258,7 @@ def _check_number(value: float, bound: ParameterBound, where_key: str) -> None:
 
 
 def _check_ratings(value: Rating | Ratings, key: str, where_key: str) -> None:
-    """A rating, or one of each cylinder."""
+    """Check one rating, or one per cylinder."""
     if isinstance(value[0], tuple):
         for name, rating in zip(CYLINDERS, value, strict=True):
             _check_ratings(rating, key, f"{where_key}[{name}]")
@@ -351,7 +351,7 @@ def _check_bucket(axes: Any, plant: Any, where: str) -> None:
 
 
 def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, where: str) -> None:
-    """The lever arm must keep its sign and a least size some degrees beyond the stops."""
+    """Check that the lever arm keeps its sign and a least size some degrees beyond the stops."""
     name = CYLINDERS[axis]
     table = "bucket_linkage" if axis == 2 else f"{name}_cylinder"
     psi = np.linspace(low - BEYOND_STOPS, high + BEYOND_STOPS, 241)

@@ -1,4 +1,4 @@
-"""Machines by name or from a TOML file: reading, and refusing what cannot be simulated before the first step."""
+"""Machines by name or from a TOML file, checked before the first step."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def machine_names() -> tuple[str, ...]:
 
 
 def load_machine(name: str) -> Machine:
-    """The machine of this name (upper or lower case; also a `member_name` of a family), or of this TOML file.
+    """Load a machine by name (case-insensitive, also a `member_name` of a family) or from a TOML file.
 
     Raises:
         ConfigError: no such machine (the closest name is offered) or file; or the file lacks or misnames a key, or
@@ -53,7 +53,7 @@ def load_machine(name: str) -> Machine:
 
 @cache
 def _from_file(path: Path, changed: int) -> Machine:
-    """`changed` is the file's time stamp, so that an edited file is read anew."""
+    """Read a machine file; `changed` is its time stamp, so that an edited file is read again."""
     return parse_machine(read_text(path, SETTINGS_BYTES, f"machine file {path}", ConfigError), path.name)
 
 
@@ -83,7 +83,10 @@ def _member(name: str) -> tuple[int, int, float, float, float] | None:
 
 
 def known_mass(name: str) -> float | None:
-    """Operating weight (t) of a machine of a family; None for any other, whose file does not say it."""
+    """Return the operating weight (t) of a machine of a family.
+
+    None for other machines, whose file does not state it.
+    """
     member = _member(name)
     return None if member is None else member_mass(*member[:4])
 

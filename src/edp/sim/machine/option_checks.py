@@ -1,4 +1,4 @@
-"""What must hold of a machine's options: engine, load sensing, long lines, motors; contradictions are refused."""
+"""Requirements on optional machine parts: engine, load sensing, long lines, motors; contradictions are refused."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LINE_LENGTHS = 0.3, 60.0
 
 
 def check_engine(machine: Machine, where: str) -> None:
-    """All numbers of the engine or none, and power enough for the pumps: they would stall it otherwise."""
+    """Check that all or no engine parameters are given, and that the power suffices for the pumps."""
     pumps = machine.pumps
     keys = ("engine_droop", "engine_power", "engine_inertia", "engine_speed_rpm")
     absent = [key for key in keys if getattr(pumps, key) == 0.0]
@@ -39,7 +39,7 @@ def check_engine(machine: Machine, where: str) -> None:
 
 
 def check_load_sensing(machine: Machine, where: str) -> None:
-    """A bleed that carries the least flow below the margin and little more, and compensators that can regulate."""
+    """Check the bleed, which must carry the least flow slightly below the margin, and the compensators."""
     pumps, valves = machine.pumps, machine.valves
     if (valves.compensator_drop > 0.0) != (valves.flow_sharing == "pre_compensated"):
         raise ConfigError(
@@ -71,7 +71,7 @@ def check_load_sensing(machine: Machine, where: str) -> None:
 
 
 def check_lines(machine: Machine, where: str) -> None:
-    """Bores of all lines or of none, and lengths that can be; what only lines have is refused without them."""
+    """Check that all or no line bores are given, lengths are possible, and no line parameters occur without lines."""
     cylinders = machine.cylinders
     if not lines.modelled(cylinders):
         for section, key, present in (

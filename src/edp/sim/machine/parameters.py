@@ -1,4 +1,4 @@
-"""From a `Machine` to the flat arrays of the compiled code, with derived numbers (areas, conductances, oil)."""
+"""Conversion of a `Machine` to the flat arrays of the compiled code, with derived parameters."""
 
 from __future__ import annotations
 

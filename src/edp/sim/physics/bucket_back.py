@@ -1,4 +1,4 @@
-"""The back of the bucket: what soil before it resists with, what it pushes ahead, what its heel shoves aside.
+"""Back of the bucket: soil resistance, soil pushed ahead, and soil displaced by the heel.
 
 Passive earth pressure on an upright rough wall by the lower bound of Lancellotta (Geotechnique 52, 2002, 617-619),
 which has Rankine's value without friction on the wall; cohesion by Caquot's corresponding states, so that every stress
@@ -49,7 +49,7 @@ def passive_coefficient(friction: float, wall: float) -> float:
 
 
 def pack(material: Material, width: float) -> Array:
-    """The numbers of the back for the compiled code, all 0 where it moves no soil."""
+    """Return the parameters of the back for compiled code, all 0 if it moves no soil."""
     if material.back_push == 0.0:
         return np.zeros(VALUES)
     friction = max(math.radians(material.friction_deg), LEAST_FRICTION)
@@ -62,7 +62,7 @@ def pack(material: Material, width: float) -> Array:
 
 @compiled
 def pressure(depth: float, grown: float, back: Array) -> float:
-    """Horizontal force (N) of the soil on the back, `depth` (m) of which stands in it.
+    """Return the horizontal force (N) of the soil on the back immersed by `depth` (m).
 
     `grown`: how far (m) it stands below the level of the ground `FURTHER_M` ahead. What is heaped up above that weighs,
     and holds together no more.
@@ -85,7 +85,7 @@ def before_it(points: Array, heights: Array, memory: Array, back: Array) -> tupl
 
 @compiled
 def push(points: Array, moved: float, share: float, heights: Array, memory: Array) -> None:
-    """Clear the soil above the floor plate's line that it has come to by moving outwards; it lies ahead and behind.
+    """Move the soil above the floor plate's line that an outward motion has reached to both sides.
 
     Args:
         points: x and y of tip and of heel (m).
@@ -128,7 +128,7 @@ def push(points: Array, moved: float, share: float, heights: Array, memory: Arra
 
 @compiled
 def shove_aside(x: float, depth: float, heights: Array, memory: Array) -> None:
-    """Leave the print of a heel that pressed `depth` (m) at `x`: what was not compacted stands on either side."""
+    """Leave the print of a heel pressed in by `depth` (m) at `x`: soil that was not compacted rises on both sides."""
     end = heights.shape[0] - 1
     middle = min(max(int(x / SPACING + 0.5), 0), end)
     bottom = height_at(x, heights) - depth

@@ -1,4 +1,4 @@
-"""From lever targets to demands of the spools: the operator's hand, then what the machine makes of its levers."""
+"""Spool demands from lever targets: first the operator's hand, then the machine's lever mapping."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def put_first(past: Array, demands: Array) -> None:
 
 @compiled
 def keep_last(demands: Array, past: Array) -> None:
-    """The last rows of `demands`, which are the past of the next ones."""
+    """Copy the last rows of `demands` to the past of the next block."""
     first = demands.shape[0] - past.shape[0]
     for k in range(past.shape[0]):
         for j in range(past.shape[1]):

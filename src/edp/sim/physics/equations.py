@@ -53,7 +53,7 @@ def eliminate(g: float, axes: Array, s: Array, e: Array) -> None:
 
 @inlined
 def factorise(g: float, axes: Array, long: bool, work: tuple[Array, ...], motors: Motors | None) -> None:
-    """Factor what is left of I - g J, 5x5, into `work[LU]`; no pivoting, its diagonal dominates.
+    """Factorise the reduced matrix of I - g J, 5x5, into `work[LU]`, without pivoting, since its diagonal dominates.
 
     `long` says whether lines lie between valves and chambers.
     """

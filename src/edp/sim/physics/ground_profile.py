@@ -30,7 +30,7 @@ def height_at(x: float, heights: Array) -> float:
 
 @inlined
 def pressed_at(x: float, heights: Array, memory: Array) -> float:
-    """Depth (m) of the rut at `x`: what the heel has pressed below the profile, whose heights count mass."""
+    """Return the rut depth (m) at `x`: compaction by the heel below the profile, whose heights count mass."""
     return height_at(x, memory[at.MEMORY : at.MEMORY + heights.shape[0]])
 
 

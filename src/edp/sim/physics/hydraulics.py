@@ -30,7 +30,7 @@ def orifice(dp: float) -> tuple[float, float]:
 
 @inlined
 def check_orifice(dp: float, leak: float) -> tuple[float, float]:
-    """An orifice behind a check valve: passes `leak` of the flow backwards."""
+    """Compute an orifice after a check valve, which passes the fraction `leak` of the flow backwards."""
     flow, slope = orifice(dp)
     passed = leak if dp < 0.0 else 1.0
     return passed * flow, passed * slope
@@ -99,7 +99,7 @@ def cylinder_flows(
     axes: Array,
     plant: Array,
 ) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float, float, float, float]]:
-    """All flows of cylinder `i` at head, rod and both pump pressures (Pa), those of its lines' ends at the valve.
+    """Compute all flows of cylinder `i` at head, rod and both pump pressures (Pa); with lines, at their valve ends.
 
     Returns:
         Net inflow of head and rod chamber and what is drawn from either pump, m^3/s; then the slopes: head by head,
@@ -131,7 +131,7 @@ def cylinder_flows(
 
 @inlined
 def highest_load(m: int, state: Array, opened: Array, plant: Array) -> float:
-    """Largest pressure (Pa) among the chambers that pump `m` is open to; far below any where there is none."""
+    """Return the largest pressure (Pa) among the chambers connected to pump `m`; a very low value without any."""
     most, port = -1e9, lines.at_valve(plant)
     for i in range(at.AXES):
         if opened[i, at.HEAD_IN_1 + m] > 0.0:

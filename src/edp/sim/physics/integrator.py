@@ -98,7 +98,7 @@ def freeze_geometry(state: Array, axes: Array, plant: Array, strokes: Array, s: 
 
 @inlined
 def section_loads(w: Array, opened: Array, plant: Array, jacobian: bool, motors: Motors | None) -> tuple[float, float]:
-    """Largest pressure (Pa) that either pump is open to."""
+    """Return the largest pressure (Pa) connected to each pump."""
     first, second = hydraulics.highest_load(0, w, opened, plant), hydraulics.highest_load(1, w, opened, plant)
     if motors is not None:
         turning = places.present(motors, jacobian)
@@ -314,6 +314,6 @@ def new_work() -> tuple[Array, ...]:
 
 
 def clock_of(machine: Machine, step_s: float) -> tuple[float, float, Array]:
-    """What `step` needs for one step length."""
+    """Return the arguments of `step` for one step length."""
     half = 0.5 * step_s
     return step_s, pump.displacement_share(machine.pumps.time_constant, half), valve.spool_filters(machine, half)

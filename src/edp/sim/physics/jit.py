@@ -22,7 +22,7 @@ OPTIONS: dict[str, Any] = {
 
 
 def fingerprinted() -> tuple[Path, ...]:
-    """The source files that compiled code comes from: those that import this one, those of places, and this one."""
+    """Return the source files that compiled code depends on: importers of this module, layout modules, this file."""
     room = Path(__file__).parents[1]
     places = room / "machine" / "layout.py", room / "physics" / "scratch.py"
     return (*files_with(room, "from edp.sim.physics.jit import"), *places, Path(__file__))

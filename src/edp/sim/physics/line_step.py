@@ -69,7 +69,7 @@ def line_rates(
 
 @inlined
 def eliminate_lines(g: float, axes: Array, s: Array, e: Array) -> None:
-    """As `eliminate`, where lines lie between valves and chambers: flows first, then the valve's side, then chambers.
+    """Eliminate as `eliminate` does, with lines between valves and chambers: flows, valve sides, then chambers.
 
     With J of `line_rates`: k_q = kept r_q + pushed (k_port - k_chamber).
     """
@@ -114,7 +114,10 @@ def eliminate_lines(g: float, axes: Array, s: Array, e: Array) -> None:
 
 @inlined
 def known_lines(i: int, g: float, r: Array, e: Array) -> tuple[float, float]:
-    """What the right-hand sides `r` alone make of the chambers of cylinder `i`; of the valve's side into `e`."""
+    """Return the chamber terms of cylinder `i` from the right-hand sides `r`.
+
+    The valve-side terms are written to `e`.
+    """
     gh, gr = g * e[i, C_PORT_HEAD], g * e[i, C_PORT_ROD]
     flow_h, flow_r = e[i, KEPT_HEAD] * r[at.FLOW_HEAD + i], e[i, KEPT_ROD] * r[at.FLOW_ROD + i]
     at_head, at_rod = r[at.PORT_HEAD + i] - gh * flow_h, r[at.PORT_ROD + i] - gr * flow_r
@@ -133,7 +136,7 @@ def known_lines(i: int, g: float, r: Array, e: Array) -> tuple[float, float]:
 
 @inlined
 def fill_lines(i: int, r: Array, e: Array, out: Array) -> None:
-    """Changes of the lines of cylinder `i` from those of its joint, both pumps and its chambers, all in `out`."""
+    """Compute the line changes of cylinder `i` from those of joint, pumps and chambers, all in `out`."""
     k, b3, b4 = out[at.RATE + i], out[at.PUMP], out[at.PUMP + 1]
     head = e[i, PORT_HEAD_K] + e[i, PORT_H_BY_W] * k + e[i, PORT_H_BY_1] * b3 + e[i, PORT_H_BY_2] * b4
     rod = e[i, PORT_ROD_K] + e[i, PORT_R_BY_W] * k + e[i, PORT_R_BY_1] * b3 + e[i, PORT_R_BY_2] * b4

@@ -72,7 +72,7 @@ def at_valve(plant: Array) -> int:
 
 
 def rest(state: Array, plant: Array) -> None:
-    """Let the oil in the lines stand, at the pressures of the chambers."""
+    """Set the oil in the lines to rest at the chamber pressures."""
     if plant[at.LINES] > 0.0:
         state[at.PORT_HEAD : at.PORT_HEAD + 2 * at.AXES] = state[at.HEAD : at.HEAD + 2 * at.AXES]
         state[at.FLOW_HEAD : at.FLOW_HEAD + 2 * at.AXES] = 0.0

@@ -22,7 +22,7 @@ def pin_triangle(base: float, rod: float, cosine: float, sine: float) -> tuple[f
 
 @inlined
 def bucket_linkage(cosine: float, sine: float, plant: Array) -> tuple[float, float]:
-    """Bucket cylinder length (m) and its derivative by the bucket angle (m/rad), whose cosine and sine come in.
+    """Return the bucket cylinder length (m) and its derivative by the bucket angle (m/rad), given cosine and sine.
 
     The rocker pin is where the circles of rocker and link meet, on the cylinder's side of the line from the rocker
     pivot to the lug. Constant link length gives the rocker's rate: (E - D) . D' = (E - D) . E_theta theta_r'.
@@ -79,14 +79,14 @@ def bucket_closes(psi: Array, plant: Array) -> NDArray[np.bool_]:
 
 @compiled
 def _tabulate(psi: Array, selected: NDArray[np.bool_], plant: Array, length: Array, lever: Array) -> None:
-    """The bucket cylinder's length and lever arm at the wanted angles."""
+    """Compute the bucket cylinder's length and lever arm at the selected angles."""
     for k in range(psi.shape[0]):
         if selected[k]:
             length[k], lever[k] = cylinder(2, psi[k], plant)
 
 
 def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Array]:
-    """Angles (rad, rising) and lengths (m, falling) of the stretch on which the bucket cylinder works.
+    """Return angles (rad, rising) and lengths (m, falling) of the working range of the bucket cylinder.
 
     Of all stretches of angles on which the linkage closes and the cylinder shortens as the angle grows, the one that
     covers most of the lengths from `closed` to `full`; empty when there is none.

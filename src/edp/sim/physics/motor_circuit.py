@@ -1,4 +1,4 @@
-"""Swing and travel of one plant: numbers of their motors, their state and their commands; see `motors`."""
+"""Swing and travel of one plant: motor parameters, state and commands; see `motors`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def filters_of(machine: Machine, half_s: float) -> Array:
 
 
 class MotorCircuit:
-    """Swing and travel of one plant: their numbers, state and past commands.
+    """Swing and travel of one plant: parameters, state and past commands.
 
     Args:
         machine: with `swing` and `travel`.
@@ -89,7 +89,7 @@ class MotorCircuit:
 
     @property
     def memory(self) -> tuple[Array, ...]:
-        """Every array that changes as time goes on, live."""
+        """Every array that changes over time, live."""
         return self.state, self.valves, self.hand, self.past
 
     def demands_of(self, levers: Array, hand_s: float) -> Array:
@@ -102,7 +102,7 @@ class MotorCircuit:
         return demands
 
     def arrays(self, demands: Array, log: Array) -> Motors:
-        """What the compiled code takes, with demands behind the past ones and the log of a run."""
+        """Return the arguments of the compiled code, with demands after the past ones and the log of a run."""
         return (
             *(self.numbers, self.state, self.valves, *self._work),
             *(demands, self.delays, self._held, *self.filters, log),

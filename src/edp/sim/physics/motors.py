@@ -76,7 +76,7 @@ def advance(motors: Motors, half_s: float) -> None:
 
 @inlined
 def open_sections(motors: Motors) -> None:
-    """Openings at the present spools."""
+    """Compute the openings at the present spool positions."""
     numbers, valves, out = motors[NUMBERS], motors[VALVES], motors[OPENED]
     for i in range(at.MOTORS):
         spool = valves[i, at.SPOOL]
@@ -115,7 +115,7 @@ def freeze_inertia(motors: Motors, turns: Array, axes: Array) -> None:
 
 @inlined
 def highest_load(m: int, state: Array, motors: Motors) -> float:
-    """Largest pressure (Pa) of the ports that pump `m` is open to; far below any where there is none."""
+    """Return the largest pressure (Pa) of the ports connected to pump `m`; a very low value without any."""
     most, opened = -1e9, motors[OPENED]
     for i in range(at.MOTORS):
         if motors[NUMBERS][i, at.MOTOR_PUMP] == m:
@@ -155,7 +155,7 @@ def port_flows(pressure: float, i: int, motors: Motors, plant: Array) -> tuple[f
 def port_rates(
     i: int, state: Array, supply: tuple[float, float], motors: Motors, plant: Array, jacobian: bool
 ) -> tuple[float, float, float]:
-    """Rates of both ports of motor `i`, and what is drawn from its pump, m^3/s; slopes, if asked for, to its slopes.
+    """Return the rates of both ports of motor `i` and the flow from its pump, m^3/s; optionally with derivatives.
 
     `supply` is the pump's pressure, and what a compensated section shows it in place of a lower load.
     """
@@ -193,7 +193,9 @@ def rates(
     jacobian: bool,
     front: Array,
 ) -> tuple[float, float]:
-    """Rates into `motors[RATES]` (torques not yet divided by the inertia); what is drawn from both pumps, m^3/s.
+    """Compute rates into `motors[RATES]` (torques not yet divided by the inertia).
+
+    Return the flow from both pumps, m^3/s.
 
     Args:
         joints: rates of the front, rad/s.
@@ -229,7 +231,7 @@ def rates(
 
 @inlined
 def eliminate(g: float, pumps: tuple[float, float], motors: Motors) -> tuple[float, float]:
-    """Motors as linear functions of their pump's pressure; what they add to the diagonal of either pump's row.
+    """Eliminate the motors as linear functions of pump pressure; return their terms on the pump diagonals.
 
     `pumps` are g times stiffness over volume of both pump lines.
     """
@@ -260,7 +262,7 @@ def eliminate(g: float, pumps: tuple[float, float], motors: Motors) -> tuple[flo
 
 @inlined
 def known(g: float, pumps: tuple[float, float], motors: Motors) -> tuple[float, float]:
-    """What `motors[RHS]` alone makes of the motors; what that adds to the right-hand sides of both pumps."""
+    """Compute the motor terms from `motors[RHS]`; return their terms on the pump right-hand sides."""
     numbers, r, e = motors[NUMBERS], motors[RHS], motors[SLOPE]
     first = second = 0.0
     for i in range(at.MOTORS):
@@ -280,7 +282,7 @@ def known(g: float, pumps: tuple[float, float], motors: Motors) -> tuple[float, 
 
 @inlined
 def fill(first: float, second: float, motors: Motors) -> None:
-    """Changes of the motors, into `motors[K2]`, from those of both pumps' pressures."""
+    """Compute the changes of the motors, into `motors[K2]`, from the changes of both pump pressures."""
     e, out = motors[SLOPE], motors[K2]
     for i in range(at.MOTORS):
         p = second if motors[NUMBERS][i, at.MOTOR_PUMP] > 0.0 else first
@@ -318,7 +320,7 @@ def second_stage(motors: Motors) -> None:
 
 @inlined
 def finish(motors: Motors, h: float) -> None:
-    """The step of ROS2."""
+    """Complete the ROS2 step."""
     for i in range(at.MOTORS):
         for n in range(at.WAY):
             motors[STATE][i, n] += h * (1.5 * motors[K1][i, n] + 0.5 * motors[K2][i, n])
@@ -326,7 +328,7 @@ def finish(motors: Motors, h: float) -> None:
 
 @inlined
 def settle(motors: Motors, step_s: float) -> int:
-    """After a step: time since the spools closed, and pressures lifted to the floor; returns how many."""
+    """Finish a step: update the time since the spools closed, raise pressures to the floor, and return their count."""
     state, lifted = motors[STATE], 0
     for i in range(at.MOTORS):
         closed = abs(motors[VALVES][i, at.SPOOL]) <= motors[NUMBERS][i, at.MOTOR_DEAD_BAND]
@@ -340,7 +342,7 @@ def settle(motors: Motors, step_s: float) -> int:
 
 @inlined
 def hold_commands(motors: Motors, sample: float) -> None:
-    """Take the commands that act at `sample`, a row of the demands and the share of it that has passed."""
+    """Set the commands active at `sample`, a fractional row of the demands."""
     for i in range(at.MOTORS):
         motors[HELD][i] = motors[DEMANDS][max(int(np.floor(sample - motors[DELAYS][i])), 0), i]
 

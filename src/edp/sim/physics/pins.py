@@ -76,7 +76,7 @@ def cross_play(
 
 @plainly_inlined
 def first_offset(force: float, half: float) -> float:
-    """Where a pin lies at the start: on the side that its force pushes it to."""
+    """Return the initial pin offset: on the side to which its force pushes."""
     return -half if force >= 0.0 else half
 
 

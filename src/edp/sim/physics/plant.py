@@ -1,4 +1,4 @@
-"""The plant as a whole: its arrays, its state at rest, and running it sample by sample."""
+"""Plant: arrays, steady state, and simulation sample by sample."""
 
 from __future__ import annotations
 
@@ -187,13 +187,13 @@ class Plant:
 
     @property
     def strokes(self) -> Array:
-        """Strokes as a share of each cylinder's stroke, shape (3,)."""
+        """Strokes as fractions of each cylinder's full stroke, shape (3,)."""
         lengths = [linkage.cylinder(i, self.state[at.PSI + i], self.plant)[0] for i in range(at.AXES)]
         return (np.array(lengths) - self.axes[:, at.CLOSED]) / self.axes[:, at.STROKE]
 
     @property
     def engine_speed(self) -> float:
-        """Speed of the engine as a share of the governed one; 1 where it has no droop."""
+        """Engine speed as a fraction of the governed speed; 1 without droop."""
         return float(self.plant[at.ENGINE_SPEED])
 
     @property
@@ -213,7 +213,7 @@ class Plant:
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """Every array that changes as time goes on, live: what to copy, and to write back to, for an exact restart."""
+        """Every array that changes over time, live; copying and restoring them gives an exact restart."""
         changing = (self.state, self.valves, self.hand, self._demands, self.axes, self.plant, self._counts)
         # Tables and course are read only while the plant runs.
         motors = () if self.motors is None else self.motors.memory
@@ -228,7 +228,7 @@ class Plant:
 
     @property
     def clamps(self) -> int:
-        """Pressures lifted to the floor so far."""
+        """Number of pressures raised to the floor so far."""
         return int(self._counts[0])
 
     def run(self, levers: Array) -> Array:
@@ -247,21 +247,21 @@ class Plant:
         return self._advance(targets, 1.0 / self.rate_hz)
 
     def drive(self, demands: Array) -> Array:
-        """Like `run`, by signed demands of the spools as logs have them, shape (samples, 6), as shares of full."""
+        """Run like `run`, with signed spool demands as in logs, shape (samples, 6), as fractions of full scale."""
         every = np.concatenate([self._demands, demands])
         # In place, since a snapshot restores arrays in place.
         self._demands[:] = every[len(every) - self._past :]
         return self._moved(every)
 
     def rest_at(self, demands: Array) -> None:
-        """Let pilots and spools rest where these demands, shape (6,), have held them for long."""
+        """Set pilots and spools to the steady state of these demands, shape (6,)."""
         self._demands[:] = demands
         self.valves[:] = 0.0
         for column in (at.PILOT, at.PLAY, at.SPOOL):
             self.valves[:, column] = demands
 
     def place(self, strokes: Array, velocities: Array, pressures: Array) -> None:
-        """Put cylinders and oil where they were measured; valves, displacements and friction go on as they were.
+        """Set cylinders and oil to measured values; valves, displacements and friction keep their state.
 
         Oil in long lines begins at rest, at the chambers' pressures.
 
@@ -280,7 +280,7 @@ class Plant:
         lines.rest(self.state, self.plant)
 
     def _advance(self, levers: Array, hand_s: float) -> Array:
-        """Run with levers that the hand smooths at steps of `hand_s`; 0 for levers as they are."""
+        """Run with levers smoothed by the hand at steps of `hand_s`; 0 for unsmoothed levers."""
         setup = (self.axes, self.plant, self.work, self._ground)
         demands = np.empty((len(levers) + self._past, at.SPOOLS))
         levers = np.asarray(levers, dtype=float)
@@ -299,7 +299,7 @@ class Plant:
         return self._moved(demands, self.motors.demands_of(others, hand_s))
 
     def _moved(self, demands: Array, motor_demands: Array | None = None) -> Array:
-        """Run along demands, behind the past ones; swing and travel without any stand still."""
+        """Run with demands appended to the past ones; without motor demands swing and travel stand still."""
         setup = (self.axes, self.plant, self.work, self._ground)
         samples = len(demands) - self._past
         log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
@@ -316,7 +316,7 @@ class Plant:
 
 
 def resting_state(strokes: Array, axes: Array, plant: Array) -> Array:
-    """State at rest in equilibrium at these strokes (shares of full), shape (STATES,)."""
+    """Return the equilibrium state at these strokes (fractions of full stroke), shape (STATES,)."""
     state = np.zeros(at.STATES)
     for i in range(at.AXES):
         state[at.PSI + i] = linkage.angle_at_stroke(i, strokes[i] * axes[i, at.STROKE], axes, plant)

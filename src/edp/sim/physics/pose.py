@@ -1,4 +1,4 @@
-"""Where the bucket is: tip pose from joint angles, and strokes that put the tip at a pose.
+"""Bucket pose: tip pose from joint angles, and strokes for a tip pose.
 
 The frame has its origin in the boom foot, x forward, y up. The attitude is the absolute angle of the line from the
 bucket pin to the tip.
@@ -27,7 +27,7 @@ REACHED_VALUES = 7
 
 @compiled
 def look_at(state: Array, axes: Array, plant: Array, look: Array) -> None:
-    """Stroke shares, joint angles (rad), joint rates (rad/s), cylinder speeds (m/s) and tip pose (m, m, rad)."""
+    """Compute stroke fractions, joint angles (rad), rates (rad/s), cylinder speeds (m/s), tip pose (m, m, rad)."""
     x = y = angle = 0.0
     for i in range(at.AXES):
         psi = state[at.PSI + i]
@@ -44,7 +44,7 @@ def look_at(state: Array, axes: Array, plant: Array, look: Array) -> None:
 
 @compiled
 def reach(x: float, y: float, attitude: float, axes: Array, plant: Array, limits: Array, reached: Array) -> None:
-    """Strokes (shares of full) and joint angles of a tip pose with the elbow up, into `reached`.
+    """Compute strokes (fractions of full stroke) and joint angles of a tip pose with the elbow up, into `reached`.
 
     `limits` is `joint_limits`. Where the pose lies outside the linkage, the nearest angles on the way there are given
     and REACHABLE is 0.
@@ -136,7 +136,7 @@ class Kinematics:
         self.axes, self.plant, self.limits = axes, plant, joint_limits(axes, plant)
 
     def angles_at(self, strokes: Array) -> Array:
-        """Joint angles (rad, shape (3,)) at strokes (shares of full)."""
+        """Return the joint angles (rad, shape (3,)) at strokes (fractions of full stroke)."""
         angles = [
             linkage.angle_at_stroke(i, float(strokes[i]) * self.axes[i, at.STROKE], self.axes, self.plant)
             for i in range(2)
@@ -153,11 +153,11 @@ class Kinematics:
         return np.array([*angles, 0.5 * (low + high)])
 
     def pose_at(self, strokes: Array) -> tuple[float, float, float]:
-        """Tip x, y (m) and attitude (rad) at strokes (shares of full)."""
+        """Return tip x, y (m) and attitude (rad) at strokes (fractions of full stroke)."""
         return tip_pose(self.angles_at(strokes), self.axes)
 
     def strokes_at(self, x: float, y: float, attitude: float) -> Array | None:
-        """Strokes (shares of full, shape (3,)) that put the tip there, or None where it cannot be."""
+        """Return the strokes (fractions of full stroke, shape (3,)) for a tip pose; None if it is unreachable."""
         reached = np.empty(REACHED_VALUES)
         reach(x, y, attitude, self.axes, self.plant, self.limits, reached)
         return reached[:3] if reached[REACHABLE] > 0.5 else None

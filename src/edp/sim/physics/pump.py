@@ -31,21 +31,21 @@ DROOP = 0.3
 
 @inlined
 def pump_of(spool: int, axes: Array) -> float:
-    """Number of the pump that feeds a spool: the first ones are those of the axes, then come those of conflux."""
+    """Return the number of the pump that feeds a spool: axis spools come first, then conflux spools."""
     pump: float = axes[spool, at.PRIMARY_PUMP] if spool < at.AXES else axes[spool - at.AXES, at.CONFLUX_PUMP]
     return pump
 
 
 @inlined
 def wish(gain: float, pilot: float) -> float:
-    """Displacement that a pilot asks for, as a share of full."""
+    """Return the displacement requested by a pilot, as a fraction of full displacement."""
     # Demand begins at 10 % of the pilot, below usual dead bands of the spools (12 to 14 %), and is full at 85 %.
     return min(gain * max(abs(pilot) - 0.1, 0.0) * (1.0 / 0.75), 1.0)
 
 
 @inlined
 def demand(valves: Array, axes: Array, plant: Array, motors: Motors | None = None) -> tuple[float, float]:
-    """Displacement asked for by the pilots, as a share of full, for both pumps."""
+    """Return the displacements of both pumps requested by the pilots, as fractions of full displacement."""
     first = second = plant[at.MIN_DISPLACEMENT]
     for j in range(at.SPOOLS):
         i = j % at.AXES
@@ -70,7 +70,7 @@ def demand(valves: Array, axes: Array, plant: Array, motors: Motors | None = Non
 def sensed_loads(
     state: Array, valves: Array, axes: Array, plant: Array, motors: Motors | None = None
 ) -> tuple[float, float]:
-    """Highest pressure (Pa) of the chambers that either pump's spools are open to; that of the tank if none is."""
+    """Return the highest chamber pressure (Pa) open to each pump's spools; the tank pressure if there is none."""
     first = second = plant[at.TANK]
     port = lines.at_valve(plant)
     for j in range(at.SPOOLS):
@@ -97,7 +97,7 @@ def sensed_loads(
 
 @inlined
 def asked(state: Array, valves: Array, axes: Array, plant: Array, motors: Motors | None = None) -> tuple[float, float]:
-    """Displacement asked for, as a share of full, for both pumps: by the pilots or by the loads."""
+    """Return the displacements of both pumps requested by pilots or loads, as fractions of full displacement."""
     margin, least = plant[at.LOAD_MARGIN], plant[at.MIN_DISPLACEMENT]
     if margin <= 0.0:
         return demand(valves, axes, plant, motors)

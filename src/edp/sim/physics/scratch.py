@@ -1,4 +1,4 @@
-"""What lies where in the scratch arrays of one step of the integrator."""
+"""Positions of values in the scratch arrays of one integrator step."""
 
 from __future__ import annotations
 

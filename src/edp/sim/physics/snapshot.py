@@ -42,7 +42,7 @@ class Snapshot:
     log: tuple[NDArray[np.float64], ...]
 
     def save(self, path: str | Path) -> Path:
-        """Write the snapshot as one ``.npz`` file: arrays, and the rest as JSON in it.
+        """Write the snapshot as one ``.npz`` file: arrays, with the rest as embedded JSON.
 
         Raises:
             StorageError: the disk is full or the folder read-only.
@@ -136,7 +136,7 @@ def _changes(value: Any) -> bool:
 
 
 def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
-    """What `capture` saw: objects, arrays and generators of `current` are set in place, the rest is made anew."""
+    """Restore the result of `capture`: arrays and generators of `current` are set in place, the rest is created."""
     if plain is None:
         return current
     ((kind, content),) = plain.items()

@@ -122,7 +122,7 @@ def material_names() -> tuple[str, ...]:
 
 @cache
 def load_material(name: str) -> Material:
-    """The material of this name, or of a TOML file of one's own (a path that ends in ``.toml``).
+    """Load a material by name, or from the user's TOML file (a path that ends in ``.toml``).
 
     Raises:
         ConfigError: no such material (the closest name is offered), or a value is missing, unknown or out of bounds.
@@ -147,7 +147,7 @@ def parse_material(text: str, where: str) -> Material:
 
 
 class Ground:
-    """The ground before one machine: a height profile along its reach, the load in the bucket, and the soil's numbers.
+    """Ground in front of one machine: height profile along its reach, load in the bucket, and soil parameters.
 
     Heights are of soil at bank density, so that the mass of soil in profile, heap and bucket stays the same; the
     surface lies lower where the heel has pressed it.
@@ -193,15 +193,15 @@ class Ground:
         return result
 
     def height(self, x: float) -> float:
-        """Height (m above the boom foot) at a distance (m) in front of it."""
+        """Return the height (m above the boom foot) at a distance (m) in front of the boom foot."""
         return float(terramechanics.height_at(x - self.start_m, self.heights - self.ruts_m))
 
     def redraw(self, rng: np.random.Generator) -> None:
-        """Draw the resistance that is still to be met anew; what the edge is in now goes on from its present value."""
+        """Redraw the resistance of soil not yet reached; soil at the cutting edge continues from its present value."""
         redraw_course(self.material, self.numbers, self.memory, self.course, rng)
 
     def arrays(self) -> tuple[Array, ...]:
-        """What the compiled code reads and writes: numbers, tables, course, heights, memory."""
+        """Return the arrays of the compiled code: parameters, tables, resistance profile, heights, memory."""
         return self.numbers, self.tables, self.course, self.heights, self.memory
 
 
@@ -211,7 +211,7 @@ def no_ground() -> tuple[Array, ...]:
 
 
 def redraw_course(material: Material, numbers: Array, memory: Array, course: Array, rng: np.random.Generator) -> None:
-    """Draw the part of `course` that is still to be met anew, in place; see `Ground.redraw`."""
+    """Redraw the part of `course` not yet reached, in place; see `Ground.redraw`."""
     old = course.copy()
     fresh = terramechanics.draw_course(material, rng)
     count = len(old)

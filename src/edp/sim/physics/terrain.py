@@ -33,7 +33,7 @@ LEFT_M = 0.03
 
 @compiled
 def cell_of(x: float, heights: Array) -> int:
-    """The cell that holds `x`."""
+    """Return the cell that contains `x`."""
     result: int = min(max(int(x / tm.SPACING + 0.5), 0), heights.shape[0] - 1)
     return result
 
@@ -82,7 +82,7 @@ def sweep(c: Array, moved: float, numbers: Array, heights: Array, memory: Array)
 
 @compiled
 def move_back(h: float, v: tuple[float, float, float, float], c: Array, ground: tuple[Array, ...]) -> None:
-    """What the back moves in a step: soil before it, and what the heel has shoved aside when it leaves."""
+    """Move soil in front of the back in a step, and soil displaced by the heel when it leaves."""
     numbers, heights, memory = ground[0], ground[3], ground[4]
     if c[tm.ON] > 0.0 and c[tm.PUSH_DEPTH] > 0.0:
         moved = h * (v[0] if c[tm.POINTS + 1] <= c[tm.POINTS + 3] else v[2])

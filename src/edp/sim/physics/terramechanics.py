@@ -95,7 +95,7 @@ def cutting_table(material: Material) -> Array:
 
 
 def draw_course(material: Material, rng: np.random.Generator) -> Array:
-    """How the resistance varies, shape (COURSE, 3), endless by wrapping around.
+    """Return the variation of the resistance, shape (COURSE, 3), periodic.
 
     Columns: a unit Ornstein-Uhlenbeck process over travelled distance; force (N) of stones, half-sines of 20-80 mm
     and 5-40 kN; strength of each dig, within 30 % of the mean.
@@ -116,7 +116,7 @@ def draw_course(material: Material, rng: np.random.Generator) -> Array:
 
 
 def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
-    """Soil, bucket and chassis as numbers for the compiled code."""
+    """Return soil, bucket and chassis parameters for the compiled code."""
     bucket, chassis, bodies = machine.bucket, machine.chassis, machine.bodies
     loose = material.density / material.swell
     floor = math.radians(bucket.floor_angle_deg)
@@ -232,7 +232,7 @@ def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Ar
 
 @compiled
 def engage_heel(numbers: Array, heights: Array, memory: Array, c: Array) -> None:
-    """Normal force and sliding friction of the floor plate's heel in `c`, from its depth below the profile."""
+    """Compute normal force and sliding friction of the floor plate's heel in `c`, from its depth below the profile."""
     depth, borne = c[HEEL_DEPTH], memory[at.HEEL_SET]
     if numbers[COMPACTION] > 0.0:
         borne = max(borne, pressed_at(c[POINTS + 2], heights, memory))
@@ -315,7 +315,7 @@ def velocities(c: Array, w1: float, w2: float, w3: float) -> Four:
 
 @compiled
 def engage_back(w1: float, w2: float, w3: float, ground: Ground, c: Array) -> None:
-    """Add what the soil before the back resists with to the forces in `c`, at the lower of tip and heel."""
+    """Add the soil resistance on the back to the forces in `c`, at the lower of tip and heel."""
     v = velocities(c, w1, w2, w3)
     back, tip_lower = ground[0][BACK:], c[POINTS + 1] <= c[POINTS + 3]
     outward = min(max(0.5 + 0.5 * (v[0] if tip_lower else v[2]) / TURNING, 0.0), 1.0)

@@ -27,7 +27,7 @@ def set_temperature(celsius: float, plant: Array) -> None:
 
 @compiled
 def losses(row: Array, axes: Array, plant: Array, motors: Motors | None = None) -> float:
-    """Hydraulic power (W) that stays in the oil: what the pumps' shafts give less what pistons and motors take.
+    """Return the hydraulic power (W) dissipated in the oil: pump shaft power minus power of pistons and motors.
 
     Args:
         row: one logged sample.

@@ -1,1 +1,1 @@
-"""What the machine's sensors, filters and buses make of the state."""
+"""Model of sensors, filters and buses: logged signals from the plant state."""

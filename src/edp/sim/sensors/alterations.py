@@ -1,4 +1,4 @@
-"""What faults make of the values that sensors show at one tick; part of the chain, see `edp.sim.sensors.chain`.
+"""Effect of faults on sensor readings at one sample; part of the chain, see `edp.sim.sensors.chain`.
 
 A fault is a row of a table (what happens, to which value, and with which other one), a number a tick (0 for nothing)
 and a row of memory. Faults act in the order of their rows.
@@ -82,7 +82,7 @@ def alter(
 
 
 def memory_shape(table: Array, sizes: Array) -> tuple[int, int]:
-    """Shape of the memory that `alter` needs for a table and the numbers of all ticks, shape (time, fault)."""
+    """Return the memory shape that `alter` needs for a table and the parameters of all samples, shape (time, fault)."""
     delays = sizes[:, table[:, OPERATION] == DELAY]
     # The tick itself, the one that a delay between ticks reads beside it, and room for rounding up.
     return len(table), (int(np.ceil(delays.max())) if delays.size else 0) + 2

@@ -1,4 +1,4 @@
-"""When values travel: frames of an ECU on the bus, late, jittered and now and then lost, held at the logger's ticks."""
+"""Bus timing: frames of an ECU with delay, jitter and loss, held at the logger's samples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Bus:
-    """Timing of the frames of every ECU, in s; `period` 0 stands for no bus: values are logged as they are.
+    """Timing of the frames of every ECU, in s; with `period` 0 there is no bus, and values are logged directly.
 
     Attributes:
         period: time between two frames of an ECU.

@@ -1,4 +1,4 @@
-"""What sensors and bus make of one logged sample, tick by tick: the only place where the chain is computed.
+"""Sensor and bus model for one logged sample; the only implementation of the chain.
 
 Recordings and episodes run the same compiled function, the former over all rows of a log, the latter a row at a time.
 Everything random of a recording is drawn before it begins (`edp.sim.sensors.draws`), one row a tick.
@@ -49,7 +49,7 @@ State = tuple[Array, Array, Array, Array]
 
 @plainly_inlined
 def remember(sample: Array, kelvin: float, tick: int, setup: Setup, memory: Array, row: Array, work: Array) -> None:
-    """What the sensors feel at this tick into `row` of the history; `sample` is one row of the log, (1, columns)."""
+    """Write the quantities sensed at this sample to `row` of the history; `sample` is one log row, (1, columns)."""
     numbers, axes, plant, _ = setup
     if numbers[PLAYING] > 0.0:
         force, mass = work[0:1], work[1:2]
@@ -85,7 +85,7 @@ def remember(sample: Array, kelvin: float, tick: int, setup: Setup, memory: Arra
 
 @plainly_inlined
 def between(history: Array, position: float) -> tuple[Array, Array, float]:
-    """The remembered rows around a position in ticks, and how far it lies from the first to the second."""
+    """Return the stored rows around a position in samples, and the interpolation weight of the second."""
     low = int(position)
     part = position - low
     # At a tick itself the one behind it may not have come yet.
@@ -127,7 +127,7 @@ def read_pressures(drawn: Array, numbers: Array, history: Array, out: Array) -> 
 
 @plainly_inlined
 def read_pilots(position: float, full: float, history: Array, out: Array) -> None:
-    """The 12 one-sided pilot pressures that the valves' ECU sends, into ``out[12:24]``."""
+    """Write the 12 one-sided pilot pressures sent by the valve ECU to ``out[12:24]``."""
     low, high, part = between(history, position)
     for j in range(at.SPOOLS):
         a, b = low[DEMAND + j], high[DEMAND + j]
@@ -158,7 +158,7 @@ def sense(
     state: State,
     out: Array,
 ) -> None:
-    """The 24 signals of Table A.1 at one tick and what is shown beside them, shape (SENSED,), into `out`.
+    """Write the 24 signals of Table A.1 and the additional observed values at one sample to `out`, shape (SENSED,).
 
     Ticks must be taken in order from 0, which starts everything at rest.
 
@@ -206,7 +206,10 @@ def sense_all(
     state: State,
     out: Array,
 ) -> None:
-    """`sense` at every row of a log, from rest; shapes (time, columns), (time,), (time, draws), (time, SENSED)."""
+    """Apply `sense` to every row of a log from steady state.
+
+    Shapes (time, columns), (time,), (time, draws), (time, SENSED).
+    """
     for k in range(log.shape[0]):
         sense(log[k : k + 1], kelvin[k], k, drawn[k], setup, state, out[k])
 

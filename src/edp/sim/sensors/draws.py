@@ -1,4 +1,4 @@
-"""Everything random that sensors and bus do to a recording, drawn at once before it begins: one row a tick."""
+"""Random numbers of sensors and bus for a recording, drawn before it begins: one row per sample."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ECUS = ("joints", "pressures", "valves")
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """What differs between two machines of one type and stays the same from recording to recording.
+    """Properties that differ between machines of one type and are constant over recordings.
 
     Attributes:
         pressure_offset: offsets of the six cylinder pressures as a share of full scale.
@@ -34,7 +34,7 @@ class Instance:
 
 
 def instance_of(machine: Machine) -> Instance:
-    """The fixed instance of a machine, drawn from its name and ``instance_seed``."""
+    """Return the fixed instance of a machine, generated from its name and ``instance_seed``."""
     own = machine.sensors
     # crc32, since hash() of a text differs from process to process.
     rng = np.random.default_rng([binascii.crc32(machine.name.encode()), int(own.instance_seed)])
@@ -46,7 +46,7 @@ def instance_of(machine: Machine) -> Instance:
 
 
 def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generator | None) -> Array:
-    """What is random in a recording of so many samples, shape (samples, chain.DRAWS); without `rng` nothing is.
+    """Return the random numbers of a recording, shape (samples, chain.DRAWS); zeros without `rng`.
 
     Args:
         machine: whose ``[sensors]`` holds.
@@ -89,7 +89,7 @@ def depth(drawn: Array) -> int:
 
 
 def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generator) -> list[can.Frames]:
-    """Frames of each of `ECUS`, with random numbers of their own."""
+    """Return the frames of each of `ECUS`, with independent random numbers."""
     own, instance = machine.sensors, instance_of(machine)
     bus = can.Bus(own.can_period, own.can_latency, own.can_jitter, own.can_loss)
     # A generator each: what one ECU draws does not move the noise of the others.

@@ -35,14 +35,14 @@ def _filter(numbers: Array, values: Array, state: Array, out: Array) -> None:
 
 
 def lfilter(numbers: Array, values: Array) -> Array:
-    """The filter of `biquad` along time, from rest, shape ``(time, channel)``."""
+    """Apply the filter of `biquad` along time, from rest, shape ``(time, channel)``."""
     out = np.empty(values.shape)
     _filter(numbers, np.ascontiguousarray(values, dtype=float), np.zeros(2), out)
     return out
 
 
 def derivative_numbers(bandwidth_hz: float, rate_hz: float) -> Array:
-    """Of w^2 s / (s^2 + 2 zeta w s + w^2) by the bilinear rule, as `biquad` takes them, shape (5,)."""
+    """Return w^2 s / (s^2 + 2 zeta w s + w^2) discretised by the bilinear rule for `biquad`, shape (5,)."""
     # Below half of the rate, where the bilinear rule warps frequencies.
     omega = 2.0 * math.pi * min(bandwidth_hz, 0.4 * rate_hz)
     k = 2.0 * rate_hz

@@ -1,4 +1,4 @@
-"""One logged sample: what is true at an instant, in the columns that `edp.sim.machine.layout` names."""
+"""Logged sample: ground truth at an instant, in the columns of `edp.sim.machine.layout`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_events(
     row: Array,
     motors: Motors | None = None,
 ) -> None:
-    """Flags 0 or 1: relief, cavitation, regeneration, power limit, soil contact."""
+    """Write the flags 0 or 1: relief, cavitation, regeneration, power limit, soil contact."""
     relief = cavitation = regeneration = limited = 0.0
     port = lines.at_valve(plant)
     for i in range(at.AXES):

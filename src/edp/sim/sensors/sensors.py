@@ -1,4 +1,4 @@
-"""From plant truth to logged signals: what a machine's sensors and its bus make of them (its ``[sensors]``)."""
+"""Logged signals from ground truth, by the sensor and bus model of a machine (its ``[sensors]``)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def measured_signals(
     rng: np.random.Generator | None,
     oil_temperature: Array | None = None,
 ) -> Array:
-    """The 24 signals of Table A.1 in its order, SI units, shape (time, 24); the truth when `rng` is None.
+    """Return the 24 signals of Table A.1 in order, SI units, shape (time, 24); the ground truth if `rng` is None.
 
     No sample depends on a later one. Acceleration is the filtered derivative of the measured velocity.
 
@@ -48,7 +48,7 @@ def shown_signals(
     oil_temperature: Array,
     faults: Array | None = None,
 ) -> Array:
-    """What is shown in all, shape (time, `chain.SENSED`): Table A.1, then what has no noise but may have a fault.
+    """Return all observed values, shape (time, `chain.SENSED`): Table A.1, then noise-free ones that may have faults.
 
     Args:
         log: rows of the plant.
@@ -67,7 +67,7 @@ def shown_signals(
 
 
 def truth_columns(width: int) -> dict[str, int]:
-    """Columns of a log with so many by the names of `EXTRA_CHANNELS`.
+    """Return the columns of a log with this width by the names of `EXTRA_CHANNELS`.
 
     Behind them those of `GROUND_CHANNELS` in soil, then of `MOTOR_CHANNELS` where swing and travel move.
     """
@@ -107,13 +107,13 @@ def _motor_columns(first: int) -> dict[str, int]:
 
 
 def truth_signals(log: Array) -> dict[str, Array]:
-    """Noise-free further signals by the names of `truth_columns`."""
+    """Return additional noise-free signals by the names of `truth_columns`."""
     signals = {name: log[:, column] for name, column in truth_columns(log.shape[1]).items()}
     signals[OIL] = signals[OIL] + KELVIN
     return signals
 
 
 def shown_names() -> dict[str, int]:
-    """Where what is shown without noise lies in `shown_signals`, by the names of `EXTRA_CHANNELS`."""
+    """Return the positions of noise-free observed values in `shown_signals`, by the names of `EXTRA_CHANNELS`."""
     strokes = {f"CylStroke_{i + 1}": chain.STROKES + i for i in range(at.AXES)}
     return {**strokes, "PumpPressure_1": chain.PUMPS, "PumpPressure_2": chain.PUMPS + 1, OIL: chain.OIL}

@@ -1,4 +1,4 @@
-"""What sensors do to a value; a size of zero changes nothing."""
+"""Sensor errors of a value; a size of zero has no effect."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ Array = NDArray[np.float64]
 
 @plainly_inlined
 def quantised(value: float, quantum: float) -> float:
-    """The nearest multiple of `quantum`."""
+    """Round to the nearest multiple of `quantum`."""
     return float(np.rint(value / quantum) * quantum) if quantum > 0.0 else value
 
 
 @plainly_inlined
 def limited(value: float, full_scale: float) -> float:
-    """Cut to what a transmitter can show, 0 to `full_scale`."""
+    """Limit to the range of a transmitter, 0 to `full_scale`."""
     return min(max(value, 0.0), full_scale) if full_scale > 0.0 else value
 
 
 def random_walk(shape: tuple[int, int], step_s: float, size: float, rng: np.random.Generator) -> Array:
-    """A bias that starts at zero and grows with the root of time: rms `size` after one second."""
+    """Return a bias that starts at zero and grows with the square root of time: rms `size` after one second."""
     steps = rng.normal(0.0, size * np.sqrt(step_s), shape)
     # The bias is zero when the recording begins.
     steps[0] = 0.0

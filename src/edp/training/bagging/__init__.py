@@ -1,1 +1,1 @@
-"""Committees trained on folds: a linear model, and learners of several kinds on what it leaves (bagging, stacking)."""
+"""Ensembles trained on folds: a linear model, and learners of several kinds on its residuals (bagging, stacking)."""

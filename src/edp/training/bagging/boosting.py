@@ -1,4 +1,4 @@
-"""Boosted regression trees as learners of a committee: steps and switches that smooth learners round off.
+"""Boosted regression trees as learners of an ensemble, for steps and switches that smooth learners miss.
 
 Up to three models with as many trees each: one of what the linear model leaves, and two of the targets themselves,
 which do not run away with the linear model where the machine goes beyond what was recorded. The first of these reads
@@ -52,7 +52,7 @@ class _Boosted:
 
 @dataclass(frozen=True, eq=False)
 class _Kind:
-    """What the trees of a model learn.
+    """Target and columns of the trees of a model.
 
     Attributes:
         direct: the targets themselves, or what the linear model leaves of them.
@@ -117,12 +117,12 @@ class TreeLearner:
         return _Boosted(count, staged[count - 1].astype(np.float64), (kind.columns[feature], threshold, leaf))
 
     def _on_grid(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Some columns of some rows, rounded to `GRID`."""
+        """Return columns of some rows, rounded to `GRID`."""
         part = self.work.table.columns[rows][:, columns]
         return np.asarray(np.round(part / np.float32(GRID)) * np.float32(GRID))
 
     def _target(self, rows: NDArray[np.int64], fold: int | None, direct: bool) -> DoubleArray:
-        """What the trees of a fold, or those on all rows, are to predict, ``(row, output)``."""
+        """Return the target of the trees of a fold, or of the trees on all rows, ``(row, output)``."""
         targets = self.work.table.targets[rows]
         if direct:
             return targets
@@ -134,7 +134,7 @@ class TreeLearner:
     def _grown(
         self, rows: NDArray[np.int64], target: DoubleArray, columns: NDArray[np.int64], judged: NDArray[np.int64]
     ) -> Iterator[DoubleArray]:
-        """Predictions of the judged rows after each tree."""
+        """Yield the predictions of the evaluation rows after each tree."""
         model = self._regressor(self.rounds).fit(self._on_grid(rows, columns), target)
         return iter(model.staged_predict(self.work.table.columns[judged][:, columns]))
 
@@ -155,13 +155,13 @@ class TreeLearner:
         )
 
     def left_out(self) -> Sequence[DoubleArray]:
-        """All models' predictions, those of the targets less the linear model's, in whose stead they come."""
+        """Return all models' predictions; direct models are reduced by the linear prediction that they replace."""
         every = [np.stack([model.left_out for model in models], axis=1) for models in self.models]
         linear = self.work.linear.left_out
         return [one - linear if kind.direct else one for kind, one in zip(self.kinds, every, strict=True)]
 
     def write(self, shares: DoubleArray) -> HeadPart:
-        """The trees with their shares into the network; the head passes their sums on."""
+        """Write the weighted trees to the network; the head passes their sums through."""
         outputs = self.work.table.targets.shape[1]
         tables = [
             [_weighted(models[output].tables, share[output]) for models, share in zip(self.models, shares, strict=True)]
@@ -184,7 +184,7 @@ class TreeLearner:
 
 
 def _kinds(bank: LagBank) -> list[_Kind]:
-    """The models; without the last one where it would read all columns."""
+    """Return the models; the last one is omitted if it would read all columns."""
     powers = [0, *(span for span, lag in enumerate(bank.lags, start=1) if lag & (lag - 1) == 0)]
     sparse = (np.array(powers)[:, None] * bank.width + np.arange(bank.width)).ravel()
     every = np.arange(bank.columns)
@@ -193,12 +193,12 @@ def _kinds(bank: LagBank) -> list[_Kind]:
 
 
 def _trained_by_all(folds: Folds, part: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows that each fold of a part trains on: none of those that they leave out, nor of those beside them."""
+    """Return the training rows common to all folds of a part."""
     return reduce(np.intersect1d, [folds.training[fold] for fold in part.tolist()])
 
 
 def _weighted(tables: Tables | None, share: float) -> Tables | None:
-    """Tables whose leaves are multiplied by a share; None where nothing is left of them."""
+    """Return tables with leaves multiplied by a weight; None for zero weight."""
     if tables is None or share <= 0:
         return None
     feature, threshold, leaf = tables
@@ -206,5 +206,5 @@ def _weighted(tables: Tables | None, share: float) -> Tables | None:
 
 
 def _sample(rows: NDArray[np.int64], most: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """At most so many of the rows, in order."""
+    """Return at most `most` random rows, in order."""
     return rows if len(rows) <= most else np.sort(rng.choice(rows, most, replace=False))

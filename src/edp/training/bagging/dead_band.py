@@ -1,4 +1,4 @@
-"""How small a prediction must be to count as none, judged on rows that were left out.
+"""Dead band of predictions: threshold below which a prediction counts as zero, chosen on left-out rows.
 
 A least-squares model says of a machine at rest what will be on average: a little more than nothing, where sensors count
 in steps and mostly nothing happens. Its squared error is least, its absolute error is larger than that of 'no change'.
@@ -28,7 +28,7 @@ def band(values: DoubleArray, width: float | DoubleArray) -> DoubleArray:
 
 
 def dead_bands(predicted: DoubleArray, truth: DoubleArray, owner: NDArray[np.integer]) -> DoubleArray:
-    """Widths of the dead bands of the outputs, ``(output,)``; 0 where none helps.
+    """Return the dead band width of each output, ``(output,)``; 0 if it brings no gain.
 
     Args:
         predicted: of left-out rows, standardised, ``(row, output)``.

@@ -1,4 +1,4 @@
-"""Fit a committee: a linear model, and learners of several kinds on what it leaves, each with one fold left out.
+"""Fit an ensemble: a linear model, and learners of several kinds on its residuals, each with one left-out fold.
 
 The prediction is the mean of the folds' linear models plus a non-negative combination of the learners (bagging:
 Breiman, 1996; stacking: Wolpert, 1992, and Breiman, 1996). Each row of the training and validation parts is left out by
@@ -52,7 +52,7 @@ class Bagged:
     table: Table
 
     def at_every_tick(self, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
-        """Left-out predictions of each stretch at every tick, standardised ``(tick, output)``.
+        """Return left-out predictions of each segment at every sample, standardised ``(tick, output)``.
 
         Args:
             truth: what was to be predicted, of each stretch of the training part, then of the validation part.
@@ -101,7 +101,10 @@ def fit_in_folds(
     run: Run | None,
     on_event: Event,
 ) -> Fitted:
-    """As `fit_bagged`, with its history in a run folder; there is no checkpoint: a stopped training begins anew."""
+    """Fit like `fit_bagged` and store the history in a run folder.
+
+    There is no checkpoint: a stopped training restarts.
+    """
     fitted = fit_bagged(data, model, spec, on_event).fitted
     if run is not None:
         run.write_history(fitted.history)
@@ -109,7 +112,7 @@ def fit_in_folds(
 
 
 def _fit_linear(net: Predictor, table: Table) -> FoldRidge:
-    """The linear models: present values alone, then with changes over more and more spans, then all columns."""
+    """Fit the linear models: present values, then changes over more and more spans, then all columns."""
     bank = committee_of(net).bank
     counts = [*range(len(bank.lags) + 1), *([len(bank.spans)] if bank.smoothed else [])]
     sets = [np.arange(bank.width * (1 + spans)) for spans in counts]
@@ -117,7 +120,7 @@ def _fit_linear(net: Predictor, table: Table) -> FoldRidge:
 
 
 def _learners(work: FoldFit) -> list[Learner]:
-    """What the committee has parts for, in the order of its representation."""
+    """Create the learners for the parts of the ensemble, in the order of its representation."""
     committee = committee_of(work.net)
     learners: list[Learner] = []
     if committee.members:
@@ -146,7 +149,7 @@ def _combine(work: FoldFit, learners: Sequence[Learner]) -> DoubleArray:
 
 
 def _write_head(work: FoldFit, parts: Sequence[HeadPart]) -> None:
-    """The linear model and every learner's part into the head of the network."""
+    """Write the linear model and every learner's part to the head of the network."""
     weight, intercept = work.linear.mean()
     remaining = 1.0 - sum((part.linear for part in parts), np.zeros(len(intercept)))
     full = np.concatenate([weight * remaining, *(part.weight for part in parts)])
@@ -160,7 +163,7 @@ def _write_head(work: FoldFit, parts: Sequence[HeadPart]) -> None:
 
 
 def _write_band(work: FoldFit, left_out: DoubleArray) -> DoubleArray:
-    """The dead bands into the head, where it has them; predictions of rows that were left out behind them."""
+    """Write the dead bands to the head if it has them; return the left-out predictions with them applied."""
     dead_band = work.net.heads.band
     if dead_band is None:
         return left_out
@@ -170,7 +173,7 @@ def _write_band(work: FoldFit, left_out: DoubleArray) -> DoubleArray:
 
 
 def _record_linear(work: FoldFit) -> None:
-    """The one row of the history where nothing is trained step by step."""
+    """Record the single history row of a training without steps."""
     error = torch.from_numpy(work.linear.left_out - work.table.targets)
     validation = float(losses_of(work.spec)[0].penalty(error).mean())
     record(work, 1, 0, math.nan, validation, float(error.abs().mean()), error.abs().mean(dim=0).numpy(), 0.0)

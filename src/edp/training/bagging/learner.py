@@ -1,4 +1,4 @@
-"""What a committee adds to its linear model: learners, each fitted with every fold left out."""
+"""Learners that an ensemble adds to its linear model, each fitted with every fold left out."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class FoldFit:
 
     @property
     def residual(self) -> DoubleArray:
-        """What the linear models leave of rows that they did not see, standardised ``(row, output)``."""
+        """Residuals of the linear models on left-out rows, standardised ``(row, output)``."""
         return np.asarray(self.table.targets - self.linear.left_out)
 
     def residuals(self, rows: NDArray[np.int64], fold: int) -> DoubleArray:
-        """What one fold's linear model leaves of some rows, standardised ``(row, output)``."""
+        """Return the residuals of one fold's linear model on some rows, standardised ``(row, output)``."""
         predicted = self.table.columns[rows] @ self.linear.weights[fold] + self.linear.intercepts[fold]
         return np.asarray(self.table.targets[rows] - predicted)
 
@@ -73,18 +73,18 @@ class HeadPart:
 
 
 class Learner(Protocol):
-    """One kind of learner; its numbers of the representation come in the order of the committee's parts."""
+    """One kind of learner; its representation elements are in the order of the ensemble's parts."""
 
     def fit(self) -> None:
         """Learn."""
         ...
 
     def left_out(self) -> Sequence[DoubleArray]:
-        """What each of its models adds to the linear prediction of rows that it did not see, ``(row, output)`` each."""
+        """Return the additions of each model to the linear prediction of left-out rows, ``(row, output)`` each."""
         ...
 
     def write(self, shares: DoubleArray) -> HeadPart:
-        """Put what was learned into the network.
+        """Write the fitted learner to the network.
 
         Args:
             shares: non-negative weight of each of its models in the sum, ``(model, output)``.

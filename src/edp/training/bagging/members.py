@@ -1,4 +1,4 @@
-"""The members of a committee while they train: weights of all of them side by side, each with a fold of its own."""
+"""Members of an ensemble during training: batched weights, each member with its own fold."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class MemberGroup:
         return each
 
     def update(self, columns: Tensor, residuals: Tensor, rate: float) -> float:
-        """One step of every member on rows of its own; the mean loss."""
+        """Update every member on its own rows, and return the mean loss."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         rows = torch.stack([self._draw_rows(int(fold)) for fold in self.fold])
@@ -99,7 +99,7 @@ class MemberGroup:
         return rows[torch.randint(len(rows), (self.batch,), generator=self.draw)]
 
     def judge(self, columns: Tensor, residuals: Tensor) -> tuple[float, float]:
-        """Keep each member's average where it is the best so far; mean loss and absolute error on left-out rows."""
+        """Keep each member's average if it is the best so far; return mean loss and absolute error on left-out rows."""
         losses, absolute = torch.zeros(len(self.fold)), 0.0
         with torch.no_grad():
             for fold, rows in enumerate(self.judged):
@@ -117,11 +117,14 @@ class MemberGroup:
         return float(losses.mean()), absolute
 
     def of_kind(self, kind: int) -> Tensor:
-        """Numbers of the members that were trained with one of the losses."""
+        """Return the indices of the members trained with one of the losses."""
         return torch.nonzero(self.kind == kind).flatten()
 
     def left_out(self, columns: Tensor, folds: Folds, kind: int) -> DoubleArray:
-        """Mean prediction of each row by members of a loss that left it out, ``(row, output)``; zero where none did."""
+        """Return the mean prediction of each row by the members that left it out, ``(row, output)``.
+
+        Zero without any.
+        """
         predicted = np.zeros((len(columns), self.best[-1].shape[-1]))
         with torch.no_grad():
             for fold in range(folds.count):

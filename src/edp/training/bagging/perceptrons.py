@@ -27,7 +27,7 @@ RISE = 0.1
 
 
 def losses_of(spec: TrainingSpec) -> tuple[Penalty, ...]:
-    """The losses that members are trained with; `check_training` refuses any other.
+    """Return the losses of the members; `check_training` refuses other losses.
 
     Raises:
         TypeError: one reads more than an error.
@@ -39,7 +39,7 @@ def losses_of(spec: TrainingSpec) -> tuple[Penalty, ...]:
 
 
 class PerceptronLearner:
-    """Trains all groups of members together, on what each fold's linear model leaves, and keeps each at its best."""
+    """Trains all groups of members together on the residuals of each fold's linear model, keeping each at its best."""
 
     def __init__(self, work: FoldFit, modules: Sequence[Members]) -> None:
         self.work, self.modules, self.bagging = work, modules, work.bagging
@@ -115,13 +115,13 @@ class PerceptronLearner:
         self.work.tell(TrainingProgress(check, checks, update, updates, rate, left, row))
 
     def left_out(self) -> Sequence[DoubleArray]:
-        """A model for each group and loss: the mean of its members that did not see a row."""
+        """Return one model per group and loss: the mean of the members that left out a row."""
         folds = self.work.table.folds
         kinds = range(len(self.losses))
         return [group.left_out(self.columns, folds, kind) * self.spread for group in self.groups for kind in kinds]
 
     def write(self, shares: DoubleArray) -> HeadPart:
-        """The best members' layers into the backbone, the weighted mean of their last layers into the head."""
+        """Write the best members' layers to the backbone, and the weighted mean of their last layers to the head."""
         blocks, bias = [], np.zeros(shares.shape[1])
         of_group = shares.reshape(len(self.groups), len(self.losses), -1)
         with torch.no_grad():

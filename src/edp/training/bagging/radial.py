@@ -66,7 +66,7 @@ class RadialLearner:
         self.best: _Kernel | None = None
 
     def fit(self) -> None:
-        """Every length on some of the rows, and for each the best penalty; then the best one on all rows."""
+        """Choose the length scale and penalty on some rows, then fit on all rows."""
         table, truth = self.work.table, self.work.residual
         every = np.arange(len(table.columns))
         targets = np.stack([self.work.residuals(every, fold) for fold in range(table.folds.count)])
@@ -84,7 +84,7 @@ class RadialLearner:
             self.best = self._kernel(best, targets, 1)
 
     def _kernel(self, length: float, targets: DoubleArray, stride: int) -> _Kernel:
-        """A fit on every `stride`-th row; targets are those of the folds, ``(fold, row, output)``."""
+        """Fit on every `stride`-th row; targets are given per fold, ``(fold, row, output)``."""
         columns, folds = self.columns[::stride], self.work.table.folds
         scale = length * np.sqrt(columns.shape[1]) * self.spread
         centres = self.centres / scale
@@ -99,7 +99,7 @@ class RadialLearner:
         return _Kernel(scale, basis, fold_ridge(rows, targets, thinned, [np.arange(rows.shape[1])]))
 
     def left_out(self) -> Sequence[DoubleArray]:
-        """The one model's predictions."""
+        """Return the predictions of the single model."""
         return [self._fitted().ridge.left_out]
 
     def write(self, shares: DoubleArray) -> HeadPart:

@@ -67,7 +67,7 @@ def _weights(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64])
 
 
 def _nested_error(columns: DoubleArray, truth: DoubleArray, owner: NDArray[np.int64]) -> float:
-    """Root-mean-square error with weights that did not see the fold they are judged by."""
+    """Return the root-mean-square error with weights fitted without the evaluated fold."""
     squared = 0.0
     for fold in np.unique(owner):
         own = owner == fold

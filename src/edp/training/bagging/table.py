@@ -1,4 +1,4 @@
-"""The rows that a committee is trained on: what its members read, what they predict, and who is left out when."""
+"""Rows for training an ensemble: inputs and targets of its members, and the left-out fold of each row."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ few steps of noise or drift; a line through them says nothing of the axis in mot
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of all stretches, laid end to end.
+    """Rows of all segments, concatenated.
 
     Attributes:
         columns: the committee's changes over several spans, ``(row, column)``, float32.
@@ -52,7 +52,7 @@ class Table:
     starts: tuple[tuple[int, int], ...]
 
     def at_every_tick(self, error: DoubleArray, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
-        """Predictions at every tick of each stretch, standardised ``(tick, output)``.
+        """Return predictions at every sample of each segment, standardised ``(tick, output)``.
 
         Where rows were thinned out, the error of the row before a tick stands for that of the tick.
 
@@ -68,7 +68,7 @@ class Table:
 
 
 def committee_of(net: Predictor) -> Committee:
-    """The backbone of a network that is trained on folds.
+    """Return the backbone of a network trained on folds.
 
     Raises:
         TypeError: it is another one; `check_training` refuses this before.
@@ -142,7 +142,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
 
 
 def _limits(columns: NDArray[np.float32], present: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Least and largest value that each column may have: its range, widened; the first `present` are no changes."""
+    """Return the lower and upper limit of each column: its widened range; the first `present` columns are values."""
     low, high = columns.min(axis=0), columns.max(axis=0)
     share = np.where(np.arange(len(low)) < present, PRESENT_BEYOND, CHANGE_BEYOND)
     few = np.array([len(np.unique(columns[:, channel])) <= FEW_LEVELS for channel in range(present)])
@@ -162,7 +162,7 @@ def _whole_recordings(
 
 
 def _pieces(share: float, test: Sequence[Series], reach: int, stride: int) -> int:
-    """Unbroken pieces of each fold of so many rows: as long as the stretches that test, of which only lengths are read.
+    """Return the number of contiguous parts per fold, so that they are as long as the test segments.
 
     What a fold leaves out should be as unlike the rest as what tests is: of three logs whose ends test a fold of one
     piece would leave out most of one log, and a model that does well on a log it has not seen would be preferred.
@@ -172,7 +172,7 @@ def _pieces(share: float, test: Sequence[Series], reach: int, stride: int) -> in
 
 
 def bank_rows(net: Predictor, part: Series, chosen: range | None = None) -> NDArray[np.float32]:
-    """What the bank of a committee gives of a stretch, as a stream from its first tick, ``(row, column)``.
+    """Return the bank features of a segment, as a stream from its first sample, ``(row, column)``.
 
     Args:
         net: with a committee.

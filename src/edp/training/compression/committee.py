@@ -1,4 +1,4 @@
-"""Students of committees: fewer and narrower perceptrons, taught what all learners together say."""
+"""Students of ensembles: fewer and narrower perceptrons, trained on the outputs of all learners together."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edp.networks.predictor import ModelSpec, Predictor, build_model
 
 
 def committee_start(teacher: Predictor, model: ModelSpec, data: Prepared, seed: int = 0) -> Predictor | None:
-    """A student that begins with the teacher's linear model and with silent perceptrons.
+    """Create a student with the teacher's linear model and zero perceptron outputs.
 
     Args:
         teacher: the committee; another backbone gives None.

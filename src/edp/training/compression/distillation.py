@@ -1,4 +1,4 @@
-"""Distillation: a network learns from the truth and from what larger networks say of the same ticks."""
+"""Distillation: training on measured targets and on the outputs of larger networks for the same samples."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class Distillation:
         return [self._taught(part, truth) for part, truth in marked]
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
-        """Copy the start's weights and scaling, where there is one; refuse a hint that batches are too small for."""
+        """Copy the weights and scaling of the start, if there is one; refuse a hint for too small batches."""
         if self.spec.hint:
             chunks = spec.chunks
             ticks = chunks.batch * (chunks.length if chunks.regime == "chunk" else 1)
@@ -148,7 +148,7 @@ class Distillation:
         return True
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """The dual objective of a batch; ticks without truth count for the teachers only."""
+        """Return the combined loss of a batch; samples without targets count for the teachers only."""
         spec, strategy_columns = self.spec, batch_context.strategy_columns
         # The mark is a number among the targets; half is its threshold.
         labelled = batch_context.valid & (strategy_columns[..., 0] > 0.5)

@@ -1,4 +1,4 @@
-"""Hidden-feature hints: how well a student's hidden features tell those of its teachers."""
+"""Hidden-feature hints: how well a student's hidden features predict those of its teachers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RIDGE = 1e-3  # of the student's mean square: keeps the map small where features
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Principal components of hidden features, all scaled alike so that their mean square is one on average.
+    """Principal components of hidden features with a common scale, so that their mean square is one on average.
 
     Attributes:
         mean: ``(width,)``.
@@ -46,7 +46,7 @@ class Components:
 
 
 def hint_error(hidden: Tensor, teacher_components: Tensor, valid: Tensor) -> Tensor:
-    """Mean square of what the best linear map of the student's hidden features leaves of the wanted ones.
+    """Return the mean square residual of the best linear map from the student's hidden features to the wanted ones.
 
     The map (ridge regression with a constant) is found anew in each batch and held fixed for the gradient, which is
     then that of the error with the best map; it adds nothing to train or to store. Zero where fewer than four ticks a

@@ -1,4 +1,4 @@
-"""Imitation of a committee on rows: a student with two perceptrons learns what all learners together say.
+"""Imitation of an ensemble on feature rows: a student with two perceptrons learns the total output of all learners.
 
 A committee has no memory but its bank of changes, so a row of the bank is all that it reads. The teacher's prediction
 is therefore known at every point of that space, not only where something was recorded. The student learns it on
@@ -57,7 +57,7 @@ PIECE = 4096
 
 
 def imitates(teachers: Sequence[Predictor], model: ModelSpec) -> bool:
-    """Whether a student of these settings can learn from the teachers on rows: one committee, and one of its bank."""
+    """Return whether a student can learn from the teachers on rows: one ensemble with the same bank."""
     if len(teachers) != 1 or not isinstance(teachers[0].backbone, Committee):
         return False
     specs, own = (teachers[0].spec, model), model.backbone
@@ -80,7 +80,7 @@ def imitates(teachers: Sequence[Predictor], model: ModelSpec) -> bool:
 
 
 def predict_rows(net: Predictor, rows: Tensor) -> Tensor:
-    """What a committee with a linear head says of rows of its bank, before any dead band: a student has the same one.
+    """Return the outputs of an ensemble with a linear head on bank rows, before the dead band, which a student shares.
 
     Args:
         net: its settings satisfy `imitates`.
@@ -167,7 +167,7 @@ class CommitteeImitation:
         return Fitted(net.eval(), history, seconds, 2 * BATCH * self.steps / max(seconds, 1e-9), 0)
 
     def _rows(self, data: Prepared) -> tuple[Tensor, Tensor]:
-        """Rows of the bank and the standardised truth of the first of them, those of `data`."""
+        """Return bank rows and the standardised targets of the first ones, which come from `data`."""
         reach, skip = data.task.max_horizon, self.teacher.spec.window - 1
         own = [part for part in (*data.train, *data.validation) if part.samples > reach]
         parts = [(part, part.samples - reach) for part in own] + [(part, part.samples) for part in self.further]
@@ -189,7 +189,7 @@ class CommitteeImitation:
 
 
 class _Perceptrons:
-    """The student's perceptrons while they learn, with a last layer common to all of them."""
+    """Perceptrons of the student during training, with a common last layer."""
 
     rate = 0.0
 
@@ -214,7 +214,7 @@ class _Perceptrons:
         self.optimizer = Soap(learning_rate=RATE, weight_decay=DECAY).build([("last", self.last), *layers])
 
     def advance(self, start: int, stop: int) -> float:
-        """Updates from one number to another; their mean loss.
+        """Run updates `start` to `stop`, and return their mean loss.
 
         Raises:
             Diverged: it is not finite.
@@ -272,7 +272,7 @@ def _neighbours(rows: Tensor, count: int, draw: torch.Generator) -> tuple[Tensor
 
 
 def _write(net: Predictor, last: Tensor, linear_bias: Tensor) -> None:
-    """The last layer into the head, whose weights of the perceptrons it is.
+    """Write the last layer to the perceptron weights of the head.
 
     Args:
         net: the student.
@@ -289,7 +289,7 @@ def _write(net: Predictor, last: Tensor, linear_bias: Tensor) -> None:
 
 
 def _judge(net: Predictor, rows: Tensor, truth: Tensor, data: Prepared) -> dict[str, Any]:
-    """The student's error on recorded rows, all of which it learns from."""
+    """Return the student's error on the recorded training rows."""
     predicted = predict_rows(net, rows[: len(truth)])
     if net.heads.band is not None:
         predicted = net.heads.band(predicted.unflatten(1, net.heads.band.width.shape)).flatten(1)

@@ -1,4 +1,4 @@
-"""Dynamic INT8 (thesis 3.3.7): 8-bit weights in linear layers, and inputs quantised anew at every tick."""
+"""Dynamic INT8 (thesis 3.3.7): 8-bit weights in linear layers, inputs quantised again at every sample."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from edp.training.compression.rounding import weight_levels
 
 @dataclass(frozen=True, eq=False)
 class Quantised:
-    """A network that computes with rounded numbers, and what it stores.
+    """Network with rounded arithmetic, and its storage size.
 
     Attributes:
         predictor: to be judged and streamed like any other; it cannot be saved as a bundle.
@@ -61,7 +61,7 @@ def dynamic_int8(predictor: Predictor) -> Quantised:
 
 
 def _round_heads(heads: Heads) -> None:
-    """Round what each layer of the heads reads: the representation, then what each non-linearity or the mix gives."""
+    """Round the inputs of each head layer: the representation, then the output of each non-linearity or the mix."""
     heads.register_forward_pre_hook(_round_input)
     units = [_rounded(unit) for unit in heads.units]
     if heads.mix is not None:

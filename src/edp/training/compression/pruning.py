@@ -26,7 +26,7 @@ GATES = {"lstm": 4, "gru": 3, "min_gru": 2}
 
 
 def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> Predictor:
-    """A network of the specs `model` made of the most important features of `predictor`; fine-tune it afterwards.
+    """Create a network with the specs `model` from the most important features of `predictor`; fine-tune it afterwards.
 
     Channels of each convolution, units of each recurrent layer and hidden features of each head are kept by what they
     contribute on `series` (`importance`). Levels whose residual path has no weights keep the same channels.
@@ -58,7 +58,7 @@ def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> P
 
 
 def _backbone(big: nn.Module, small: nn.Module, input_features: Tensor, importances: FeatureImportance) -> Tensor:
-    """Copy what is kept; the features kept of the representation."""
+    """Copy the selected weights, and return the selected features of the representation."""
     if isinstance(big, ConvolutionStack) and isinstance(small, ConvolutionStack):
         return _stack(big, small, input_features, importances)
     if not isinstance(big, RecurrentBackbone) or not isinstance(small, RecurrentBackbone):
@@ -124,7 +124,7 @@ def _shortcut(big: TemporalBlock, small: TemporalBlock, input_features: Tensor, 
 
 
 def _recurrent(big: nn.Module, small: nn.Module, input_features: Tensor, units: Tensor) -> None:
-    """Matrices with one row a unit for each gate; those of the state have a column a unit, the others one an input."""
+    """Copy matrices with one row per unit and gate; state matrices have one column per unit, others one per input."""
     full = _units(big)
     for (name, its), own in zip(big.named_parameters(), small.parameters(), strict=True):
         # Gates lie one behind the other: a unit has a row in each of them.
@@ -133,7 +133,7 @@ def _recurrent(big: nn.Module, small: nn.Module, input_features: Tensor, units: 
 
 
 def _heads(big: Heads, small: Heads, input_features: Tensor, importances: Sequence[Tensor]) -> None:
-    """Each output keeps hidden features of its own."""
+    """Copy the heads; each output selects its own hidden features."""
     for output in range(big.outputs):
         into = input_features
         for layer in range(len(big.weights)):
@@ -150,13 +150,13 @@ def _heads(big: Heads, small: Heads, input_features: Tensor, importances: Sequen
 
 
 def _best(importances: Tensor, count: int) -> Tensor:
-    """The `count` most important features, in their order."""
+    """Return the `count` most important features, in their order."""
     # Sorted and stable: the order of features stays, and ties give the same network everywhere.
     return torch.sort(torch.argsort(importances, descending=True, stable=True)[:count]).values
 
 
 def _side_by_side(parts: Sequence[tuple[Tensor, int]]) -> Tensor:
-    """Places of kept features in a concatenation of parts of the given full widths."""
+    """Return the positions of selected features in a concatenation of parts with the given full widths."""
     starts = [sum(width for _, width in parts[:index]) for index in range(len(parts))]
     return torch.cat([part_features + start for (part_features, _), start in zip(parts, starts, strict=True)])
 
@@ -174,7 +174,7 @@ def _units(layer: nn.Module) -> int:
 
 
 def check_pruning(big: ModelSpec, small: ModelSpec) -> None:
-    """Refuse what cannot be pruned, and specs that are not narrower ones of the same network.
+    """Raise an error for networks that cannot be pruned, and for specs that are not narrower versions.
 
     Raises:
         ConfigError: every reason.

@@ -1,4 +1,4 @@
-"""Quantisation-aware training: a network is trained on while it computes with rounded numbers."""
+"""Quantisation-aware training: continued training with rounded arithmetic."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from edp.training.warm_start import continue_from
 
 @dataclass(frozen=True, kw_only=True)
 class RoundingSpec:
-    """What is rounded in training; weights have 8 bits, with a step for each output.
+    """Roundings in training; weights have 8 bits, with one step size per output.
 
     Attributes:
         activation_bits: of what convolutions, recurrent and linear layers read: 16, 8 (an experiment), or 0 for none.
@@ -58,7 +58,7 @@ class QuantisationAware:
         self._rounding: NetworkRounding | None = None
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series with what the teachers say of them, where there are any."""
+        """Return the training series with the teachers' outputs, if there are teachers."""
         # Ranges are found on the run's own series: those of a teacher may hold unlabelled recordings.
         self._known = own_series
         return list(own_series) if self.strategy is None else self.strategy.series(task, own_series)
@@ -79,7 +79,7 @@ class QuantisationAware:
         return True
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """The loss of the teachers' strategy.
+        """Return the loss of the teachers' strategy.
 
         Raises:
             ConfigError: there are no teachers.

@@ -1,4 +1,4 @@
-"""Rounding of weights and of what they are multiplied with, put into a network that goes on as it was otherwise."""
+"""Rounding of weights and their inputs, inserted into an otherwise unchanged network."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Site:
         self.limit: float | None = None
 
     def __call__(self, x: Tensor) -> Tensor:
-        """The values, rounded where the range is fixed."""
+        """Return the values, rounded once the range is fixed."""
         if self.limit is not None:
             # Outside of the range the clamp has no gradient: values there should not grow further.
             inside = x.clamp(-self.limit, self.limit)
@@ -151,7 +151,7 @@ class NetworkRounding:
         self._handles, self._units, self.sites = [], {}, []
 
     def keep(self) -> None:
-        """Set the weights to what they are rounded to."""
+        """Replace the weights by their rounded values."""
         with torch.no_grad():
             for matrix in self.matrices:
                 levels, steps = weight_levels(matrix.values, matrix.axes)
@@ -176,7 +176,7 @@ class NetworkRounding:
         self._handles.append(part.register_forward_hook(leave, always_call=True))
 
     def _watch(self, part: nn.Module) -> None:
-        """Round what a part reads; of the heads, what each of their layers reads."""
+        """Round the inputs of a part; for heads, the inputs of each layer."""
         site = self._site()
         self._handles.append(
             part.register_forward_pre_hook(lambda module, arguments: (site(arguments[0]), *arguments[1:]))

@@ -23,7 +23,7 @@ PIECE = 256
 
 @dataclass(frozen=True, eq=False)
 class FeatureImportance:
-    """Squared first-order change of the loss when a feature is set to zero, the mean over pieces of the data.
+    """Squared first-order change of the loss when a feature is set to zero, averaged over segments of the data.
 
     Attributes:
         sites: by module, ``(channel,)`` or ``(unit,)``: convolutions, temporal blocks and recurrent layers.
@@ -80,7 +80,7 @@ def _pieces(predictor: Predictor, series: Sequence[Series], most: int) -> list[t
 
 
 def _loss(predictor: Predictor, part: Series, start: int, stop: int) -> Tensor:
-    """Mean squared standardised error of a piece, after a lead of a window from reset."""
+    """Return the mean squared standardised error of a segment, after a window of lead from reset."""
     # A window of lead, so that the state is that of a stream and not of a reset.
     lead = max(0, start - predictor.spec.window)
     like = next(predictor.parameters())
@@ -98,7 +98,7 @@ def _loss(predictor: Predictor, part: Series, start: int, stop: int) -> Tensor:
 
 @contextmanager
 def _recorded(predictor: Predictor) -> Iterator[dict[nn.Module, Tensor]]:
-    """The last output of each convolution, temporal block and recurrent layer, with its gradient."""
+    """Record the last output of each convolution, temporal block and recurrent layer, with its gradient."""
     outputs: dict[nn.Module, Tensor] = {}
 
     def keep(module: nn.Module, _: object, result: tuple[Tensor, object]) -> None:

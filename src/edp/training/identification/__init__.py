@@ -1,1 +1,1 @@
-"""Parameters of the simulator's machine from those of a grey box: coordinates, bodies, intervals, machine file."""
+"""Identification of the simulator's machine from grey-box parameters: coordinates, bodies, intervals, machine file."""

@@ -67,7 +67,7 @@ class Poses:
 
 
 def base_parameters(bodies: Bodies) -> Doubles:
-    """The nine numbers of bodies, in the order of `NAMES`."""
+    """Return the nine base parameters of bodies, in the order of `NAMES`."""
     m, x, y, i = (np.array(values) for values in (bodies.mass, bodies.com_x, bodies.com_y, bodies.inertia))
     behind = np.array([m[1] + m[2], m[2], 0.0])
     length = np.array(bodies.length)
@@ -76,7 +76,7 @@ def base_parameters(bodies: Bodies) -> Doubles:
 
 
 def load_by_base(poses: Poses, lengths: Sequence[float], gravity: float) -> tuple[Doubles, Doubles]:
-    """Gravity torques ``(pose, 3, 9)`` and joint inertia ``(pose, 3, 3, 9)`` by the nine numbers."""
+    """Return gravity torques ``(pose, 3, 9)`` and joint inertia ``(pose, 3, 3, 9)`` per base parameter."""
     count = len(poses.angles)
     absolute, (_, second, third) = np.cumsum(poses.angles, axis=1), poses.angles.T
     torque, inertia = np.zeros((count, 3, 9)), np.zeros((count, 3, 3, 9))
@@ -126,7 +126,7 @@ def grey_load(
 
 
 def solved_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine) -> Doubles:
-    """The nine numbers that agree best with gravity torques and joint inertia over the poses.
+    """Return the nine base parameters that best match gravity torques and joint inertia over the poses.
 
     Args:
         torque: ``(pose, 3)``.
@@ -150,13 +150,13 @@ def solved_base(torque: Doubles, inertia: Doubles, poses: Poses, guess: Machine)
 
 
 def linked_bodies(load: Doubles, guess: Machine) -> Bodies:
-    """Bodies of a grey box with a known linkage, from the numbers of its load in its units; lengths are the guess's."""
+    """Return the bodies of a grey box with a known linkage from its load parameters; lengths are the guess's."""
     mass, x, y, inertia = load.reshape(-1, BODY_VALUES).T * np.array([[GIGA], [1.0], [1.0], [GIGA]])
     return replace(guess.bodies, mass=_triple(mass), com_x=_triple(x), com_y=_triple(y), inertia=_triple(inertia))
 
 
 def realised(base: Doubles, guess: Machine) -> Bodies:
-    """Bodies with these nine numbers, in proportions as near to the guess's as may be.
+    """Return bodies with these nine base parameters, in proportions as near to the guess's as possible.
 
     Raises:
         ConfigError: no masses give every body a positive inertia about its centre.

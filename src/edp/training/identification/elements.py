@@ -28,7 +28,7 @@ BEYOND = 0.03
 
 
 def excavator_elements(channels: TwinChannels, machine: Machine) -> Elements:
-    """Cylinders with the machine's bores, a spool of each, a second one where its commands are logged, two pumps.
+    """Return cylinders with the machine's bores, one spool each, a second one if its commands are logged, two pumps.
 
     Raises:
         DataError: logs that do not show a front of three cylinders with strokes and both pressures of each.
@@ -87,7 +87,7 @@ def _check_axis(axis: Axis, name: str) -> None:
 
 
 def full_commands(channels: TwinChannels, elements: Elements, machine: Machine) -> list[float]:
-    """What a full command of each valve is, in units of its channels.
+    """Return the full-scale command of each valve in units of its channels.
 
     Raises:
         DataError: commands that are neither pilot pressures nor ratios.
@@ -105,7 +105,7 @@ def full_commands(channels: TwinChannels, elements: Elements, machine: Machine) 
 
 
 def parts_of(twin: GreyTwin, elements: Elements, machine: Machine, celsius: float) -> GreyParts:
-    """Which element of a grey box is which part of a machine.
+    """Return the mapping from grey-box elements to machine parts.
 
     Raises:
         ConfigError: elements that are no excavator front, or pumps that are paired otherwise.
@@ -148,7 +148,7 @@ def parts_of(twin: GreyTwin, elements: Elements, machine: Machine, celsius: floa
 
 
 def check_strokes(channels: Sequence[Channel], low: np.ndarray, high: np.ndarray, machine: Machine) -> None:
-    """Refuse a machine whose cylinders are not those of the logs.
+    """Raise an error if the machine's cylinders do not match the logs.
 
     Raises:
         ConfigError: a stroke of the logs lies beyond the machine's; which, and by how much.
@@ -166,7 +166,7 @@ def check_strokes(channels: Sequence[Channel], low: np.ndarray, high: np.ndarray
 
 
 def check_same_linkage(twin: GreyTwin, base: Machine, machine: str) -> None:
-    """Refuse a grey box whose known linkage is not that of the guess, whose lengths the bodies would get.
+    """Raise an error if the known linkage of a grey box differs from the guess, whose lengths the bodies would get.
 
     Raises:
         ConfigError: pins or lengths that differ.

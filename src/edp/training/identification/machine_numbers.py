@@ -1,4 +1,4 @@
-"""The numbers of a machine file that logs can tell: where each lies, its unit, and how far from a guess it may be."""
+"""Machine file parameters that logs can identify: position, unit, and prior standard deviation from a guess."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class MachineNumber:
 
     @property
     def label(self) -> str:
-        """As messages and comments call it."""
+        """Name in messages and comments."""
         return self.path + ("" if self.cylinder is None else f"[{CYLINDERS[self.cylinder]}]")
 
     def of(self, machine: Machine) -> float:
-        """Its value; of a rating the flow, of static friction what it exceeds the Coulomb friction by."""
+        """Return its value: the flow of a rating, the excess over Coulomb friction for static friction."""
         value = getattr(getattr(machine, self.section), self.key)
         value = value if self.cylinder is None else value[self.cylinder]
         value = value[0] if isinstance(value, tuple) else value
@@ -131,14 +131,14 @@ def guesses(machine: Machine) -> Doubles:
 
 
 def _regeneration(machine: Machine, number: MachineNumber) -> float:
-    """Flow of a small regeneration, L/min at the pressure difference that the file rates it at."""
+    """Return the flow of a small regeneration, L/min at the rated pressure difference of the file."""
     out = number.key.replace("regeneration", "meter_out")
     (flow, bar), (_, own_bar) = (getattr(machine.valves, key)[number.cylinder] for key in (out, number.key))
     return float(LEAST_REGENERATION * flow * np.sqrt(own_bar / bar))
 
 
 def with_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
-    """A machine with other numbers.
+    """Return a machine with other parameters.
 
     Args:
         machine: the one whose other numbers stay.
@@ -160,5 +160,5 @@ def with_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
 
 
 def _rated(old: Any, value: float) -> Any:
-    """A number, or a rating of which the pressure stays."""
+    """Return a number, or a rating with unchanged pressure."""
     return (value, old[1]) if isinstance(old, tuple) else value

@@ -1,4 +1,4 @@
-"""A machine as the text of its file, with a comment behind each number that says where it comes from."""
+"""Machine as the text of its file, with a comment after each parameter that states its origin."""
 
 from __future__ import annotations
 

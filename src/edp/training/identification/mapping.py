@@ -1,4 +1,4 @@
-"""From a machine of the simulator to the numbers of its grey box, equation by equation.
+"""Mapping from a simulator machine to grey-box parameters, equation by equation.
 
 The grey box (`edp.networks.twin.grey`) has the simulator's equations but for its linkage, so most numbers are the same
 in other units. What differs:
@@ -40,7 +40,7 @@ DEMAND_START, DEMAND_SPAN = 0.1, 0.75
 
 @dataclass(frozen=True, eq=False)
 class GreyParts:
-    """Which element of a grey box is which part of a machine.
+    """Mapping from grey-box elements to machine parts.
 
     Attributes:
         table: of its numbers.
@@ -126,7 +126,7 @@ def _put_valve(
     axis: Doubles,
     clock: tuple[float, float],
 ) -> None:
-    """Numbers of one spool; `which`: machine, cylinder, whether it is the second spool, and stretches of its curves.
+    """Set the parameters of one spool; `which`: machine, cylinder, whether it is the second spool, curve segments.
 
     `clock` is reach and step.
     """
@@ -162,7 +162,7 @@ def _put_valve(
 
 @lru_cache(maxsize=256)  # differences by other numbers ask for the same curve thousands of times
 def _curve(band: float, reach: float, stretches: int) -> Doubles:
-    """Rises between the knots of the grey box's opening curve, of a spool with this dead band that reaches so far."""
+    """Return the increments of the grey box's opening curve for a spool with this dead band and reach."""
     # Where the simulator's spool is: the curve of the grey box counts from its own full command.
     spool = band + (reach - band) * np.linspace(0.0, 1.0, FINE)
     r = np.clip((spool - band) / (1.0 - band), 0.0, 1.0)

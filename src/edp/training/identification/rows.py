@@ -1,4 +1,4 @@
-"""What an identification says of each number: value, interval, and whether the logs told it."""
+"""Results of an identification per parameter: value, interval, and whether the logs identify it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class IdentifiedNumber:
 
 
 def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray[np.bool_]) -> list[IdentifiedNumber]:
-    """A row for each number of `MACHINE_NUMBERS`.
+    """Return one row per entry of `MACHINE_NUMBERS`.
 
     Args:
         base: the guess.
@@ -86,7 +86,7 @@ def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray
 def body_rows(
     tie: MachineTie, load: Doubles, covariance: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
 ) -> tuple[Doubles, list[IdentifiedNumber]]:
-    """The nine numbers of the bodies, and a row of each.
+    """Return the nine base parameters of the bodies with one row each.
 
     Args:
         tie: the guess, and which element is which.
@@ -123,7 +123,7 @@ def body_rows(
 
 
 def line_comments(rows: Sequence[IdentifiedNumber]) -> dict[tuple[str, str], str]:
-    """What stands behind each line of the machine's file."""
+    """Return the comment after each line of the machine file."""
     comments: dict[tuple[str, str], list[str]] = {}
     for number, row in zip(MACHINE_NUMBERS, rows, strict=False):
         name = "" if number.cylinder is None else f"{CYLINDERS[number.cylinder]} "

@@ -1,4 +1,4 @@
-"""What the numbers of a fit are worth: how far parts of the logs, and free runs of other lengths, pull them apart.
+"""Uncertainty of fitted parameters from the differences between parts of the logs and free-run lengths.
 
 The information of a fit takes its errors for noise that is new at each tick. They are not: neighbouring ticks err
 alike, and so does a structure that is not the machine's, in every run of a length. So at the optimum each block of the
@@ -36,7 +36,7 @@ TICKS = 3000
 
 @one_blas_thread()
 def covariance(twin: GreyTwin, tie: Tie, theta: Doubles, train: Sequence[Series], seed: int) -> Doubles:
-    """Covariance of the coordinates of a fit; that of the guess where the logs are too short to be divided.
+    """Return the covariance of the fitted coordinates; the prior's if the logs are too short to be divided.
 
     Args:
         twin: the grey box at the optimum.
@@ -63,7 +63,7 @@ def covariance(twin: GreyTwin, tie: Tie, theta: Doubles, train: Sequence[Series]
 
 
 def spread(theta: Doubles, matrices: Doubles, gradients: Doubles) -> Doubles:
-    """The sum of four, see above.
+    """Return the sum of the four parts described above.
 
     Args:
         theta: the optimum ``(coordinate,)``.
@@ -90,8 +90,9 @@ def spread(theta: Doubles, matrices: Doubles, gradients: Doubles) -> Doubles:
 
 
 def divided(train: Sequence[Series], least: int) -> list[list[Series]]:
-    """Stretches as `LEAST_BLOCKS` to `MOST_BLOCKS` groups, each with one of at least `least` ticks; fewer where the
-    logs are shorter.
+    """Divide segments into `LEAST_BLOCKS` to `MOST_BLOCKS` groups with at least `least` samples.
+
+    Short logs give fewer.
     """
     usable = [part for part in train if part.samples >= least]
     pieces = [piece for part in usable for piece in _cut(part, -(-LEAST_BLOCKS // len(usable)), least)]
@@ -100,7 +101,7 @@ def divided(train: Sequence[Series], least: int) -> list[list[Series]]:
 
 
 def _cut(part: Series, pieces: int, least: int) -> list[Series]:
-    """A stretch in so many pieces, or as many as have `least` ticks each."""
+    """Divide a segment into `pieces` parts, or as many as have `least` samples each."""
     count = max(1, min(pieces, part.samples // least))
     edges = np.linspace(0, part.samples, count + 1).astype(int)
     return [

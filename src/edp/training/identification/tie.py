@@ -1,4 +1,4 @@
-"""Machine and grey box tied together: a fit of the numbers of a machine file through those of its grey box.
+"""Parametrisation of a grey box by a machine: the fit varies the parameters of a machine file.
 
 The first machine is the one whose grey box is nearest to a fitted one, in the metric of what the data told of that:
 
@@ -36,7 +36,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
 
 @dataclass(frozen=True, eq=False)
 class MachineTie:
-    """Coordinates of a fit: numbers of a machine, then those of the load: polynomials, or bodies of a known linkage.
+    """Coordinates of a fit: machine parameters, then load parameters (polynomials, or bodies of a known linkage).
 
     Attributes:
         base: the machine that is guessed.
@@ -65,7 +65,7 @@ class MachineTie:
         return np.where(positive, grown, self.load + moved)
 
     def load_slope(self, load: Doubles) -> Doubles:
-        """Derivatives of the numbers of the load by their own coordinates: deviations that were plausible before."""
+        """Return the derivatives of the load parameters by their coordinates (prior standard deviations)."""
         return np.where(self._load_positive, load * self._load_width, self._load_width)
 
     @property
@@ -78,11 +78,11 @@ class MachineTie:
 
     @cached_property
     def _base_values(self) -> tuple[Doubles, Doubles]:
-        """Guesses of the base, and what its file states; differences ask for them thousands of times."""
+        """Return the guesses and the stated values of the base machine, cached, since differences need them often."""
         return guesses(self.base), np.array([number.of(self.base) for number in MACHINE_NUMBERS])
 
     def machine(self, theta: Doubles) -> Machine:
-        """The machine of these coordinates; numbers that are not free are those of the guess, zeros included."""
+        """Return the machine for these coordinates; fixed parameters equal the guess, zeros included."""
         return with_values(self.base, self._values(theta))
 
     def _values(self, theta: Doubles) -> Doubles:
@@ -100,7 +100,7 @@ class MachineTie:
         return np.where(self.parts.table.positive, np.maximum(numbers, TINY * self.parts.table.nominal), numbers)
 
     def slopes(self, theta: Doubles) -> Doubles:
-        """Derivatives of the numbers by the coordinates ``(number, coordinate)``."""
+        """Return the derivatives of the parameters by the coordinates ``(number, coordinate)``."""
         count = len(MACHINE_NUMBERS)
         result = np.zeros((len(self.parts.table.numbers), len(theta)))
         for k in np.flatnonzero(self.free):
@@ -126,13 +126,13 @@ WIDTHS: Doubles = np.array([number.width for number in MACHINE_NUMBERS])
 
 
 def coordinates(table: NumberTable, numbers: Doubles, origin: Doubles) -> Doubles:
-    """Coordinates of numbers: plausible deviations from `origin`, of the logarithm where they are positive."""
+    """Return coordinates of parameters: prior standard deviations from `origin`, logarithmic for positive ones."""
     safe = np.where(table.positive, numbers / np.where(table.positive, origin, 1.0), 1.0)
     return np.asarray(np.where(table.positive, np.log(safe), numbers - origin) / table.width)
 
 
 def nearest(tie: MachineTie, numbers: Doubles, information: Doubles, prior: float = 1.0) -> Doubles:
-    """Coordinates of the machine whose grey box is nearest to these numbers, by damped Gauss-Newton steps.
+    """Return the coordinates of the machine whose grey box is nearest to these parameters (damped Gauss-Newton).
 
     Args:
         tie: the coordinates.
@@ -176,7 +176,7 @@ def deviations(information: Doubles) -> Doubles:
 
 
 def kept_back(theta: Doubles, information: Doubles, back: NDArray[np.bool_]) -> Doubles:
-    """Where the other coordinates go once some are set back to the guess: the conditional optimum of the quadratic.
+    """Return the optimum of the quadratic for the other coordinates after some are reset to the guess.
 
     Args:
         theta: optimum of all.

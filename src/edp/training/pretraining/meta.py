@@ -1,4 +1,4 @@
-"""What the meta-learners share: episodes of machines, and a judgement of what comes out after adaptation."""
+"""Common part of the meta-learners: machine episodes, and evaluation after adaptation."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class Meta(ABC):
 
     @property
     def passes(self) -> int:
-        """Through the network that an update goes back through."""
+        """Number of passes through the network in the backward pass of an update."""
         # The gradient passes through every inner step and the query, so memory grows with their number.
         return 1 + self.spec.inner_steps
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series as they are."""
+        """Return the training series unchanged."""
         return list(own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
@@ -60,7 +60,7 @@ class Meta(ABC):
         return True
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """Not asked: episodes have a cost of their own."""
+        """Return the loss; not called, since episodes have their own cost."""
         return objective.evaluate(
             batch_context.answer, batch_context.future, batch_context.features, batch_context.valid
         )
@@ -84,15 +84,15 @@ class Meta(ABC):
 
     @abstractmethod
     def cost(self, net: Predictor, objective: Objective, support: Pieces, query: Pieces) -> Tensor:
-        """What one machine costs, a scalar with the gradient to go down."""
+        """Return the cost of one machine, a scalar with the gradient to descend."""
 
     def start_of(self, net: Predictor) -> Weights:
         # Frozen parameters do not adapt: their gradient would be missing.
-        """The weights that adapt."""
+        """Return the weights that adapt."""
         return {name: p for name, p in net.named_parameters() if name in self.adapted and p.requires_grad}
 
     def judge(self, net: Predictor, objective: Objective, data: Prepared) -> tuple[float, float, float]:
-        """Errors after adaptation to each validation machine: the first half of its series adapts, the rest counts.
+        """Return the errors after adaptation to each validation machine: one half adapts, the other is evaluated.
 
         Raises:
             DataError: a series is too short to be halved.

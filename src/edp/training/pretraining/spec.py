@@ -1,4 +1,4 @@
-"""What is set of a pretraining over many machines."""
+"""Settings of a pretraining over many machines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MOST_STEPS = 1_000
 
 @dataclass(frozen=True, kw_only=True)
 class MetaSpec:
-    """The inner loop of the meta-learners; what trains over all machines jointly has none.
+    """Inner loop of the meta-learners; joint training over all machines has none.
 
     Attributes:
         inner_rate: learning rate of a step of adaptation.

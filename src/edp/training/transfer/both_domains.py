@@ -30,7 +30,7 @@ STEEPNESS = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class BothSpec:
-    """How much the source counts beside the target.
+    """Weight of the source domain relative to the target.
 
     Attributes:
         weight: of the source's loss; that of the target's is one.
@@ -50,7 +50,7 @@ class BothSpec:
 
 
 class BothDomains:
-    """Training that continues from the source's network with recordings of both domains, in equal shares of ticks.
+    """Continued training of the source's network with recordings of both domains, in equal fractions of samples.
 
     Args:
         start: the source's network.
@@ -82,7 +82,7 @@ class BothDomains:
         return [*own, *rehearsed]
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
-        """Take over weights and scaling; put the classifier beside the network, where there is one."""
+        """Copy weights and scaling; add the classifier, if there is one."""
         self.base.begin(net, spec)
         if self.spec.reversal:
             x = torch.zeros(1, 1, len(net.task.inputs))
@@ -96,7 +96,7 @@ class BothDomains:
         return True
 
     def loss(self, objective: Objective, batch: BatchContext) -> Tensor:
-        """The loss of the target, that of the source, and that of the classifier with its gradient reversed."""
+        """Return the sum of the losses of target, source, and classifier with reversed gradient."""
         spec, domain = self.spec, batch.strategy_columns[..., 0]
         # The domain is a number among the targets; half separates 0 from 1.
         here, there = batch.valid & (domain < 0.5), batch.valid & (domain > 0.5)
@@ -144,7 +144,7 @@ class BothDomains:
 
 
 class Classifier(nn.Module):
-    """Which domain a tick is from, by the backbone's representation: ``(..., width)`` to logits ``(...)``."""
+    """Domain classifier on the backbone's representation: ``(..., width)`` to logits ``(...)``."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -174,6 +174,6 @@ class _Reverse(torch.autograd.Function):
 
 
 def reverse(values: Tensor, factor: float) -> Tensor:
-    """The values themselves, whose gradient is multiplied with ``-factor``."""
+    """Return the values unchanged; their gradient is multiplied by ``-factor``."""
     result: Tensor = _Reverse.apply(values, factor)  # type: ignore[no-untyped-call]
     return result

@@ -46,11 +46,11 @@ class Centred:
         return self.base.series(task, own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
-        """As the base strategy begins."""
+        """Begin like the base strategy."""
         return self.base.begin(net, spec)
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """That of the base strategy."""
+        """Return the loss of the base strategy."""
         return self.base.loss(objective, batch_context)
 
     def end(self, net: Predictor) -> None:
@@ -61,7 +61,7 @@ class Centred:
 
 
 def centre(net: Predictor, series: Sequence[Series]) -> None:
-    """Shift the last biases of the heads until the mean error over `series` is nothing.
+    """Shift the last biases of the heads so that the mean error over `series` is zero.
 
     What would raise the mean absolute error of a horizon and target by more than a hundredth is left as it was, and
     everything is where no series is longer than a window.
@@ -94,7 +94,7 @@ def centre(net: Predictor, series: Sequence[Series]) -> None:
 
 
 def _shift(net: Predictor, change: NDArray[np.float64]) -> None:
-    """Add a change in SI units, ``(horizon, target)``, to what the heads say."""
+    """Add a change in SI units, ``(horizon, target)``, to the head outputs."""
     bias = net.heads.biases[-1]
     features = torch.zeros(1, 1, len(net.task.features.features), device=bias.device)
     future = torch.as_tensor(change, dtype=torch.float32, device=bias.device)[None, None]
@@ -105,7 +105,7 @@ def _shift(net: Predictor, change: NDArray[np.float64]) -> None:
 
 
 def _errors(net: Predictor, series: Sequence[Series]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean error and mean absolute error, SI units, ``(horizon, target)``; NaN where nothing can be judged."""
+    """Return mean error and mean absolute error, SI units, ``(horizon, target)``; NaN if nothing can be evaluated."""
     horizons, targets = len(net.task.horizons), len(net.task.targets)
     total, size, ticks = np.zeros((horizons, targets)), np.zeros((horizons, targets)), np.zeros((horizons, 1))
     for index, error in stream_errors(net, series):

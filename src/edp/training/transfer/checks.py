@@ -1,4 +1,4 @@
-"""What must hold of the logs of a target before a network of another machine is trained on them."""
+"""Requirements on the logs of a target before a network of another machine is trained on them."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ Values = Sequence[NDArray[np.float64]]
 
 
 def _pearson(first: Values, second: Values, lag: int) -> float:
-    """Of ``first[t]`` and ``second[t + lag]``; 0 where one does not move."""
+    """Return the correlation of ``first[t]`` and ``second[t + lag]``; 0 if one is constant."""
     a = np.concatenate([part[: max(0, len(part) - lag)] for part in first])
     b = np.concatenate([part[lag:] for part in second])
     a, b = a - a.mean(), b - b.mean()

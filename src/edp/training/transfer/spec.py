@@ -1,4 +1,4 @@
-"""What is set of a fine-tuning; the two phases have the values of the thesis (Table 3.1 and 3.4.5)."""
+"""Settings of a fine-tuning; the two phases have the values of the thesis (Table 3.1 and 3.4.5)."""
 
 from __future__ import annotations
 

@@ -35,11 +35,11 @@ class LowRank:
         self._frozen: list[nn.Parameter] = []
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series as they are."""
+        """Return the training series unchanged."""
         return list(own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
-        """Take over weights and scaling, hold them, and put the changes in.
+        """Copy weights and scaling, freeze them, and insert the low-rank changes.
 
         Raises:
             ConfigError: the start has other specs.
@@ -58,7 +58,7 @@ class LowRank:
         return True
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """Not asked: nothing is taught but the truth."""
+        """Return the loss of the base strategy; there is no teacher."""
         return self.base.loss(objective, batch_context)
 
     def end(self, net: Predictor) -> None:

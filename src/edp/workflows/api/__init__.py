@@ -1,1 +1,1 @@
-"""The front door: what ``import edp`` offers. `edp` imports each name of these modules when it is first asked for."""
+"""Public Python API: the names that ``import edp`` offers. Each module is imported on first use of one of its names."""

@@ -1,4 +1,4 @@
-"""What a user gave as arrays, names, units and recordings, checked: one error each."""
+"""Checks of user arguments: arrays, names, units and recordings; each problem raises one error."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def matrix_of(values: Any, number: int) -> NDArray[Any]:
 
 
 def check_width(tables: Sequence[NDArray[Any]], names: Sequence[str]) -> Sequence[NDArray[Any]]:
-    """The arrays, all of which have the same channels.
+    """Return the arrays after checking that all have the same channels.
 
     Raises:
         DataError: one has another number of channels.
@@ -85,7 +85,7 @@ def check_width(tables: Sequence[NDArray[Any]], names: Sequence[str]) -> Sequenc
 
 
 def names_of(names: Sequence[str] | None, usual: list[str], what: str, counted: str) -> list[str]:
-    """Names that a user gave, or the usual ones; `what` is the argument and `counted` what they name.
+    """Return the user's names after a check, or the default names; `what` is the argument and `counted` what it names.
 
     Raises:
         DataError: another number of them, one that is empty or stands twice, or no texts.

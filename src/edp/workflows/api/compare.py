@@ -1,4 +1,4 @@
-"""Several runs beside each other, from Python."""
+"""Comparison of several runs from Python."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edp.workflows.api.frames import OneFrame
 
 
 class ComparedRuns(OneFrame):
-    """Judged runs on the test recordings that they share; the first is what the others are measured against.
+    """Evaluated runs on their common test recordings; the first run is the reference for the others.
 
     A frame has a row for each run and error.
 
@@ -26,12 +26,12 @@ class ComparedRuns(OneFrame):
 
     @property
     def recordings(self) -> tuple[str, ...]:
-        """Test recordings that all runs were judged on."""
+        """Test recordings on which all runs were evaluated."""
         return self._comparison.recordings
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader must know: recordings left out, other data, settings that differ."""
+        """Remarks for the reader: omitted recordings, different data, different settings."""
         return self._comparison.remarks
 
     def report(self, target: str | Path, title: str = "") -> Path:
@@ -60,16 +60,16 @@ class ComparedRuns(OneFrame):
         return [error_sheet(self._comparison, measure).table() for measure in self._comparison.measures]
 
     def __repr__(self) -> str:
-        """The headline and the tables."""
+        """Return the headline and the tables as text."""
         return "\n\n".join([self._comparison.headline(), *self.remarks, *map(text_of, self._tables())])
 
     def _repr_html_(self) -> str:
-        """The same for a notebook."""
+        """Return the headline and the tables as HTML for a notebook."""
         return html_of(self._tables(), self._comparison.headline())
 
 
 def compare(*runs: str | Path) -> ComparedRuns:
-    """Compare judged runs on the test recordings that they share, with paired intervals.
+    """Compare evaluated runs on their common test recordings, with paired confidence intervals.
 
     Args:
         runs: 2 to 12 run folders; the others are measured against the first.

@@ -1,4 +1,4 @@
-"""Columns of pandas and Polars frames, in and out; neither library is imported before it is asked for."""
+"""Conversion from and to pandas and Polars data frames; both libraries are imported on first use only."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def frame_library(name: str) -> ModuleType:
 
 
 def frame_of(library: str, columns: Mapping[str, NDArray[Any] | list[Any]]) -> Any:
-    """A frame of ``pandas`` or ``polars`` with these columns.
+    """Create a ``pandas`` or ``polars`` data frame from columns.
 
     Raises:
         ConfigError: the library is not installed.
@@ -36,7 +36,7 @@ def frame_of(library: str, columns: Mapping[str, NDArray[Any] | list[Any]]) -> A
 
 
 class OneFrame(ABC):
-    """What is one table of columns: a frame of either library."""
+    """Base class of results that are one table, convertible to a data frame."""
 
     @abstractmethod
     def _columns(self) -> Mapping[str, NDArray[Any] | list[Any]]:
@@ -51,7 +51,7 @@ class OneFrame(ABC):
         return frame_of("pandas", self._columns())
 
     def to_polars(self) -> Any:
-        """The same as a Polars frame.
+        """Return the table as a Polars data frame.
 
         Raises:
             ConfigError: Polars is not installed.

@@ -20,7 +20,7 @@ from edp.workflows.api.frames import OneFrame
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Predictions(OneFrame):
-    """What was predicted at every tick of some recordings, in SI units.
+    """Predictions for every sample of the given recordings, in SI units.
 
     A frame has the columns ``recording``, ``time_s`` of the tick, and one for each target and horizon: it is called
     ``TARGET+HORIZON``; bounds of an interval ``TARGET+HORIZON lower 0.9`` and ``... upper 0.9``.
@@ -45,15 +45,18 @@ class Predictions(OneFrame):
     bounds: tuple[FloatArray, ...] | None = None
 
     def __len__(self) -> int:
-        """Number of recordings."""
+        """Return the number of recordings."""
         return len(self.recordings)
 
     def to_numpy(self) -> list[FloatArray]:
-        """For each recording float32 ``(time, horizon, target)``, SI units; row t was said at t."""
+        """Return one float32 array ``(time, horizon, target)`` per recording, SI units.
+
+        Row t holds the predictions made at sample t.
+        """
         return list(self.values)
 
     def plot(self, recording: int | str = 0, horizon: int | None = None) -> Any:
-        """A Plotly figure: predictions, moved to the time that they speak of, over what was measured.
+        """Plot predictions, shifted to the time that they predict, together with the measured values (Plotly).
 
         Args:
             recording: number or name.
@@ -124,9 +127,9 @@ class Predictions(OneFrame):
         return TextTable(caption, (("Recording", ""), ("Samples", ""), ("Duration", "s")), rows)
 
     def __repr__(self) -> str:
-        """What was predicted of which recordings."""
+        """Return a summary table as text."""
         return text_of(self._table())
 
     def _repr_html_(self) -> str:
-        """The same for a notebook."""
+        """Return a summary table as HTML for a notebook."""
         return html_of([self._table()])

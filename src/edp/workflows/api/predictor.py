@@ -1,4 +1,4 @@
-"""A trained predictor on disk, as a user handles it: judge, predict, draw, export, stream."""
+"""Trained predictor on disk: evaluate, predict, plot, export and stream it."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class TrainedPredictor:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Channels that are fed at each tick, in order, in SI units."""
+        """Input channels of each sample, in order, SI units."""
         return self._task.inputs
 
     @property
@@ -76,7 +76,7 @@ class TrainedPredictor:
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of what it reads."""
+        """Sampling rate of the inputs in Hz."""
         return self._task.rate_hz
 
     @property
@@ -102,7 +102,9 @@ class TrainedPredictor:
         test: Recordings | Recording | Sequence[Recording] | None = None,
         baselines: Sequence[str] | None = None,
     ) -> JudgedScores:
-        """Score it on recordings that it was not trained on, beside baselines fitted on its training data.
+        """Evaluate the predictor on recordings outside its training data.
+
+        Baselines fitted to its training data are evaluated, too.
 
         Args:
             test: recordings, all of which are judged; without them those that the training set apart.
@@ -142,7 +144,7 @@ class TrainedPredictor:
         )
 
     def plot(self, test: Recordings | Recording | Sequence[Recording], horizon: int | None = None) -> Any:
-        """A Plotly figure: what is predicted of the first recording over what was measured.
+        """Plot predictions for the first recording together with its measured values (Plotly).
 
         Args:
             test: recordings with the inputs.
@@ -173,7 +175,7 @@ class TrainedPredictor:
         return deployment.export_bundle(self.folder, target, folder, name, options)
 
     def stream(self) -> Stream:
-        """It as a stream: ``step(row)`` takes one tick of `inputs` and gives prediction, intervals and a status.
+        """Return a stream: ``step(row)`` takes one sample of `inputs` and returns prediction, intervals and status.
 
         What is learned on board (`edp adapt`) is part of it.
         """
@@ -183,7 +185,7 @@ class TrainedPredictor:
         return Stream(self._bundle.predictor)
 
     def _judged_alone(self, recordings: Recordings | None, baselines: Sequence[str] | None) -> JudgedScores:
-        """Scores of a bundle, of which nothing but itself is known."""
+        """Evaluate a bundle that has no run folder."""
         if recordings is None:
             raise ConfigError(f"'{self.folder}' is a bundle without its run folder; give the recordings to judge it on")
         if baselines:
@@ -219,16 +221,16 @@ class TrainedPredictor:
         return TextTable("Trained predictor", (("", ""), ("", "")), rows)
 
     def __repr__(self) -> str:
-        """What it reads and predicts."""
+        """Return a summary table as text."""
         return text_of(self._table())
 
     def _repr_html_(self) -> str:
-        """The same for a notebook."""
+        """Return a summary table as HTML for a notebook."""
         return html_of([self._table()])
 
 
 def load(path: str | Path) -> TrainedPredictor:
-    """A predictor from a run folder (of `train` or `edp train`) or from a bundle.
+    """Load a predictor from a run folder (written by `train` or `edp train`) or from a bundle.
 
     Raises:
         BundleError: neither of them, or a damaged one.
@@ -238,7 +240,7 @@ def load(path: str | Path) -> TrainedPredictor:
 
 def _memory(recordings: Recordings) -> MemorySource:
     # Named by content: the same recordings judged twice share a folder, others never overwrite it.
-    """Recordings of this process; their scores lie in a folder of the run that is named by their content."""
+    """Return a data source of recordings in memory. Its folder name contains their digest."""
     content = "".join(f"{recording.name}\n{recording.digest}\n" for recording in recordings)
     digest = hashlib.blake2b(content.encode("utf-8", "surrogateescape"), digest_size=6).hexdigest()
     return MemorySource(Path(f"recordings-{digest}"), recordings=tuple(recordings))

@@ -60,7 +60,7 @@ class Recordings(Sequence[Recording]):
         recording_names: Sequence[str] | None = None,
         repair: Mapping[str, str] | None = None,
     ) -> Recordings:
-        """Recordings from arrays ``(time, channel)``, one array a recording; one array alone is one recording.
+        """Create recordings from arrays ``(time, channel)``, one array per recording. A single array is one recording.
 
         Args:
             arrays: numbers, each of shape ``(time, channel)``.
@@ -95,7 +95,7 @@ class Recordings(Sequence[Recording]):
         recording_names: Sequence[str] | None = None,
         repair: Mapping[str, str] | None = None,
     ) -> Recordings:
-        """Recordings from pandas or Polars frames, one frame a recording, one column a channel.
+        """Create recordings from pandas or Polars data frames: one frame per recording, one column per channel.
 
         Args:
             frames: a frame, or a sequence of them.
@@ -136,7 +136,7 @@ class Recordings(Sequence[Recording]):
 
     @property
     def source(self) -> DataSource | None:
-        """Where the same recordings can be read again; None for those of arrays, frames and slices."""
+        """Data source from which the recordings can be read again; None for arrays, frames and slices."""
         return self._source
 
     @property
@@ -160,11 +160,11 @@ class Recordings(Sequence[Recording]):
         return tuple(recording.name for recording in self._recordings)
 
     def __len__(self) -> int:
-        """Number of recordings."""
+        """Return the number of recordings."""
         return len(self._recordings)
 
     def __iter__(self) -> Iterator[Recording]:
-        """Recording by recording."""
+        """Iterate over the recordings."""
         return iter(self._recordings)
 
     @overload
@@ -172,7 +172,7 @@ class Recordings(Sequence[Recording]):
     @overload
     def __getitem__(self, which: slice) -> Recordings: ...
     def __getitem__(self, which: int | str | slice) -> Recording | Recordings:
-        """A recording by number or name, or some of them by a slice.
+        """Return a recording by number or name, or several recordings by a slice.
 
         Raises:
             DataError: there is no recording of this name, or the slice is empty.
@@ -191,7 +191,7 @@ class Recordings(Sequence[Recording]):
         return [recording.values for recording in self._recordings]
 
     def to_pandas(self) -> list[Any]:
-        """A pandas frame a recording: ``time_s``, then a column a channel, SI units.
+        """Return one pandas data frame per recording: ``time_s`` and one column per channel, SI units.
 
         Raises:
             ConfigError: pandas is not installed.
@@ -199,7 +199,7 @@ class Recordings(Sequence[Recording]):
         return [frame_of("pandas", _columns(recording)) for recording in self._recordings]
 
     def to_polars(self) -> list[Any]:
-        """A Polars frame a recording: ``time_s``, then a column a channel, SI units.
+        """Return one Polars data frame per recording: ``time_s`` and one column per channel, SI units.
 
         Raises:
             ConfigError: Polars is not installed.
@@ -207,7 +207,7 @@ class Recordings(Sequence[Recording]):
         return [frame_of("polars", _columns(recording)) for recording in self._recordings]
 
     def split(self, test: float = 0.2, seed: int = 0) -> tuple[Recordings, Recordings]:
-        """A part to train on and a part to test on: whole recordings, drawn at random.
+        """Split into training and test data: whole recordings, chosen at random.
 
         One recording alone is cut in time: its end tests.
 
@@ -233,7 +233,7 @@ class Recordings(Sequence[Recording]):
         return Recordings(parts[0]), Recordings(parts[1])
 
     def plot(self, recording: int | str = 0, channels: Sequence[str] = ()) -> Any:
-        """A Plotly figure of a recording over time, a row a channel.
+        """Plot the channels of a recording over time, one row per channel (Plotly).
 
         Args:
             recording: number or name.
@@ -245,11 +245,11 @@ class Recordings(Sequence[Recording]):
         return recordings_figure(self[recording], list(channels) or self.names[:SHOWN_CHANNELS])
 
     def __repr__(self) -> str:
-        """Recordings and channels as text."""
+        """Return recordings and channels as text."""
         return "\n\n".join(text_of(table) for table in self._tables())
 
     def _repr_html_(self) -> str:
-        """The same for a notebook."""
+        """Return recordings and channels as HTML for a notebook."""
         return html_of(self._tables())
 
     def _tables(self) -> list[TextTable]:
@@ -295,7 +295,7 @@ def read(
 
 
 def as_recordings(data: Recordings | Recording | Sequence[Recording]) -> Recordings:
-    """What a user gave as data, as `Recordings`.
+    """Convert user data to `Recordings`.
 
     Raises:
         DataError: it is something else.
@@ -318,12 +318,12 @@ class MemorySource(DataSource):
     recordings: tuple[Recording, ...] = ()
 
     def read(self) -> list[Recording]:
-        """The recordings."""
+        """Return the recordings."""
         return list(self.recordings)
 
 
 def repair_of(table: Mapping[str, str] | None) -> Repair | None:
-    """What may be repaired, from a mapping.
+    """Build the repair settings from a mapping.
 
     Raises:
         ConfigError: an unknown repair or choice.

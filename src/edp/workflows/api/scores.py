@@ -1,4 +1,4 @@
-"""Scores of a predictor beside its baselines, and what a search came to: tables, frames, figures."""
+"""Scores of a predictor and its baselines, and results of a model search, as tables, data frames and figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ShownTable:
         self._tables = tables
 
     def __repr__(self) -> str:
-        """As text."""
+        """Return the tables as text."""
         return "\n\n".join(map(text_of, self._tables))
 
     def _repr_html_(self) -> str:
@@ -49,7 +49,7 @@ class JudgedScores(OneFrame):
 
     @property
     def folder(self) -> Path:
-        """Where ``scores.json`` lies, or the bundle that was judged."""
+        """Folder that holds ``scores.json``, or the evaluated bundle."""
         return self._facts.folder
 
     def to_dict(self) -> Mapping[str, Any]:
@@ -57,11 +57,11 @@ class JudgedScores(OneFrame):
         return {} if self._facts.scores is None else self._facts.scores.to_table()
 
     def table(self) -> ShownTable:
-        """A table for each horizon: every judged model, the best first."""
+        """Return one table per horizon with every evaluated model, the best first."""
         return ShownTable(score_tables(self._facts))
 
     def plot(self) -> Any:
-        """A Plotly figure: RMSE of every judged model, against the horizon where there are several."""
+        """Plot the RMSE of every evaluated model, over the horizon if there are several (Plotly)."""
         return score_figure(self._facts)
 
     def _columns(self) -> dict[str, list[Any]]:
@@ -76,16 +76,16 @@ class JudgedScores(OneFrame):
         return columns
 
     def __repr__(self) -> str:
-        """The headline and the tables."""
+        """Return the headline and the tables as text."""
         return f"{headline(self._facts)}\n\n{self.table()!r}"
 
     def _repr_html_(self) -> str:
-        """The same for a notebook."""
+        """Return the headline and the tables as HTML for a notebook."""
         return html_of(score_tables(self._facts), headline(self._facts))
 
 
 class SearchStudy:
-    """What a model search has decided so far.
+    """State and results of a model search.
 
     Args:
         facts: of the study.
@@ -100,7 +100,7 @@ class SearchStudy:
         return self._facts.state
 
     def plot(self, name: str | None = None) -> Any:
-        """A Plotly figure of the study: ``variance``, ``pareto``, ``confirmation``, ``screening`` or ``history``.
+        """Plot a part of the study: ``variance``, ``pareto``, ``confirmation``, ``screening`` or ``history`` (Plotly).
 
         Args:
             name: without it the first that there are facts for.
@@ -111,16 +111,16 @@ class SearchStudy:
         return study_figure(self._facts, name)
 
     def __repr__(self) -> str:
-        """What came out, in sentences."""
+        """Return the headline and the conclusions as text."""
         return " ".join([words.headline(self._facts), *words.verdict(self._facts)])
 
     def _repr_html_(self) -> str:
-        """The same and the phases, for a notebook."""
+        """Return the conclusions and the phases as HTML for a notebook."""
         return study_html(self._facts)
 
 
 def load_study(path: str | Path) -> SearchStudy:
-    """A model search from the folder of ``edp search --study``, finished or not.
+    """Load a model search from the folder of ``edp search --study``, finished or not.
 
     Raises:
         StorageError: no study, or one of another version.

@@ -107,7 +107,7 @@ def _train(
 
 
 def _apart(tests: Recordings, recordings: Recordings) -> Recordings:
-    """Recordings to test on, named apart from those to train on: arrays of both parts have the same usual names."""
+    """Rename test recordings whose names also occur in the training recordings."""
     names = [f"test {name}" if name in recordings.recording_names else name for name in tests.recording_names]
     return Recordings([replace(entry, name=name) for entry, name in zip(tests, names, strict=True)])
 
@@ -177,7 +177,7 @@ def _nested(settings: Mapping[str, Any]) -> Table:
 
 
 def _plain(value: Any) -> Any:
-    """What TOML would give: lists for tuples, tables in them as dictionaries."""
+    """Convert tuples to lists and mappings to dictionaries, as TOML would give them."""
     if isinstance(value, list | tuple):
         return [_nested(entry) if isinstance(entry, Mapping) else _plain(entry) for entry in value]
     return value
@@ -193,7 +193,7 @@ def _check_targets(data: Recordings, experiment: Experiment | AutoSettings) -> N
 
 
 def _write(source: DataSource) -> None:
-    """Recordings of this process into the run folder, so that the run can be judged and reported on later."""
+    """Write recordings in memory to the run folder, so that the run can be evaluated later."""
     if not isinstance(source, MemorySource):
         return
     folder = make_folder(source.path)

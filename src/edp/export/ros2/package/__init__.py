@@ -1,1 +1,1 @@
-"""The Python of an exported package; it is copied as it stands and imports nothing of EDP."""
+"""Python code of an exported package; it is copied unchanged and does not import EDP."""

@@ -28,7 +28,7 @@ LOOPED_S = 1.0
 
 
 class CallStatus(IntEnum):
-    """What the C code did; see its header."""
+    """Result code of the C functions; see their header."""
 
     OK = 0
     WARMING = 1
@@ -38,7 +38,7 @@ class CallStatus(IntEnum):
 
 
 def build(compiler: str = "cc", folder: Path = HERE) -> Path:
-    """Compile the C code beside this file.
+    """Compile the C code next to this file.
 
     Raises:
         RuntimeError: the compiler is missing or says no.
@@ -109,11 +109,11 @@ class Core:
         return CallStatus(self._step(self._state, c_row, self._out))
 
     def missed(self, ticks: int) -> CallStatus:
-        """Tell that so many ticks went by without inputs."""
+        """Report the number of samples without inputs."""
         return CallStatus(self._missed(self._state, ctypes.c_uint32(min(ticks, 2**31)), self._out))
 
     def result(self, meaning: str = "prediction") -> list[list[list[float]]]:
-        """The last result: ``[interval][horizon][target]``; a prediction has one interval."""
+        """Return the last result: ``[interval][horizon][target]``; a prediction has one interval."""
         at = 0
         for name, count in self.results.items():
             if name == meaning:
@@ -132,7 +132,7 @@ class Core:
 
 @dataclass(frozen=True)
 class InputSource:
-    """Where an input comes from.
+    """Source of an input.
 
     Attributes:
         kind: ``position``, ``velocity`` or ``effort`` of a joint, ``pressure`` of a sensor, or ``constant``.
@@ -149,7 +149,7 @@ KINDS = ("position", "velocity", "effort", "pressure", "constant")
 
 
 def read_sources(inputs: list[str], texts: list[str]) -> dict[str, InputSource]:
-    """Sources by input from texts such as ``CylVels_1=velocity:boom``, ``BmUp=pressure:boom_up``, ``Load=constant:0``.
+    """Parse input sources such as ``CylVels_1=velocity:boom``, ``BmUp=pressure:boom_up``, ``Load=constant:0``.
 
     Raises:
         ValueError: inputs without a source, sources without an input, or a text of another form; all of them are named.
@@ -182,7 +182,7 @@ def read_sources(inputs: list[str], texts: list[str]) -> dict[str, InputSource]:
 
 @dataclass
 class Tick:
-    """What came of a message of joints.
+    """Result of a joint message.
 
     Attributes:
         status: of the C code, None where no tick was made of it.
@@ -228,7 +228,7 @@ class Assembler:
         return 1.0 / float(self.core.about["rate_hz"])
 
     def pressure(self, name: str, value: float, stamp: float) -> None:
-        """A pressure in Pa, measured at `stamp` s; an older one than is held is left out."""
+        """Store a pressure in Pa, measured at `stamp` s; a value older than the stored one is ignored."""
         latest = self._pressures.get(name)
         if latest is None or stamp >= latest[1] or latest[1] - stamp > LOOPED_S:
             self._pressures[name] = (value, stamp)
@@ -236,7 +236,7 @@ class Assembler:
     def joints(
         self, names: list[str], position: list[float], velocity: list[float], effort: list[float], stamp: float
     ) -> Tick:
-        """A message of joints at `stamp` s, which is a tick."""
+        """Process a joint message at `stamp` s as one sample."""
         if self._heard is not None:
             if stamp - self._heard < -LOOPED_S:
                 self.core.reset()
@@ -270,7 +270,7 @@ class Assembler:
         return Tick(status, not reason, reason, missed, spent)
 
     def _wrong_rate(self) -> str:
-        """What is wrong with the time between messages; empty if nothing is."""
+        """Return a description of a wrong message rate; empty if the rate is correct."""
         if len(self._gaps) < RATE_MESSAGES:
             return ""
         middle = sorted(self._gaps)[len(self._gaps) // 2]
@@ -282,7 +282,7 @@ class Assembler:
     def _row(
         self, at: dict[str, int], fields: tuple[list[float], list[float], list[float]], stamp: float
     ) -> tuple[list[float], str]:
-        """Inputs of the tick; those that are missing are NaN, which the C code rejects."""
+        """Return the inputs of the sample; missing inputs are NaN, which the C code rejects."""
         row, absent = [], []
         for name, source in self.sources.items():
             value = source.value

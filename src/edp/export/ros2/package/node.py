@@ -1,4 +1,4 @@
-"""The ROS 2 node: messages in and out; what they mean is in core.py."""
+"""ROS 2 node for messages; their meaning is defined in core.py."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PredictorNode(TickNode):
         self.listen()
 
     def on_joints(self, message: Any) -> None:
-        """A tick."""
+        """Process one sample."""
         tick = self.tick_of(message)
         if self.last is None or (tick.why and tick.why != self.last.why):
             self.get_logger().warning(tick.why or "predicting")
@@ -45,7 +45,7 @@ class PredictorNode(TickNode):
             self.publish(message.header.stamp)
 
     def publish(self, stamp: Any) -> None:
-        """The results of this tick, stamped with the time of its inputs."""
+        """Publish the results of this sample with the time stamp of its inputs."""
         core = self.ticks.core
         for meaning in core.results:
             for number, interval in enumerate(core.result(meaning)):

@@ -17,7 +17,7 @@ TYPES = {"sensor_msgs/msg/JointState": "joints", "sensor_msgs/msg/FluidPressure"
 
 
 def sources_of(path: Path) -> list[str]:
-    """The parameter `sources` of a file of parameters.
+    """Return the parameter `sources` of a parameter file.
 
     Raises:
         ValueError: it has none.
@@ -32,7 +32,7 @@ def sources_of(path: Path) -> list[str]:
 
 
 def replay(bag: Path, ticks: Assembler, joints: str = "/joint_states", pressures: str = "/pressures") -> Iterator[Any]:
-    """Feeds the messages of a bag in the order in which they were recorded; yields time and `Tick`."""
+    """Process the messages of a bag in recorded order; yields time and `Tick`."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 

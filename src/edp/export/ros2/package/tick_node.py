@@ -1,4 +1,4 @@
-"""What the nodes of this package have in common: ticks out of messages of joints and pressures."""
+"""Common base of the nodes of this package: samples from joint and pressure messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .core import Assembler, Tick, read_sources
 
 
 def seconds(stamp: Any) -> float:
-    """A time of ROS in seconds."""
+    """Convert a ROS time to seconds."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
@@ -46,17 +46,17 @@ class TickNode(Node):
         self.create_timer(1.0, self.report)
 
     def on_pressure(self, message: Any) -> None:
-        """A pressure; its frame_id names the sensor."""
+        """Store a pressure; its frame_id names the sensor."""
         self.ticks.pressure(message.header.frame_id, message.fluid_pressure, seconds(message.header.stamp))
 
     def tick_of(self, message: Any) -> Tick:
-        """The tick of a message of joints."""
+        """Return the sample of a joint message."""
         position, velocity, effort = (list(part) for part in (message.position, message.velocity, message.effort))
         self.fresh = True
         return self.ticks.joints(list(message.name), position, velocity, effort, seconds(message.header.stamp))
 
     def on_joints(self, message: Any) -> None:
-        """A tick."""
+        """Process one sample."""
         raise NotImplementedError
 
     def report(self) -> None:

@@ -1,4 +1,4 @@
-"""What the monitor says, as levels, messages and values of a diagnostic status. Needs Python only.
+"""Output of the monitor as levels, messages and values of a diagnostic status. Needs Python only.
 
 Nothing here knows ROS: `node.py` puts it into messages.
 """
@@ -21,7 +21,7 @@ SHOWN = 5
 
 
 class MonitorCore(Core):
-    """One machine's monitor with its state; its results are numbers of `about["outputs"]`."""
+    """Monitor of one machine with its state; its results are named by `about["outputs"]`."""
 
     def __init__(self, folder: Path = HERE) -> None:
         super().__init__(folder)
@@ -31,7 +31,7 @@ class MonitorCore(Core):
 
     @property
     def outputs(self) -> dict[str, float]:
-        """Of the last tick, by name."""
+        """Return the outputs of the last sample by name."""
         return dict(zip(self.about["outputs"], self.result()[0][0]))
 
     def evidence(self) -> list[tuple[str, float]]:
@@ -43,7 +43,7 @@ class MonitorCore(Core):
 
 @dataclass
 class MonitorReport:
-    """What is reported of a monitor.
+    """Diagnostic report of a monitor.
 
     Attributes:
         core: the monitor.

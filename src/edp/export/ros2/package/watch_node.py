@@ -1,4 +1,4 @@
-"""The ROS 2 node of a monitor: messages in, diagnostics out; what they mean is in core.py and watch.py."""
+"""ROS 2 node of a monitor: messages in, diagnostics out; their meaning is defined in core.py and watch.py."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MonitorNode(TickNode):
         self.listen()
 
     def on_joints(self, message: Any) -> None:
-        """A tick; an alarm is reported at once."""
+        """Process one sample; an alarm is reported immediately."""
         self.stamp = seconds(message.header.stamp)
         self.last = self.tick_of(message)
         if self.watch.take(self.last, self.stamp):

@@ -1,4 +1,4 @@
-"""MAT files: what they announce, and what is found in them."""
+"""MAT files: size check before unpacking, and the signals in them."""
 
 from edp.logs.formats.matlab.variables import INFO, MAGIC, MatVariables, Part, is_v4
 

@@ -1,4 +1,4 @@
-"""What a MAT file announces, weighed before it is unpacked: a small file may hold more than a machine has.
+"""Size check of a MAT file before it is unpacked, since a small file may expand beyond the memory of the machine.
 
 Layout of v5: a header of 128 bytes, then elements of type (4 bytes), length (4) and content; a packed element (15)
 holds one array (14), whose length stands in its first 8 bytes. v7.3 is HDF5.
@@ -37,7 +37,7 @@ _ADVICE = "it may be damaged, or was made to exhaust memory; else save fewer var
 
 
 def check_size(path: Path) -> tuple[int, int]:
-    """Add up what the variables of a file take.
+    """Add up the memory required by the variables of a file.
 
     Returns:
         bytes when unpacked, and the number of HDF5 objects (v7.3) or of variables (v5).
@@ -141,7 +141,11 @@ class _Walk:
             self.add(inner, h5py.h5o.open(group, link))
 
     def array(self, name: str, data: Any) -> None:
-        """Where an array's values lie is looked at before its shape: the shape of a virtual one opens other files."""
+        """Check a dataset and add its size to the total.
+
+        Rejects virtual and external storage before the shape is read, since reading the shape of a virtual dataset
+        opens other files.
+        """
         plan = data.get_create_plist()
         if plan.get_layout() == h5py.h5d.VIRTUAL:
             raise self.refused(name, "a virtual data set, whose values lie in other files")
@@ -164,7 +168,7 @@ class _Walk:
             self.references(name, part)
 
     def references(self, name: str, part: h5py.Dataset) -> None:
-        """What a cell or an object refers to need not be linked from anywhere."""
+        """Check the targets of references in cells and objects, which need not be linked from elsewhere."""
         for reference in np.asarray(part[()]).ravel():
             if isinstance(reference, h5py.RegionReference):
                 raise self.refused(name, "a reference to a region of an array")

@@ -26,7 +26,7 @@ def experiment_names(variables: Mapping[str, Any]) -> list[str]:
 
 
 def pick_experiment(variables: Mapping[str, Any], name: str) -> dict[str, Any] | None:
-    """One experiment as a variable of its own; None where no variable holds one of this name."""
+    """Return one experiment as a variable; None if no variable has one of this name."""
     match = _ONE.fullmatch(name)
     if match is None or match["variable"] not in variables:
         return None
@@ -36,7 +36,7 @@ def pick_experiment(variables: Mapping[str, Any], name: str) -> dict[str, Any] |
 
 
 def _experiments(value: Any) -> list[Any]:
-    """The experiments of a variable; empty where it is one, or none."""
+    """Return the experiments of a variable; empty if it is a single one or none."""
     if isinstance(value, MatlabOpaque):
         return _of_iddata(value)
     if not isinstance(value, np.ndarray) or value.size < 2 or not (value.dtype.names or value.dtype == object):
@@ -58,7 +58,7 @@ def _is_experiment(element: Any) -> bool:
 
 
 def _of_iddata(value: MatlabOpaque) -> list[Any]:
-    """An iddata an experiment of one with several, whose facts are cells with an entry each."""
+    """Return one iddata per experiment of an iddata with several experiments, whose properties are cells."""
     props = value.properties
     if value.classname != "iddata" or not isinstance(props, dict):
         return []

@@ -1,4 +1,4 @@
-"""The signals inside a loaded MAT file, whatever they are wrapped in.
+"""Signals of a loaded MAT file, in any kind of container.
 
 Known wrappers: vectors and matrices, structs (one time vector per struct), Simulink's structure with time,
 ``timeseries``, ``Simulink.SimulationData.Dataset`` and ``Signal``, ``SimulationOutput``, signals that Simulink streamed
@@ -54,7 +54,7 @@ def collect(variables: dict[str, Any]) -> MatVariables:
 
 
 def _drop_copies(mat_variables: MatVariables) -> None:
-    """Leave out signals that repeat another one of their name, as a model logs one at each block that it passes."""
+    """Remove repeated signals of equal name, which a model logs at each block along a line."""
     parts_by_name: dict[str, list[Part]] = {}
     for part in mat_variables.signals:
         namesakes = parts_by_name.setdefault(part.name, [])
@@ -74,7 +74,10 @@ def _is_copy(part: Part, other: Part) -> bool:
 
 
 def _share_times(mat_variables: MatVariables) -> None:
-    """Make equal times one array: a Dataset holds them once a signal, and each would be judged and kept again."""
+    """Replace equal time arrays by one array.
+
+    A Dataset holds one per signal, and each would be checked and stored again.
+    """
     distinct_times: list[NDArray[np.float64]] = []
     for part in mat_variables.signals:
         if part.time is None:
@@ -123,7 +126,10 @@ def _add_array(
 
 
 def _columns(array: NDArray[Any], samples: int | None) -> NDArray[Any] | None:
-    """An array as ``(time, column)``: time is the axis of `samples` values, else the longest; None if there is none."""
+    """Return an array as ``(time, column)``.
+
+    Time is the axis with `samples` values, otherwise the longest; None without one.
+    """
     if array.size == 0:
         return None
     long_sides = [length for length in array.shape if length > 1]
@@ -189,7 +195,7 @@ def _walk_structure_with_time(element: Any, path: str, mat_variables: MatVariabl
 
 
 def _add_streamed(element: Any, fields: tuple[str, ...], path: str, mat_variables: MatVariables) -> None:
-    """A signal of a Dataset whose values `edp.logs.formats.matlab.sigstream` has put in their place."""
+    """Add a Dataset signal whose values `edp.logs.formats.matlab.sigstream` has filled in."""
     values, time = element[VALUES], element[EVEN_TIMES]
     if not isinstance(values, np.ndarray) or values.ndim != 2 or time is None:
         return
@@ -200,7 +206,7 @@ def _add_streamed(element: Any, fields: tuple[str, ...], path: str, mat_variable
 
 
 def _port(element: Any, path: str) -> str:
-    """Block and port that a signal of a Dataset was logged at; `path` where it names none."""
+    """Return block and port at which a Dataset signal was logged; `path` if they are not named."""
     block = element["BlockPath"]
     while isinstance(block, np.ndarray) and block.dtype == object and block.size:
         block = block.ravel()[0]
@@ -209,7 +215,7 @@ def _port(element: Any, path: str) -> str:
 
 
 def _nested_text(value: Any) -> str:
-    """A text that a struct holds as its ``Value``, or the text itself."""
+    """Return the text in the ``Value`` field of a struct, or the text itself."""
     if isinstance(value, np.ndarray) and value.dtype.names and "Value" in value.dtype.names and value.size:
         return _text(value.ravel()[0]["Value"])
     return _text(value)
@@ -247,7 +253,7 @@ def _walk_object(value: MatlabOpaque, name: str, path: str, mat_variables: MatVa
 
 
 def _walk_contents(value: Any, name: str, path: str, mat_variables: MatVariables) -> None:
-    """The inside of a Dataset or SimulationOutput: structs with Storage or Elements, cells, or plain fields."""
+    """Visit the content of a Dataset or SimulationOutput: structs with Storage or Elements, cells, or plain fields."""
     if isinstance(value, np.ndarray) and value.dtype.names and {"Storage", "Elements"} & set(value.dtype.names):
         for element in value.ravel():
             for key in ("Storage", "Elements"):
@@ -268,7 +274,7 @@ def _add_timeseries(props: dict[str, Any], name: str, path: str, mat_variables: 
 
 
 def _add_iddata(props: dict[str, Any], mat_variables: MatVariables) -> None:
-    """Inputs and outputs of System Identification Toolbox, under the names that it gives them."""
+    """Add inputs and outputs of System Identification Toolbox data under their names there."""
     inner = props.get("Data_")
     facts = props | (inner.properties if isinstance(inner, MatlabOpaque) and isinstance(inner.properties, dict) else {})
     factor = _SECONDS.get(_text(facts.get("TimeUnit_")).lower(), 1.0)
@@ -312,7 +318,7 @@ def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:
 
 @lru_cache(maxsize=1)
 def _even(start: float, step: float, length: int, factor: float) -> NDArray[np.float64]:
-    """Even times; the signals of one Dataset mostly have the same, and then share the array."""
+    """Return evenly spaced times; signals of one Dataset share the array."""
     return np.asarray((start + step * np.arange(length)) * factor, dtype=np.float64)
 
 

@@ -33,7 +33,7 @@ _DEEPEST = 60
 
 
 def variable_names(path: Path) -> list[str] | None:
-    """The variables of a file with streamed signals; None for any other file."""
+    """Return the variables of a file with streamed signals; None for any other file."""
     if not h5py.is_hdf5(path):
         return None
     with h5py.File(path, "r") as stored:
@@ -57,7 +57,7 @@ def place_streams(path: Path, variables: dict[str, Any]) -> None:
 
 
 def _times(path: Path, records: h5py.Group, signal: Any, samples: int) -> NDArray[np.float64]:
-    """Times of the samples of a signal: a record of their own, or even ones."""
+    """Return the sample times of a signal: its own record, or evenly spaced times."""
     stream = _record(path, records, signal, TIMES) if TIMES in signal.dtype.names else None
     facts = np.asarray(signal[EVEN_TIMES])
     even = facts.dtype.kind in "fiu" and facts.size == 3
@@ -89,7 +89,7 @@ def _signals(values: list[Any], depth: int) -> Iterator[Any]:
 
 
 def _record(path: Path, records: h5py.Group, signal: Any, field: str) -> NDArray[Any] | None:
-    """Samples of a record as ``(time, column)``; None where there is none, or none of real numbers."""
+    """Return the samples of a record as ``(time, column)``; None without a record of real numbers."""
     reference = np.asarray(signal[field])
     if reference.dtype.kind not in "fiu" or reference.size != 1:
         return None
@@ -108,7 +108,7 @@ def _record(path: Path, records: h5py.Group, signal: Any, field: str) -> NDArray
 
 
 def _sample(signal: Any) -> tuple[str | None, int]:
-    """Number type and count of the numbers of one sample; no type for what are no real numbers."""
+    """Return number type and count of the elements of one sample; the type is None unless they are real numbers."""
     names = signal.dtype.names
     facts = np.asarray(signal["SignalAttributes"]).ravel() if "SignalAttributes" in names else np.empty(0)
     if not facts.size or not facts.dtype.names:

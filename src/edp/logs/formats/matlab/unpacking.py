@@ -28,7 +28,7 @@ OBJECT_BYTES = 8192
 
 
 def unpack(path: Path, variable: str | None = None) -> MatVariables:
-    """Everything in a file, or in one variable of it.
+    """Return everything in a file, or in one of its variables.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""What is found in a MAT file, and by which bytes such a file begins."""
+"""Content found in a MAT file, and the first bytes of such files."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class MatVariables:
 
 
 def is_v4(head: bytes) -> bool:
-    """Whether a file begins with the numbers of a v4 header."""
+    """Return whether a file begins with a v4 header."""
     if len(head) < 20:
         return False
     # v4 has no magic number; its five integers must be sound in one of both byte orders.

@@ -1,4 +1,4 @@
-"""What `edp.networks.twin.grey.run.run_lanes` is handed where a run has no cell, no trace and no sums."""
+"""Placeholder arguments of `edp.networks.twin.grey.run.run_lanes` for runs without cell, trace or sums."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def _check_actuator(actuator: Actuator, channels: TwinChannels, ports: _Ports) -
 
 
 def _check_kind(actuator: Actuator, velocity: Channel) -> None:
-    """A cylinder has a linear velocity, a motor an angular one."""
+    """Check that a cylinder has a linear velocity and a motor an angular velocity."""
     cylinder = isinstance(actuator, CylinderElement)
     needed, other = (Kind.VELOCITY, "[[twin.motors]]") if cylinder else (Kind.ANGULAR_VELOCITY, "[[twin.cylinders]]")
     if velocity.kind is not needed:

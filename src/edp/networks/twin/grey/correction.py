@@ -28,13 +28,13 @@ Trace = tuple[Singles, Singles, Singles, Singles, Singles, Singles, Singles]
 
 @inner
 def index_of(port: IntArray, n: int, nodes: int) -> Any:
-    """Where the state behind a port lies among pressures, velocities and strokes."""
+    """Return the index of the state of a port among pressures, velocities and strokes."""
     return port[1] + (nodes if port[0] == 0 else (nodes + n if port[0] == 1 else 0))
 
 
 @inner
 def fed_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
-    """What the ports read, in units of the grey box, into `fed` ``(answer,)``."""
+    """Write the port readings, in units of the grey box, to `fed` ``(answer,)``."""
     n, nodes = len(s), len(y) - len(s)
     for c in range(len(ports)):
         index = index_of(ports[c], n, nodes)
@@ -45,7 +45,7 @@ def fed_ports(ports: IntArray, y: Array, s: Array, fed: Array) -> None:
 def correct(
     now: tuple[int, int], y: Array, s: Array, fed: Array, ports: IntArray, cell: Cell, trace: Trace, proposed: Array
 ) -> None:
-    """Move the cell of one lane by a tick, and pressures and velocities by its correction.
+    """Advance the cell of one run by one sample, and correct pressures and velocities.
 
     Args:
         now: tick and lane.
@@ -86,7 +86,7 @@ def correct(
 def note_bounds(
     now: tuple[int, int], y: Array, s: Array, ports: IntArray, limits: tuple[Array, ...], trace: Trace, proposed: Array
 ) -> None:
-    """Write to the trace where no bound acted on an answer, from the ports before the bounds acted."""
+    """Record in the trace where no bound was active on an output, from the ports before bounding."""
     n, nodes = len(s), len(y) - len(s)
     for c in range(len(ports)):
         index = index_of(ports[c], n, nodes)
@@ -128,7 +128,7 @@ def run_back(
     trace: Trace,
     grads: tuple[Singles, Singles, Singles],
 ) -> None:
-    """The adjoint of a free run of grey box and cell, from the last tick to the first.
+    """Compute the adjoint of a free run of grey box and cell, from the last sample to the first.
 
     Args:
         grad_answers: gradient by the answers, each in its deviations ``(tick, lane, answer)``.
@@ -189,7 +189,7 @@ def run_back(
 def _before(
     t: int, row: int, port: Singles, where: IntArray, trace: Trace, by_fed: Array, by_tick: Array, by_state: Array
 ) -> None:
-    """Gradient by the state before a tick, from that by what was fed and by what the grey box made of it."""
+    """Compute the gradient by the state before a sample from those by the fed values and the grey-box result."""
     by_state[:] = 0.0
     if trace[6][t, row] == 0.0:
         # All that was fed so far was measured: no weight has a part in it.

@@ -1,4 +1,4 @@
-"""The datasheet of a machine: every number of its grey box with unit and interval, as far as the data tell it."""
+"""Datasheet of a machine: every grey-box parameter with unit and confidence interval."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BASIS = (
 
 
 def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, Any]]:
-    """A row for each number that is fitted, and for the inertia of each actuator, which follows of them; SI units.
+    """Return one row per fitted parameter, and one for the derived inertia of each actuator; SI units.
 
     Args:
         table: of the grey box.
@@ -60,7 +60,7 @@ def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list
 
 
 def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, Any]]:
-    """A row for the inertia of each actuator with the others at rest, at the middle of all strokes.
+    """Return one row for the inertia of each actuator with the others at rest, at the middle of all strokes.
 
     It is the sum of squares of its row of the root, whose first coefficients are the root there; its interval follows
     from theirs and their covariance.
@@ -81,7 +81,7 @@ def _inertias(table: NumberTable, values: Doubles, information: Doubles) -> list
 
 
 def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> list[dict[str, Any]]:
-    """The same of a known linkage, at the middle of the strokes of its machine."""
+    """Return the inertia rows of a known linkage, at the middle of the strokes of its machine."""
     span, n = slice(table.inertia_at, table.potential_at), len(table.actuator_at)
     joints = table.linkage[at.JOINTS :].reshape(at.BODIES, at.JOINT_VALUES)
     strokes, zero = np.zeros((1, n)), np.zeros((1, n))
@@ -104,7 +104,7 @@ def _body_inertias(table: NumberTable, values: Doubles, covariance: Doubles) -> 
 def _inertia_row(
     of: str, unit: str, factor: float, value: float, slope: Doubles, covariance: Doubles
 ) -> dict[str, Any]:
-    """Of an actuator's inertia, from its slope by coordinates in plausible deviations and their covariance."""
+    """Return the row of an actuator's inertia, from its derivative by scaled coordinates and their covariance."""
     deviation = float(np.sqrt(slope @ covariance @ slope))
     reach = NORMAL * deviation
     return {
@@ -119,7 +119,7 @@ def _inertia_row(
 
 
 def datasheet_text(rows: Sequence[dict[str, Any]], basis: str = BASIS) -> str:
-    """The rows as a table for readers, under what their intervals rest on."""
+    """Format the rows as a table for readers, headed by the basis of the intervals."""
     width = max(len(f"{row['element']}.{row['name']}") for row in rows)
     lines = [
         basis + ".",

@@ -1,4 +1,4 @@
-"""Elements of which a grey box is made, as a settings file names them, or as names and kinds of channels tell them."""
+"""Elements of a grey box, as named in a settings file or derived from names and kinds of channels."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class CylinderElement:
 
     @property
     def areas(self) -> tuple[float, float] | None:
-        """Of head and rod side, m^2; None where the bore is not known."""
+        """Return the areas of head and rod side, m^2; None without a known bore."""
         if not self.bore:
             return None
         head = self.count * np.pi / 4 * self.bore**2
@@ -182,7 +182,7 @@ class Elements:
 
 
 def default_elements(channels: TwinChannels) -> Elements:
-    """What names and kinds say: a cylinder for each velocity, a motor for each angular one, a spool for each command.
+    """Return the elements derived from channels: a cylinder or motor per velocity, a spool per command.
 
     Raises:
         ConfigError: pressures whose place they do not tell.
@@ -220,7 +220,7 @@ def default_elements(channels: TwinChannels) -> Elements:
 
 
 def _actuator(name: str, velocity: Channel, pressures: Sequence[str], angles: bool) -> Actuator:
-    """A cylinder, or a motor where the velocity is an angular one."""
+    """Return a cylinder, or a motor for an angular velocity."""
     first, second = (*pressures, "", "")[:2]
     if velocity.kind is Kind.ANGULAR_VELOCITY:
         # A measured angle may be that of a joint, which gravity turns: nothing tells that it is not.

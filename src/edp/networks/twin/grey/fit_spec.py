@@ -22,7 +22,7 @@ MOST_STARTS = 100
 
 @dataclass(frozen=True, kw_only=True)
 class GreyFitSpec:
-    """How the numbers of a grey box are fitted (`edp.training.grey_fit`).
+    """Settings for fitting the parameters of a grey box (`edp.training.grey_fit`).
 
     Attributes:
         lengths_s: lengths of the free runs, stage after stage.

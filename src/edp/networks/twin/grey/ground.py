@@ -29,11 +29,11 @@ NORMAL = 1.96
 
 
 class GroundContact(ABC):
-    """The ground of one run: it remembers what was cut."""
+    """Ground contact of one run, with memory of the excavated profile."""
 
     @abstractmethod
     def forces(self, strokes: Array, free: Array, slopes: Array) -> Array:
-        """Forces against the actuators (N) in the coming tick.
+        """Return forces against the actuators (N) in the next sample.
 
         Args:
             strokes: before it, of each actuator, m.
@@ -43,11 +43,11 @@ class GroundContact(ABC):
 
     @abstractmethod
     def touches(self, strokes: Array, free: Array) -> bool:
-        """Whether there would be any force; arguments are those of `forces`."""
+        """Return whether there would be any force; arguments as in `forces`."""
 
 
 class GroundLaw(ABC):
-    """A law with its numbers.
+    """Ground law with its parameters.
 
     Attributes:
         numbers: of the law, SI units.
@@ -60,7 +60,7 @@ class GroundLaw(ABC):
     @classmethod
     @abstractmethod
     def fitted(cls, twin: GreyTwin, logs: Sequence[tuple[Array, Array, Array]], machine: str) -> GroundLaw:
-        """The law of logs.
+        """Return the law fitted to logs.
 
         Args:
             twin: with a known linkage.
@@ -77,7 +77,7 @@ class GroundLaw(ABC):
 
     @abstractmethod
     def contact(self, twin: GreyTwin) -> GroundContact:
-        """The ground before a run, uncut."""
+        """Return the undisturbed ground before a run."""
 
     @abstractmethod
     def plain(self) -> dict[str, Any]:
@@ -97,7 +97,7 @@ class GroundLaw(ABC):
         """Name and unit of each number."""
 
     def rows(self) -> list[dict[str, Any]]:
-        """Rows of the datasheet, as those of `edp.networks.twin.grey.datasheet.datasheet`."""
+        """Return datasheet rows in the form of `edp.networks.twin.grey.datasheet.datasheet`."""
         rows = []
         for (name, unit), value, deviation in zip(self.names(), self.numbers, self.deviations, strict=True):
             excited = bool(np.isfinite(deviation))
@@ -111,7 +111,7 @@ GROUNDS: Registry[type[GroundLaw]] = Registry("ground")
 
 
 class GroundedRunner(TwinRunner):
-    """A runner whose machine stands on a ground.
+    """Runner whose machine is in contact with a ground.
 
     What the ground does in a tick belongs to the velocity at its end, as a stage of the grey box does: an explicit
     force of some 10 kN that turns with the velocity would swing from tick to tick.
@@ -135,7 +135,7 @@ class GroundedRunner(TwinRunner):
         self._slopes, self._age = np.zeros((len(columns), len(columns))), 0
 
     def begin(self) -> None:
-        """A ground that nothing has cut."""
+        """Start with an undisturbed ground."""
         self._contact, self._age = self._law.contact(self._grey), 0
 
     def step(self, command: NDArray[np.float32], state: TwinState, measured: NDArray[np.float32]) -> TwinState:
@@ -157,7 +157,7 @@ class GroundedRunner(TwinRunner):
 
 
 def check_grounded(twin: Twin) -> GreyTwin:
-    """The grey box on which a ground can act.
+    """Return the twin as a grey box on which a ground can act.
 
     Raises:
         ConfigError: it is none, has no known linkage, or has a network on top.

@@ -1,4 +1,4 @@
-"""Compiled parts of a ground under a grey box with a known linkage: where the tip is, how deep, and what holds it.
+"""Compiled ground contact of a grey box with a known linkage: tip position, depth and holding forces.
 
 A force of the ground is a damper for one tick, the size of the force over the speed: it stands still within the tick,
 opposes the motion or stands across it, so that the ground never gives energy, whatever the numbers of its law are.
@@ -83,7 +83,7 @@ def height_at(x: float, profile: Array) -> float:
 
 @inner
 def share(speed: float) -> float:
-    """Of the direction towards smaller values, 0 to 1."""
+    """Return the fraction of motion towards smaller values, 0 to 1."""
     return min(max(0.5 - 0.5 * speed / TURNING, 0.0), 1.0)
 
 
@@ -133,7 +133,7 @@ def hold(
     memory: tuple[Array, Array],
     forces: Array,
 ) -> None:
-    """Forces against the cylinders that belong to the velocity at the end of a tick.
+    """Compute the forces against the cylinders that match the velocity at the end of a sample.
 
     Args:
         front: linkage and length of the bucket, as `tip_at` reads them.
@@ -182,7 +182,7 @@ def follow(
     tips: Array,
     terms: Array,
 ) -> None:
-    """Depth and speed of the tip along a log, and what each number of a law would be against the cylinders there.
+    """Compute depth and speed of the tip along a log, and the cylinder forces of each law parameter.
 
     Args:
         front: as in `hold`.
@@ -215,7 +215,7 @@ def follow(
 
 @compiled
 def touches(front: tuple[Array, float], strokes: Array, free: Array, profile: Array) -> bool:
-    """Whether the tip may be in the ground; arguments are those of `hold` and `follow`."""
+    """Return whether the tip may be in the ground; arguments as in `hold` and `follow`."""
     tip, by, w_x = np.empty(2), np.empty((2, len(strokes))), 0.0
     tip_at(front[0], front[1], strokes, tip, by)
     for i in range(len(strokes)):

@@ -169,7 +169,10 @@ class DragLaw(GroundLaw):
 
 
 def _solved(terms: Array, forces: Array, blocks: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Numbers by least squares with Huber's weights, those of directions not below zero, and their standard errors."""
+    """Solve for parameters by least squares with Huber weights; directional ones are non-negative.
+
+    Returns standard errors, too.
+    """
     scaled = terms * PLAUSIBLE[None, :, None]
     lowest = np.where(np.arange(contact.NUMBERS) < contact.ACROSS, 0.0, -np.inf)
     weight, x = np.ones(len(forces)), np.zeros(contact.NUMBERS)

@@ -1,4 +1,4 @@
-"""Compiled code of grey boxes, kept on disk by the sources of this folder."""
+"""Compiled code of grey boxes, cached on disk by the sources of this folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The linkage of a machine file for a grey box: joint angles over strokes, lengths, and the bodies to start from."""
+"""Linkage of a machine file for a grey box: joint angles over strokes, lengths, and initial bodies."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class KnownLinkage:
 
     @staticmethod
     def read(name: str, elements: Elements, channels: TwinChannels, scales: TwinScales) -> KnownLinkage:
-        """That of a machine.
+        """Read the linkage of a machine.
 
         Args:
             name: of the machine, or of its file.
@@ -108,7 +108,7 @@ class KnownLinkage:
         return {"linkage": self.values.astype(np.float32), "bodies": self.bodies.astype(np.float32)}
 
     def numbers(self) -> list[GreyNumber]:
-        """Masses, centres of gravity and inertias, from the first body on."""
+        """Return masses, centres of gravity and inertias, beginning with the first body."""
         lengths = [*self.values[at.LENGTH : at.JOINTS], 0.0]
         rows = []
         for name, length, own in zip(BODY_NAMES, lengths, self.bodies.reshape(at.BODIES, -1), strict=True):
@@ -126,7 +126,7 @@ class KnownLinkage:
 
 
 def check_linkage(machine: str, elements: Elements, channels: TwinChannels) -> None:
-    """Refuse elements that are not those of a linkage.
+    """Raise ConfigError for elements that do not match a linkage.
 
     Raises:
         ConfigError: other cylinders, motors, or strokes that are not measured.

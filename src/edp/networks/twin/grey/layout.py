@@ -1,4 +1,4 @@
-"""Where each number of a grey box lies in the flat arrays that its compiled code reads and writes.
+"""Positions of the grey-box parameters in the flat arrays of the compiled code.
 
 Units there are m, s, MPa, MN and Gg (10^6 kg), in which pressures, forces and masses are numbers of a like size.
 

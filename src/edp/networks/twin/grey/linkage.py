@@ -96,7 +96,7 @@ def base_of(q: Array, load: int, linkage: Array, base: Array, by_number: Array) 
 def fill_pose(
     linkage: Array, strokes: Array, v: Array, which: IntArray, turn: Array, absolute: Array, parts: Array, torque: Array
 ) -> None:
-    """Where the bodies are, how they turn, and what inertia and torques are by the numbers of `base_of`.
+    """Compute positions and rotation of the bodies, and inertia and torques from the parameters of `base_of`.
 
     Args:
         linkage: of `layout`.
@@ -137,7 +137,7 @@ def fill_pose(
 def _couple(
     length: float, a: int, b: int, which: IntArray, turn: Array, absolute: Array, parts: Array, torque: Array
 ) -> None:
-    """Add what a body `b` is to a body `a` that carries it, by both moments of b."""
+    """Add the coupling between body `b` and a body `a` that carries it, by both moments of b."""
     cosine = length * (absolute[0, a] * absolute[0, b] + absolute[1, a] * absolute[1, b])
     sine = length * (absolute[0, a] * absolute[1, b] - absolute[1, a] * absolute[0, b])
     rate_a, rate_b = absolute[2, a] * absolute[2, a], absolute[2, b] * absolute[2, b]
@@ -308,7 +308,7 @@ def inertia_by_numbers(i: int, change: Array, parts: Array, by_number: Array, lo
 
 @compiled
 def balance_by_base(strokes: Array, speeds: Array, pulls: Array, linkage: Array, out: Array) -> None:
-    """Forces on the strokes by the numbers of `base_of`, for strokes, velocities and accelerations.
+    """Compute forces on the strokes by the parameters of `base_of`, for strokes, velocities and accelerations.
 
     Args:
         strokes: ``(row, actuator)``; `speeds` and `pulls` likewise.

@@ -1,4 +1,4 @@
-"""A grey box as a layer: its constants, its state after a reset, and what a tick of it means."""
+"""Grey box as a layer: constants, state after a reset, and reference implementation of one sample."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Values = NDArray[np.floating]
 
 
 def add_layer(build: Builder, twin: GreyTwin, fed: str) -> str:
-    """Add the layer of a twin; after a reset it rests at the means of the training data.
+    """Add the layer of a twin; after a reset it is in steady state at the means of the training data.
 
     Args:
         build: the layers in the making.
@@ -74,7 +74,7 @@ def _padded(values: Values, size: int) -> Values:
 
 
 def _places(values: Any) -> NDArray[np.uint16]:
-    """A table of places with `NONE` for what is not there."""
+    """Return a table of positions with `NONE` for missing entries."""
     return indices(np.where(np.asarray(values) < 0, NONE, values))
 
 
@@ -86,7 +86,7 @@ def _signed(values: NDArray[np.uint16]) -> NDArray[np.int64]:
 def _tick(
     layer: HydraulicTick, w: Mapping[str, Values], memory: dict[str, Values], commands: Values, fed: Values
 ) -> Values:
-    """One tick of the layer by the compiled kernel of the twin, without bounds on what it answers."""
+    """Compute one sample of the layer with the compiled kernel of the twin, without output bounds."""
     values = {name: np.asarray(array, np.float64) for name, array in w.items()}
     sides, ports = _signed(layer.sides), _signed(layer.ports)
     demand = commands[sides[:, 0]] - np.where(sides[:, 1] >= 0, commands[sides[:, 1]], 0.0)

@@ -245,7 +245,7 @@ def _turning_by_state(
 
 @inner
 def _second(q: Array, places: tuple[int, int, int], second: Array, k: int, own: Array) -> None:
-    """Derivatives of the gradient of L by stroke `k` ``(actuator, actuator, stroke)``."""
+    """Compute derivatives of the gradient of L by stroke `k` ``(actuator, actuator, stroke)``."""
     n = len(own)
     first_of_entry = places[0]
     own[:] = 0.0

@@ -1,4 +1,4 @@
-"""Compiled code of plans on grey boxes, kept on disk apart: no fit waits for it, and it for no fit."""
+"""Compiled code of plans on grey boxes, cached separately so that fits and plans do not wait for each other."""
 
 from __future__ import annotations
 

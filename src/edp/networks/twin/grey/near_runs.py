@@ -1,4 +1,4 @@
-"""One machine with a grey box's equations, and runs near it: what a plan asks of its model at each tick.
+"""One machine with the equations of a grey box, and linearised neighbouring runs, for the plan at each sample.
 
 The first run is the grey box itself. The others differ from it by commands: their spools, pilots and displacements are
 run as they are, dead bands and play among them; pressures, velocities and strokes follow by the tangent of each
@@ -41,7 +41,7 @@ def _step(
     time: tuple[float, int],
     scratch: tuple[tuple[Array, ...], ...],
 ) -> None:
-    """One implicit step of all runs; the first one's is that of `steps.tick`.
+    """Advance all runs by one implicit step; the first run's step equals that of `steps.tick`.
 
     Args:
         state: y, strokes and bristles of the first run; moved.
@@ -126,7 +126,7 @@ def _write(t: int, ports: IntArray, units: Array, y: Array, s: Array, d_y: Array
 
 @inner
 def _write_between(t: int, ports: IntArray, half: float, answers: Array) -> None:
-    """Answers of all runs at tick t, between those of the ticks before and after it that were solved.
+    """Interpolate outputs of all runs at sample t between the solved samples before and after it.
 
     Args:
         t: the tick, of which there is one before.
@@ -164,7 +164,7 @@ def run_near(
     single: int,
     answers: Array,
 ) -> None:
-    """Run one machine freely from what is measured, and to first order runs near it.
+    """Simulate one machine in free run from the measured state, and neighbouring runs to first order.
 
     From tick `single` on, a step may go over two ticks: what is answered between them lies on their velocities' line.
 

@@ -1,4 +1,4 @@
-"""By how much runs near a run of a grey box differ from it: tangents of its implicit stages, whatever the spools do."""
+"""Differences between neighbouring runs of a grey box: tangents of its implicit stages, for any spool motion."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _add_spools(
     sums: tuple[Array, ...],
     right: Array,
 ) -> None:
-    """Add to the right side what other spools than those of the first run pass, at its pressures.
+    """Add the flows of spools that differ from the first run to the right-hand side, at its pressures.
 
     Args:
         spools: at this stage, shape (run, valve), and which of them are not those of the first run.
@@ -99,7 +99,7 @@ def stage_of_others(
     sums: tuple[Array, ...],
     load: tuple[Array, Array],
 ) -> None:
-    """By how much pressures and velocities of all other runs differ after a stage.
+    """Compute the differences of pressures and velocities of all other runs after a stage.
 
     Args:
         d_y: written, shape (unknown, column), a column a run.
@@ -149,7 +149,7 @@ def stage_of_others(
 def bristles_of_others(
     d_z: Array, d_base: Array, d_y: Array, y: Array, base: Array, h: float, q: Array, actuator_at: IntArray
 ) -> None:
-    """Differences of the bristles after a stage, from those of their base and of y."""
+    """Compute the differences of the bristles after a stage, from the differences of their base and of y."""
     nodes = len(y) - len(base)
     for i in range(len(base)):
         a = actuator_at[i]
@@ -171,7 +171,7 @@ def contents_of_others(d_y: Array, y: Array, nodes: int, q: Array, circuit: int,
 
 @inner
 def hold_others(ports: IntArray, limits: tuple[Array, ...], y: Array, s: Array, d_y: Array, d_s: Array) -> None:
-    """Where the first run is at a bound, the others are held there with it."""
+    """Hold the other runs at a bound where the first run is at this bound."""
     n = len(s)
     nodes = len(y) - n
     for c in range(len(ports)):

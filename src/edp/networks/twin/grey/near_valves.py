@@ -1,4 +1,4 @@
-"""Command path of runs that are near each other: spools, pilots and displacements of each of them as they are."""
+"""Command path of neighbouring runs: exact spools, pilots and displacements of each run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ IntArray = NDArray[np.int64]
 
 @inner
 def _demand(demands: Array, past: Array, t: int, j: int, delay: float) -> float:
-    """Demand of valve `j` a dead time in ticks before tick t, linear between ticks; before the run those of `past`."""
+    """Return the demand of valve `j` one dead time (in samples) before sample t, interpolated.
+
+    From `past` before the run.
+    """
     ticks = min(max(delay, 0.0), len(past) - 2.0)
     whole = min(int(ticks), len(past) - 2)
     part = ticks - whole
@@ -39,7 +42,7 @@ def _spool_way(
     spools: Array,
     pilots: Array,
 ) -> None:
-    """A valve of one run from its state `valves[t]` on, as `valve.advance_valves` moves it.
+    """Advance a valve of one run from its state `valves[t]`, like `valve.advance_valves`.
 
     Args:
         demands: shape (tick, valve).
@@ -89,7 +92,7 @@ def spool_ways(
     spools: Array,
     pilots: Array,
 ) -> None:
-    """Spools and pilots of all runs; `differs`: written, which valves of a run are not those of the first one.
+    """Compute spools and pilots of all runs; `differs` is set for valves that differ from the first run.
 
     Args:
         demands: shape (run, tick, valve).
@@ -154,7 +157,7 @@ def displace_by(
 
 @inner
 def centre(x: Array, m: int, q: Array, valve_pump: IntArray, pump: int) -> float:
-    """Area of the open centre of pump `m`, whose numbers begin at `pump`, with spools at `x` ``(valve,)``."""
+    """Return the open-centre area of pump `m`, whose parameters begin at `pump`, with spools at `x` ``(valve,)``."""
     closed, area = 1.0 / q[pump + at.BYPASS_CLOSED], q[pump + at.BYPASS]
     for j in range(len(x)):
         if valve_pump[j] == m:

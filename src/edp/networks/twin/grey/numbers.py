@@ -1,4 +1,4 @@
-"""The numbers of a grey box: where each lies, what it means, its unit, and a plausible value to start from."""
+"""Parameters of a grey box: position, meaning, unit and typical initial value of each."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ LEFT_OUT = {
 
 @dataclass(frozen=True, eq=False)
 class NumberTable:
-    """All numbers in order, and where those of each element begin.
+    """All parameters in order, and the position of each element's first one.
 
     With a known linkage `inertia_at` is the place of the first body's, and the load has no terms.
     """
@@ -64,12 +64,12 @@ class NumberTable:
 
     @cached_property
     def knots(self) -> Array:
-        """Of all opening curves ``(stretches + 1,)``."""
+        """Knots of all opening curves ``(stretches + 1,)``."""
         return opening_knots(self.stretches)
 
     @property
     def in_curves(self) -> NDArray[np.bool_]:
-        """Which numbers are increments of an opening curve."""
+        """Mask of the parameters that are increments of an opening curve."""
         inside = np.zeros(len(self.numbers), np.bool_)
         for first in self.valve_at[:, at.INTO : at.REGENERATION].ravel():
             if first >= 0:
@@ -78,12 +78,12 @@ class NumberTable:
 
     @property
     def linkage(self) -> Array:
-        """As `layout` orders it; empty where the load is polynomials of the strokes."""
+        """Linkage values in the order of `layout`; empty if the load is a polynomial of the strokes."""
         return np.zeros(0) if self.front is None else self.front.values
 
     @property
     def places(self) -> tuple[int, int, int, int]:
-        """As compiled code reads them."""
+        """Positions as read by compiled code."""
         return self.inertia_at, self.inertia_terms, self.potential_at, self.circuit_at
 
     @property
@@ -99,12 +99,12 @@ class NumberTable:
 
     @property
     def positive(self) -> NDArray[np.bool_]:
-        """Which are fitted by their logarithm."""
+        """Mask of the parameters fitted by their logarithm."""
         return self._columns["positive"].copy()
 
     @property
     def nominal(self) -> Array:
-        """Where a fit starts."""
+        """Initial values of a fit."""
         return self._columns["nominal"].copy()
 
     @property
@@ -114,7 +114,7 @@ class NumberTable:
 
     @property
     def factor(self) -> Array:
-        """SI units in one of each number's own."""
+        """Value of one unit of each parameter in SI units."""
         return self._columns["factor"].copy()
 
     def values(self, theta: Array) -> Array:
@@ -123,7 +123,7 @@ class NumberTable:
         return np.where(self.positive, grown, self.nominal + self.width * theta)
 
     def slope(self, values: Array) -> Array:
-        """Derivative of the numbers by the coordinates."""
+        """Return the derivative of the parameters by the coordinates."""
         return np.where(self.positive, values, self.width)
 
 
@@ -142,7 +142,7 @@ def number_table(
     front: KnownLinkage | None = None,
     stretches: int = STRETCHES[0],
 ) -> NumberTable:
-    """Numbers of connected elements, with starting values from what the data show.
+    """Return the parameters of connected elements, with initial values from the data.
 
     Args:
         elements: connected.
@@ -195,7 +195,7 @@ def number_table(
 
 
 def finer_values(coarse: NumberTable, values: Array, fine: NumberTable) -> Array:
-    """Numbers of the same machine in a table of more stretches: every stretch is divided, no curve changes."""
+    """Return the parameters of the same machine with subdivided opening curves of unchanged shape."""
     parts = fine.stretches // coarse.stretches
     divided, result = coarse.in_curves, np.empty(len(fine.numbers))
     # Curves, and what is no curve, have the same order in both tables.
@@ -205,8 +205,9 @@ def finer_values(coarse: NumberTable, values: Array, fine: NumberTable) -> Array
 
 
 def coarse_by_fine(coarse: NumberTable, fine: NumberTable) -> Array:
-    """Derivatives of the coordinates in which `coarse` is fitted by those of `fine` with equal curves
-    ``(coarse, fine)``: all stretches that one is divided into grow together where it grows.
+    """Return derivatives of coarse coordinates by fine ones with equal curves ``(coarse, fine)``.
+
+    Subdivided increments grow together.
     """
     parts = fine.stretches // coarse.stretches
     slopes, divided = np.zeros((len(coarse.numbers), len(fine.numbers))), coarse.in_curves
@@ -216,7 +217,7 @@ def coarse_by_fine(coarse: NumberTable, fine: NumberTable) -> Array:
 
 
 def _check_load(elements: Elements, degrees: tuple[int, int]) -> None:
-    """Refuse a load before its numbers are made: they grow with a power of the actuators."""
+    """Raise ConfigError if the polynomial load model would have too many parameters."""
     actuators, variables = len(elements.actuators), len(elements.load_variables)
     entries = actuators * (actuators + 1) // 2
     count = entries * comb(variables + degrees[0], variables) + comb(variables + max(degrees), variables)
@@ -230,7 +231,7 @@ def _check_load(elements: Elements, degrees: tuple[int, int]) -> None:
 
 
 def _load_exponents(elements: Elements, degree: int) -> IntArray:
-    """Of the load's monomials ``(term, actuator)``: zero for a motor whose angle the load does not depend on."""
+    """Return the exponents of the load's monomials ``(term, actuator)``: zero for motors not affecting the load."""
     variables = elements.load_variables
     own = monomials(len(variables), degree)
     exponents = np.zeros((len(own), len(elements.actuators)), np.int64)
@@ -256,7 +257,7 @@ def _inertia(actuators: Sequence[Actuator], areas: Sequence[float], exponents: I
 def _potential(
     actuators: Sequence[Actuator], areas: Sequence[float], travels: Sequence[Travel], exponents: IntArray
 ) -> list[GreyNumber]:
-    """Coefficients of the potential, but for the constant one."""
+    """Return the coefficients of the potential without the constant one."""
     # Work of a motor's oil over half of its angle, where a cylinder has 30 kJ.
     sizes = [
         load_size(one, area) * (0.5 * (travel.high - travel.low) if isinstance(one, MotorElement) else 1.0)
@@ -272,7 +273,7 @@ def _potential(
 
 
 def _fixed(number: GreyNumber, value: float) -> GreyNumber:
-    """The number at a value that a fit leaves alone."""
+    """Return the parameter fixed at a value."""
     return replace(number, nominal=value, width=0.0, positive=False)
 
 

@@ -1,4 +1,4 @@
-"""The numbers of each element of a grey box: meaning, unit, and a plausible value to start from."""
+"""Parameters of each element of a grey box: meaning, unit and typical initial value."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ START_CURVE = (0.25, 0.75)
 
 
 def opening_knots(stretches: int) -> Array:
-    """Knots of an opening curve with a number of `STRETCHES` ``(stretches + 1,)``, from 0 to 1."""
+    """Return the knots of an opening curve with a number of `STRETCHES` ``(stretches + 1,)``, from 0 to 1."""
     parts = stretches // STRETCHES[0]
     places = np.arange(stretches + 1) / parts
     return np.asarray(np.interp(places, np.arange(len(COARSE)), COARSE))
@@ -73,7 +73,7 @@ class GreyNumber:
 
 @dataclass(frozen=True)
 class Travel:
-    """What the data say of one actuator: stroke from `low` to `high` (m or rad), fastest speed, highest pressures."""
+    """Measured range of one actuator: stroke from `low` to `high` (m or rad), largest speed, largest pressures."""
 
     low: float
     high: float
@@ -82,14 +82,16 @@ class Travel:
 
 
 def plausible_areas(actuator: Actuator, travel: Travel) -> tuple[float, float]:
-    """Of both sides, where they are not known."""
+    """Return typical areas of both sides of an actuator with unknown areas."""
     if isinstance(actuator, MotorElement):
         return (PLAUSIBLE_FLOW / max(travel.fastest, 1e-3),) * 2
     return PLAUSIBLE_AREAS
 
 
 def load_size(actuator: Actuator, area: float) -> float:
-    """Of the root of an actuator's inertia, as a multiple of a plausible cylinder's: a motor has that of its oil.
+    """Return the scale of the root of an actuator's inertia relative to a typical cylinder.
+
+    A motor scales with its displacement.
 
     Inertia by the square of the area (or oil a radian) is what the oil carries, so that the root goes with the area.
     """
@@ -97,7 +99,7 @@ def load_size(actuator: Actuator, area: float) -> float:
 
 
 def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyNumber]:
-    """Numbers of a cylinder, as `layout` orders them; `declared`: its areas are told."""
+    """Return the parameters of a cylinder in the order of `layout`; `declared`: its areas are given."""
     head, rod = areas
     length = travel.high - travel.low
     hard = 30.0 * head  # MN at the pressure of a main relief
@@ -130,7 +132,10 @@ def cylinder_numbers(name: str, travel: Travel, areas: tuple[float, float], decl
 
 
 def motor_numbers(name: str, travel: Travel, areas: tuple[float, float], declared: bool) -> list[GreyNumber]:
-    """Numbers of a motor, in the order of a cylinder's; what a cylinder has by its stroke, it has by its speed."""
+    """Return the parameters of a motor in the order of a cylinder's.
+
+    Speed-dependent where a cylinder's depend on stroke.
+    """
     each, fastest = areas[0], max(travel.fastest, 1e-3)
     hard, flow = 30.0 * each, each * fastest  # MN m at the pressure of a main relief; m^3/s
     # Half a turn of its own oil, and a tenth of a second of its flow in the lines.
@@ -179,7 +184,7 @@ def pump_numbers(name: str, flow: float, highest: float) -> list[GreyNumber]:
 
 
 def circuit_numbers(highest: float, flow: float) -> list[GreyNumber]:
-    """Numbers that all elements share, from the highest pressure (MPa) and the flow of all pumps (m^3/s)."""
+    """Return the parameters common to all elements, from the highest pressure (MPa) and total pump flow (m^3/s)."""
     rows = [
         ("bulk_modulus", "Pa", MEGA, 1400.0, 0.3),
         ("air", "1", 1.0, 0.005, 0.7),
@@ -205,7 +210,7 @@ def valve_numbers(
     first: int,
     knots: Array,
 ) -> list[GreyNumber]:
-    """Numbers of a spool with opening curves between `knots`; `places` is filled in."""
+    """Return the parameters of a spool with opening curves between `knots`; `places` is filled in."""
     rows = [("dead_time", "s", 0.04, 0.5), ("pilot_lag", "s", 0.025, 0.5), ("spool_lag", "s", 0.02, 0.5)]
     numbers = [GreyNumber(name, label, unit, 1.0, start, width) for label, unit, start, width in rows]
     places[at.DELAY : at.BAND] = first + np.arange(3)

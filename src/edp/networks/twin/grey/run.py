@@ -1,4 +1,4 @@
-"""Grey boxes along many lanes: free runs with measured ports, and the normal equations of a fit."""
+"""Batched simulation of grey boxes: free runs with measured ports, and the normal equations of a fit."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _follow(
     tick_s: float,
     columns_by: int,
 ) -> None:
-    """A tick in which the whole load is measured: only valves, displacements and bristles move."""
+    """Advance a sample with fully measured load: only valves, displacements and bristles move."""
     y, s, z, d, valves = lane
     t_y, _, t_z, t_d, t_valves = tangents
     n, nodes = len(s), len(y) - len(s)
@@ -86,7 +86,7 @@ def _follow(
 def hold_bounds(
     y: Array, s: Array, before: tuple[Array, Array], ports: IntArray, limits: tuple[Array, ...], tick_s: float
 ) -> None:
-    """Hold what is answered within its bounds: velocities first, strokes by them, no velocity into an end stop."""
+    """Limit the outputs to their bounds: first velocities, then strokes; no velocity into an end stop."""
     nodes = len(y) - len(s)
     for turn in range(2):
         for c in range(len(ports)):
@@ -114,7 +114,7 @@ def feed(
     tangents: tuple[Array, Array],
     full: bool,
 ) -> None:
-    """Fill the ports: what was measured, or the last answer where the state was rounded to it."""
+    """Fill the ports with the measurement, or with the last output where the state was rounded to it."""
     y, s = state
     nodes = len(y) - len(s)
     for c in range(len(ports)):
@@ -179,7 +179,7 @@ def run_lanes(
     cell: Cell,
     trace: Trace,
 ) -> None:
-    """Run lanes, each port measured or fed back; on request with losses, their gradient and Gauss-Newton matrix.
+    """Simulate a batch, each port measured or fed back; optionally with losses, gradient and Gauss-Newton matrix.
 
     Args:
         demands: of the valves ``(lane, tick, valve)``.
@@ -279,7 +279,7 @@ def _answer(
     cell: Cell,
     trace: Trace,
 ) -> None:
-    """What a twin answers after a tick: corrected, within its bounds, rounded as it goes out; and what ports read next.
+    """Compute the twin's outputs after a sample: corrected, bounded, rounded; and the next port readings.
 
     Args:
         now: tick and lane.

@@ -51,7 +51,7 @@ def _node_row(
     out: tuple[Array, ...],
     full: bool,
 ) -> tuple[float, float]:
-    """Residual and derivatives of one pressure; what it owes to volume and area is returned, for chambers."""
+    """Compute residual and derivatives of one pressure; return the volume and area derivatives for chambers."""
     y, base, step = now
     net, jac, net_x, net_s, net_q = sums
     residual, by_y, by_x, by_s, _, by_q = out
@@ -203,7 +203,7 @@ def _inertia_slopes(
     by_q: Array,
     nodes: int,
 ) -> None:
-    """Derivatives of row `i` of M (v - b) by strokes and numbers."""
+    """Compute derivatives of row `i` of M (v - b) by strokes and parameters."""
     _, low, _, by_mass, value, parts, by_number = load
     n = len(change)
     for k in range(n):

@@ -1,4 +1,4 @@
-"""Where a fit of a grey box starts: the balance of forces, solved for the load by least squares on what was measured.
+"""Initial load of a grey-box fit: the force balance, solved by least squares on the measurements.
 
     A_A p_A = A_B p_B + M v' + grad U(s) + F_C sign(v) + F_v v
 
@@ -37,7 +37,7 @@ def load_start(
     rate_hz: float,
     declared: Sequence[bool],
 ) -> Array:
-    """Nominal numbers, those of the load in index of the plausible ones where all is measured.
+    """Return nominal parameters; the load parameters come from the force balance if everything is measured.
 
     Args:
         table: of numbers.
@@ -81,7 +81,7 @@ def load_start(
 
 
 def _load_columns(table: NumberTable, rows: Array, z_of: tuple[Array, Array]) -> Array:
-    """Forces on the actuators by what is linear in the load ``(actuator, row, column)``."""
+    """Return the actuator forces per linear load parameter ``(actuator, row, column)``."""
     if table.front is not None:
         return balance_columns(table, rows)
     n, exponents, pull = rows.shape[1], table.exponents, rows[:, :, 1]
@@ -100,12 +100,12 @@ def _load_columns(table: NumberTable, rows: Array, z_of: tuple[Array, Array]) ->
 
 
 def _entries(n: int) -> list[tuple[int, int]]:
-    """Of a symmetric matrix, row by row."""
+    """Return the index pairs of a symmetric matrix, row by row."""
     return [(a, c) for a in range(n) for c in range(a + 1)]
 
 
 def _taken(table: NumberTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
-    """The solution in its places, as far as it can be believed."""
+    """Insert the solution into the parameters where it is plausible."""
     n = len(table.actuator_at)
     inertia = _entries(n)
     mass = np.zeros((n, n))
@@ -124,7 +124,7 @@ def _taken(table: NumberTable, solution: Array, declared: Sequence[bool], values
 
 
 def _with_friction(table: NumberTable, solution: Array, declared: Sequence[bool], values: Array) -> Array:
-    """Friction and rod areas in their places, as far as they can be believed."""
+    """Insert friction and rod areas into the parameters where they are plausible."""
     for i in range(len(table.actuator_at)):
         a, own = table.actuator_at[i], 3 * i
         for index, value in ((at.COULOMB, solution[own]), (at.VISCOUS, solution[own + 1])):

@@ -1,4 +1,4 @@
-"""Where a fit of a grey box with a known linkage starts: bodies that balance the forces that were measured."""
+"""Initial bodies of a grey-box fit with a known linkage, which balance the measured forces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS, TRIES = 30, 12
 
 
 def balance_columns(table: NumberTable, rows: Array) -> Array:
-    """Forces on the cylinders by the nine numbers in which they are linear ``(actuator, row, BASE)``.
+    """Return the cylinder forces per linear parameter (nine) ``(actuator, row, BASE)``.
 
     Args:
         table: of numbers, with a linkage.
@@ -31,7 +31,7 @@ def balance_columns(table: NumberTable, rows: Array) -> Array:
 
 
 def balanced_bodies(table: NumberTable, matrix: Array, goal: Array) -> tuple[Array, Array]:
-    """Numbers whose bodies balance the forces as well as is plausible, and what else the balance is linear in.
+    """Return parameters whose bodies balance the forces within plausible limits, and the other linear parameters.
 
     Args:
         table: of numbers, with a linkage.
@@ -69,7 +69,7 @@ def balanced_bodies(table: NumberTable, matrix: Array, goal: Array) -> tuple[Arr
 
 
 def _cost(table: NumberTable, theta: Array, square: Array, pull: Array) -> tuple[float, Array, Array]:
-    """What the bodies leave of the balance and how far from plausible they are, the nine numbers, and their slopes."""
+    """Return cost (residual balance and deviation from typical values), nine parameters and derivatives."""
     values, span = _numbers(table, theta), slice(table.inertia_at, table.potential_at)
     base, by_number = np.empty(at.BASE), np.empty((at.BASE, len(theta)))
     base_of(values, table.inertia_at, table.linkage, base, by_number)
@@ -79,7 +79,7 @@ def _cost(table: NumberTable, theta: Array, square: Array, pull: Array) -> tuple
 
 
 def _numbers(table: NumberTable, theta: Array) -> Array:
-    """All numbers, with those of the bodies at coordinates in plausible deviations."""
+    """Return all grey-box parameters, with rigid-body parameters from `theta` (in prior standard deviations)."""
     values, span = table.nominal, slice(table.inertia_at, table.potential_at)
     moved = table.width[span] * theta
     grown = values[span] * np.exp(np.clip(moved, -12.0, 12.0))

@@ -1,4 +1,4 @@
-"""A grey box over time: one tick of one lane, with exact tangents by all numbers, or by the state before it."""
+"""Time stepping of a grey box: one sample of one run, with exact tangents by parameters or by the previous state."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def bristles(
 def fill_contents(
     y: Array, t_y: Array, nodes: int, q: Array, circuit: int, contents: Array, t_contents: Array, columns_by: int
 ) -> None:
-    """What pressures and velocities hold: oil and the velocities themselves; with their tangents."""
+    """Compute the contents for pressures and velocities: oil volumes and the velocities themselves, with tangents."""
     contents[nodes:] = y[nodes:]
     if columns_by:
         t_contents[nodes:] = t_y[nodes:]
@@ -161,7 +161,7 @@ def tick(
     work: tuple[tuple[Array, ...], ...],
     columns_by: int,
 ) -> int:
-    """One tick of one lane.
+    """Advance one run by one sample.
 
     Args:
         lane: y, strokes, bristles, displacements and valves; moved.
@@ -263,7 +263,7 @@ def freeze(
     work: tuple[tuple[Array, ...], ...],
     columns_by: int,
 ) -> None:
-    """Strokes in the middle of the step, and the load there; `tangents`: those of y and of the strokes."""
+    """Compute the strokes at the middle of the step and the load there; `tangents`: those of y and of the strokes."""
     q, _, middle, scale, linkage = model
     _, _, loads, terms, vectors, matrices = work
     t_y, t_s = tangents

@@ -1,4 +1,4 @@
-"""Command path of a grey box: dead time, two lags of the pilot, play, two lags of the spool; and what pumps are asked.
+"""Command path of a grey box: dead time, two pilot lags, play, two spool lags; and the demand on the pumps.
 
 Nothing here depends on the load, so a valve has tangents of its own: by its dead time, its lags and the play.
 """
@@ -79,7 +79,7 @@ def advance_valves(
 
 @inner
 def own_places(j: int, valve_at: IntArray, play_at: int, places: IntArray) -> None:
-    """Where the numbers of a valve's own tangents lie."""
+    """Write the positions of the parameters in a valve's own tangents."""
     places[at.BY_DELAY] = valve_at[j, at.DELAY]
     places[at.BY_PILOT_LAG] = valve_at[j, at.PILOT_LAG]
     places[at.BY_SPOOL_LAG] = valve_at[j, at.SPOOL_LAG]
@@ -99,7 +99,7 @@ def displace(
     circuit: int,
     columns_by: int,
 ) -> None:
-    """Move the displacements of all pumps towards what the pilots ask for, under the common power limit.
+    """Move the displacements of all pumps towards the pilots' demand, under the common power limit.
 
     Args:
         displacement: shares of full ``(pump,)``, moved; `tangents` theirs ``(pump, column)``.

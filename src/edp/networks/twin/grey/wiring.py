@@ -1,4 +1,4 @@
-"""Which channel of a twin is which state of its grey box, and where answers of a machine that turns may lie."""
+"""Assignment of twin channels to grey-box states, and the bounds of outputs for turning machines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FARTHEST_TURN = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """Which channel is which state of the grey box.
+    """Assignment of channels to grey-box states.
 
     Attributes:
         sides: columns of the commands that extend and retract ``(valve, 2)``; -1: none.
@@ -40,7 +40,7 @@ class Wiring:
 
     @staticmethod
     def of(elements: Elements, channels: TwinChannels, scales: TwinScales) -> Wiring:
-        """The wiring of connected elements."""
+        """Return the wiring of connected elements."""
         names = [channel.name for channel in channels.answers]
         commands = [channel.name for channel in channels.commands]
         speeds = [channel.name for channel in channels.velocities]
@@ -82,7 +82,7 @@ class Wiring:
 
 
 def turning_scales(elements: Elements, channels: TwinChannels, scales: TwinScales) -> TwinScales:
-    """Scales whose bounds leave the angles of motors free, but for those on which the load depends.
+    """Return scales that do not bound the angles of motors, except those that influence the load.
 
     Bounds of a stroke are end stops: where the training data end, a cylinder stays. A motor has none.
     """

@@ -1,4 +1,4 @@
-"""Compiled code of tanks, masses and lags, kept on disk by its sources."""
+"""Compiled code of tanks, masses and lags, cached on disk by its sources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tanks, masses and lags as layers: products, quotients and functions of numbers, a few for each step of the solver."""
+"""Tanks, masses and lags as layers: products, quotients and functions, a few for each step of the solver."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ Values = NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class _Tick:
-    """What the layers of one tick are made from: the list in the making, the twin, and what the ports read."""
+    """Context for the layers of one sample: the graph under construction, the twin, and the port readings."""
 
     build: Builder
     twin: ElementsTwin
     fed: str
 
     def numbers(self, elements: list[str], name: str, default: float | None = None) -> Doubles:
-        """One number of each of these elements; `default` of those that have none of this name."""
+        """Return one parameter of each element; `default` for elements without this parameter."""
         places = [self.twin.places.get((element, name), -1) for element in elements]
         if default is None:
             return self.twin.numbers[places]
         return np.array([default if index < 0 else self.twin.numbers[index] for index in places])
 
     def drives(self, name: str, channels: list[str]) -> str:
-        """Commands in SI units, one of each of these channels."""
+        """Add the commands of these channels in SI units."""
         return self.build.pick(name, INPUT, [self.twin.inputs[channel] for channel in channels])
 
     def line(self, name: str, x: str, gain: float | Values, shift: float | Values = 0.0) -> str:
@@ -54,26 +54,26 @@ class _Tick:
         return self.build.add(ScaleShift, name, x, gain=gain * one, shift=shift * one)
 
     def of(self, function: Function, name: str, x: str) -> str:
-        """A function of each number."""
+        """Apply a function to each element."""
         return self.build.add(Activate, name, x, function=function, size=self.build.width(x))
 
     def both(self, name: str, operation: BinaryOperation, a: str, b: str) -> str:
-        """An operation on two values."""
+        """Apply an operation to two values."""
         return self.build.combine(name, operation, a, b)
 
     def read(self, name: str, columns: list[int]) -> str:
-        """What ports read, in SI units."""
+        """Add the port readings in SI units."""
         scales = self.twin.scales
         fed = self.build.pick(name, self.fed, columns)
         return self.line(f"{name}_si", fed, scales.answer_width[columns], scales.answer_offset[columns])
 
     def scaled(self, name: str, x: str, columns: list[int]) -> str:
-        """SI values of answers, scaled."""
+        """Scale SI values of outputs."""
         width, offset = self.twin.scales.answer_width[columns], self.twin.scales.answer_offset[columns]
         return self.line(name, x, 1.0 / width, -offset / width)
 
     def bounded(self, name: str, x: str, columns: list[int]) -> str:
-        """Scaled answers within their bounds."""
+        """Limit scaled outputs to their bounds."""
         scales = self.twin.scales
         offset, width = scales.answer_offset[columns], scales.answer_width[columns]
         low, high = ((end[columns] - offset) / width for end in (scales.low, scales.high))
@@ -81,7 +81,7 @@ class _Tick:
 
 
 def lowered_answers(build: Builder, twin: ElementsTwin, fed: str) -> str:
-    """Scaled answers within their bounds, from SI commands and what the ports read (scaled); see `lumped.run`.
+    """Add the scaled, bounded outputs from SI commands and scaled port readings; see `lumped.run`.
 
     Levels that are not measured are a second feedback edge, which starts where a reset of the twin does.
     """
@@ -183,7 +183,7 @@ def _tanks(tick: _Tick) -> list[tuple[str, list[int]]]:
 
 
 def _risen(tick: _Tick, before: str) -> str:
-    """Changes of all levels in a tick, by the midpoint rule."""
+    """Add the changes of all levels in a sample, by the midpoint rule."""
     twin, build, tanks = tick.twin, tick.build, tick.twin.elements.tanks
     step, inflow = 1.0 / (twin.channels.rate_hz * twin.spec.steps), tick.numbers([t.name for t in tanks], "inflow")
     pumped = np.array([tank.source in twin.inputs for tank in tanks])

@@ -1,4 +1,4 @@
-"""Elements of small physical systems, as a settings file names them, how they connect, and the numbers they have."""
+"""Elements of small physical systems as named in a settings file, their connections and parameters."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class LumpedNumber:
 
 
 def default_parts(channels: TwinChannels) -> Parts:
-    """A mass for each velocity and a lag for each pressure, driven by the commands in their order."""
+    """Return a mass for each velocity and a lag for each pressure, driven by the commands in order."""
     commands = [channel.name for channel in channels.commands]
 
     def command(i: int) -> str:
@@ -170,7 +170,7 @@ def check_parts(parts: Parts, channels: TwinChannels) -> None:
 
 
 def lumped_numbers(parts: Parts, channels: TwinChannels, scales: TwinScales) -> list[LumpedNumber]:
-    """All numbers in a fixed order: tanks, masses, lags; plausible values follow from the scales of the channels."""
+    """Return all parameters in a fixed order (tanks, masses, lags), with typical values from the channel scales."""
     answers = [c.name for c in channels.answers]
     commands = {c.name: float(w) for c, w in zip(channels.commands, scales.command_width, strict=True)}
     rows: list[LumpedNumber] = []

@@ -1,4 +1,4 @@
-"""Free runs of tanks, masses and lags along many lanes, compiled; with complex values each lane carries a slope.
+"""Batched free-run simulation of tanks, masses and lags, compiled; complex values carry one derivative per run.
 
 The imaginary part of a complex step is exact to rounding, so one code is the equations and their derivatives.
 """
@@ -37,7 +37,7 @@ def _log_of_one_and(x: Any) -> Any:
 
 @inner
 def ramp(value: Any, width: Any) -> Any:
-    """A smooth maximum of zero and a value, rounded over the width."""
+    """Return a smooth maximum of zero and a value, rounded over the width."""
     share = value / width
     if share.real > 0.0:
         return width * (_log_of_one_and(np.exp(-share)) + share)
@@ -155,7 +155,7 @@ def _fill_tanks(
 def _tick(
     numbers: Values, command: Doubles, answer: Values, hidden: Values, after: Values, work: Values, wiring: Wiring
 ) -> None:
-    """One tick from what the ports read; writes the answers after it and moves the hidden levels."""
+    """Advance one sample from the port readings: write the next outputs and the hidden levels."""
     after[:] = answer
     _move_masses(numbers, command, answer, after, wiring)
     _move_lags(numbers, command, answer, after, wiring)
@@ -164,7 +164,7 @@ def _tick(
 
 @compiled
 def free_run(numbers: Values, commands: Doubles, answer: Values, hidden: Values, wiring: Wiring) -> Values:
-    """Answers ``(lane, tick, answer)`` on commands alone.
+    """Simulate outputs ``(lane, tick, answer)`` from commands only.
 
     Args:
         numbers: of each lane ``(lane, number)``; `commands` ``(lane, tick, command)``.
@@ -193,7 +193,7 @@ def measured_run(
     hidden: NDArray[np.float32],
     wiring: Wiring,
 ) -> NDArray[np.float32]:
-    """Answers ``(lane, tick, answer)``; a port reads what is measured, or where that is NaN the last answer.
+    """Simulate outputs ``(lane, tick, answer)``; a port reads the measurement, or the last output if it is NaN.
 
     State is rounded at each tick, so that a run that goes on from a kept state is the same one. `answer` and `hidden`
     are moved to the end of the run.

@@ -1,1 +1,1 @@
-"""Faults of the machine, a kind a file."""
+"""Machine faults, one module per fault type."""

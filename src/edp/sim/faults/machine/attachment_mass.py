@@ -1,4 +1,4 @@
-"""The bucket or the attachment is heavier than the machine's numbers say."""
+"""Fault: bucket or attachment is heavier than the machine's parameters state."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from edp.sim.machine import layout as at
 
 
 class CheckLeak(MachineFault):
-    """The share of their opening that load checks let pass backwards grows, in all sections of one axis."""
+    """Backward opening of load checks increases, in all sections of one axis."""
 
     text = "load checks of an axis let oil back; the size is the share of the opening that stays"
     part = "{axis} valve"

@@ -1,4 +1,4 @@
-"""The oil cooler is dirty, or its fan stands."""
+"""Fault: dirty oil cooler, or a stopped fan."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from edp.sim.machine import layout as at
 
 
 class Cooler(MachineFault):
-    """The oil gives less heat to the air, and becomes warmer in the course of minutes."""
+    """Less heat flows from oil to air, so that the oil warms up over minutes."""
 
     text = "the oil cooler takes away less heat; the size is the share that is lost"
     part = "oil cooler"

@@ -8,7 +8,7 @@ from edp.sim.machine import layout as at
 
 
 class FreeAir(MachineFault):
-    """The share of free air grows, and the oil becomes softer."""
+    """The fraction of free air increases, and the oil becomes softer."""
 
     text = "there is more free air in the oil"
     part = "oil"

@@ -11,7 +11,7 @@ REFERENCE_PRESSURE = 200e5
 
 
 class InternalLeak(MachineFault):
-    """A laminar gap beside the piston: its flow goes with the pressure across it and with 1 / viscosity."""
+    """Laminar leakage across the piston: the flow is proportional to its pressure difference and to 1 / viscosity."""
 
     text = "oil passes the seals of the piston"
     part = "{axis} cylinder"

@@ -8,7 +8,7 @@ from edp.sim.machine import layout as at
 
 
 class PowerLimit(MachineFault):
-    """The common power limit of the pumps falls by a share of itself."""
+    """The common power limit of the pumps decreases by a fraction."""
 
     text = "the power limit of the pumps is too low; the size is the share that is lost"
     part = "pump control"

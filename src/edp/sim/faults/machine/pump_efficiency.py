@@ -8,7 +8,7 @@ from edp.sim.machine import layout as at
 
 
 class PumpEfficiency(MachineFault):
-    """The volumetric efficiency falls by a share of itself."""
+    """The volumetric efficiency decreases by a fraction."""
 
     text = "a pump delivers less; the size is the share that is lost"
     part = "{site}"

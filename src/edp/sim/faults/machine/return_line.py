@@ -8,7 +8,7 @@ from edp.sim.machine import layout as at
 
 
 class ReturnLine(MachineFault):
-    """The pressure of the return gallery rises, whatever flows."""
+    """The pressure of the return gallery rises, independent of the flow."""
 
     text = "the pressure of the return line is too high"
     part = "return line"

@@ -10,7 +10,7 @@ from edp.sim.machine import layout as at
 
 
 class StuckSpool(MachineFault):
-    """The travel of one spool behind its dead band ends early, so that a share of its opening is never reached."""
+    """The travel of one spool beyond its dead band is limited, so that part of its opening is never reached."""
 
     text = "a spool sticks before it is open; the size is the share of the opening that is lost"
     part = "{axis} valve"

@@ -1,1 +1,1 @@
-"""Faults of what is shown, a kind a file."""
+"""Sensor faults, one module per fault type."""

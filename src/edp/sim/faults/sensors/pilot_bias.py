@@ -11,7 +11,7 @@ PILOTS = tuple(TABLE_A1)[12:]
 
 
 class PilotBias(SensorFault):
-    """An offset of one one-sided pilot pressure; what the valve gets stays."""
+    """Offset of one one-sided pilot pressure reading; the actual pilot pressure is unchanged."""
 
     text = "a pilot pressure is shown with an offset"
     part = "sensor of pilot pressure {site}"

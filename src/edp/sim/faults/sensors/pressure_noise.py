@@ -10,7 +10,7 @@ from edp.sim.sensors import alterations, chain
 
 
 class PressureNoise(SensorFault):
-    """The white noise of one transmitter grows by a factor; one without noise stays silent."""
+    """White noise of one transmitter increases by a factor; a noise-free transmitter stays noise-free."""
 
     text = "the noise of a cylinder pressure is larger by a factor"
     part = "sensor of {site} pressure"

@@ -8,7 +8,7 @@ from edp.sim.sensors import alterations, chain
 
 
 class PressureScale(SensorFault):
-    """A share of one chamber's pressure is added, before range and converter."""
+    """Scale error of one chamber pressure, before range limits and converter."""
 
     text = "a cylinder pressure is shown too large by a share"
     part = "sensor of {site} pressure"

@@ -8,7 +8,7 @@ from edp.sim.sensors import alterations, chain
 
 
 class StrokeScale(SensorFault):
-    """A share of one cylinder's stroke is added."""
+    """Scale error of one cylinder stroke."""
 
     text = "a stroke is shown too large by a share"
     part = "sensor of {axis} stroke"

@@ -8,7 +8,7 @@ from edp.sim.sensors import alterations, chain
 
 
 class TemperatureOffset(SensorFault):
-    """An offset of the oil temperature; the oil stays as warm as it is."""
+    """Offset of the oil temperature reading; the actual temperature is unchanged."""
 
     text = "the oil temperature is shown with an offset"
     part = "sensor of oil temperature"

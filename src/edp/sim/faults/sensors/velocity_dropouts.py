@@ -10,7 +10,7 @@ from edp.sim.sensors import alterations, chain
 
 
 class VelocityDropouts(SensorFault):
-    """Single ticks at random show 0; the size is their share."""
+    """Random single samples read 0; the size is their fraction."""
 
     text = "a velocity shows 0 for single ticks; the size is their share"
     part = "sensor of {axis} velocity"

@@ -8,7 +8,7 @@ from edp.sim.sensors import alterations, chain
 
 
 class VelocityScale(SensorFault):
-    """A share of one cylinder's velocity is added; its acceleration follows."""
+    """Scale error of one cylinder velocity; its acceleration follows."""
 
     text = "a velocity is shown too large by a share"
     part = "sensor of {axis} velocity"

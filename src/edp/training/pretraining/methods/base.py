@@ -1,4 +1,4 @@
-"""What a method of pretraining is, and their registry."""
+"""Interface and registry of pretraining methods."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Pretraining(Protocol):
     """Whether it adapts to machines within an update; the others walk carried chunks."""
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
-        """What the training has beside its data; None for nothing.
+        """Return the training strategy; None if the method has none.
 
         Raises:
             ConfigError: options that the method has no use for.
@@ -32,7 +32,7 @@ class HasModel(Protocol):
     """A method that needs parts which the network may lack."""
 
     def model(self, spec: ModelSpec) -> ModelSpec:
-        """The network with them.
+        """Return the network with the additional parts.
 
         Raises:
             ConfigError: it has no place for them.

@@ -1,4 +1,4 @@
-"""A code for each machine: one network for all of them, and a few numbers that say which one it is."""
+"""Machine codes: one network for all machines, and a few trained parameters per machine."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Codes:
     episodic: ClassVar[bool] = False
 
     def model(self, spec: ModelSpec) -> ModelSpec:
-        """The network with the block that reads a code, behind the blocks that it has."""
+        """Return the network with a block that reads a code, after its other blocks."""
         if any(isinstance(block, MachineCode) for block in spec.blocks):
             return spec
         return replace(spec, blocks=(*spec.blocks, MachineCode()))
@@ -49,7 +49,7 @@ class Codes:
 
 
 class WithCodes(StreamStrategy):
-    """Learns the codes of the machines that train beside the weights, and keeps the weights alone.
+    """Trains the codes of the training machines together with the weights, and stores the weights only.
 
     Args:
         start: a network to begin with; None begins at random.
@@ -62,7 +62,7 @@ class WithCodes(StreamStrategy):
         """Which streams have a code, and the mean square of the codes of the last chunk."""
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """The training series, each with the number of its machine as what the strategy reads."""
+        """Return the training series, each with its machine number as the strategy column."""
         owned = by_machine(own_series)
         self.machines = len(owned)
         numbers = {name: np.float32(number) for number, name in enumerate(owned)}
@@ -82,7 +82,7 @@ class WithCodes(StreamStrategy):
         return self.start is not None
 
     def tell(self, net: Predictor, strategy_columns: Tensor, reset: Tensor) -> None:
-        """Give each stream the code of its machine, or from its start to its end none."""
+        """Set the code of each stream's machine, or no code for the whole stream."""
         self.block = block = coded_block(net)
         drawn = (torch.rand(len(reset), 1, device=reset.device) >= UNKNOWN).float()
         # Of another size only before the first chunk, with which all streams begin.
@@ -91,7 +91,7 @@ class WithCodes(StreamStrategy):
         block.lanes, self.size = codes * self.told, codes.square().mean()
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
-        """The error, and what keeps codes small; the network is without codes again."""
+        """Return the error plus a penalty on code size; the codes are removed from the network."""
         if self.block is not None:
             self.block.lanes = None
         error = objective.evaluate(
@@ -105,7 +105,7 @@ class WithCodes(StreamStrategy):
 
 
 def coded_block(net: Predictor) -> CodedChannels:
-    """The block of a network that reads a code.
+    """Return the block of a network that reads a code.
 
     Raises:
         StopIteration: it has none.

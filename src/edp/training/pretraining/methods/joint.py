@@ -19,5 +19,5 @@ class Joint:
     episodic: ClassVar[bool] = False
 
     def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
-        """The start, where there is one."""
+        """Return a warm start, if there is a network to start from."""
         return None if start is None else WarmStart(start, unfreeze=False)

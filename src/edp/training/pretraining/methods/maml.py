@@ -47,6 +47,6 @@ class AfterAdaptation(Meta):
         self.second_order = second_order
 
     def cost(self, net: Predictor, objective: Objective, support: Pieces, query: Pieces) -> Tensor:
-        """The query's loss with adapted weights."""
+        """Return the query's loss with adapted weights."""
         weights = adapt(net, self.start_of(net), objective, support, self.spec.steps, self.second_order)
         return loss_with(net, weights, objective, query)
