@@ -57,7 +57,7 @@ def test_the_run_is_that_of_the_chosen_candidate(result):
     assert found.facts["chosen"] in found.facts["candidates"]
     assert json.loads((folder / "auto.json").read_text())["sentence"] == found.sentence
     bundle, experiment, provenance, _ = trained_run(folder)
-    assert provenance["auto"] == found.sentence
+    assert provenance.more["auto"] == found.sentence
     assert experiment.training.bagging is not None
     assert load_bundle(folder).predictor.spec == bundle.predictor.spec
     for one in found.facts["candidates"].values():

@@ -143,7 +143,7 @@ def test_a_run_that_diverged_says_so_again_and_keeps_what_was_good(logs, tmp_pat
     assert (status["status"], status["epoch"], status["update"], status["kept_epoch"]) == ("diverged", 2, 5, 1)
     assert len((run / "history.jsonl").read_text().splitlines()) == 1
     kept = load_bundle(run)
-    assert "the training diverged" in kept.provenance["diverged"]
+    assert "the training diverged" in kept.provenance.more["diverged"]
     bits = _contents(run)
     with pytest.raises(
         Diverged, match=r"diverged on 20.*nan at update 5.*would do so again.*another folder with --out"

@@ -91,7 +91,7 @@ def evaluate(
     from edp.evaluation.guard import network_verdict
     from edp.report.run.choice import promise_line, read_choice
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
-    from edp.storage.provenance import read_provenance
+    from edp.settings.provenance import read_provenance
 
     folder, scores = run_evaluation(run, source, names, as_json, minutes, workforce, at_most)
     verdict = network_verdict(scores, minutes_of(run))

@@ -66,17 +66,18 @@ def train(
         _train_auto(source, folder, config, [*changes, *own], workers, as_json)
         return
     bundle, best = run(data, folder, config, preset, changes, source, as_json)
+    seconds = bundle.provenance.seconds or 0.0
     facts = {
         "run": str(folder),
         "bundle": str(folder / "bundle"),
         "parameters": sum(parameter.numel() for parameter in bundle.predictor.parameters()),
-        "seconds": bundle.provenance["seconds"],
+        "seconds": seconds,
         "validation_mae": best,
     }
 
     def show() -> None:
         tail = "" if best is None else f", validation MAE {figure(best)} (report units)"
-        out.print(f"trained in {duration(bundle.provenance['seconds'])}{tail}; bundle in {folder / 'bundle'}")
+        out.print(f"trained in {duration(seconds)}{tail}; bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
     emit(as_json, facts, show)

@@ -82,7 +82,7 @@ def twin(
     with shown_progress("twin", as_json) as progress:
         source = source_of(data, signal_map, repair)
         trained = train_twin(source, experiment, folder, progress, workers, start)
-    seconds = trained.bundle.provenance["seconds"]
+    seconds = trained.bundle.provenance.seconds or 0.0
     verdict = twin_verdict(trained.scores)
     facts = {
         "run": str(folder),
@@ -95,7 +95,7 @@ def twin(
     facts["candidates"] = plain_value(candidates)
 
     if trained.bundle.ground is not None:
-        facts["ground"] = trained.bundle.provenance.get("ground")
+        facts["ground"] = trained.bundle.provenance.more.get("ground")
 
     def show() -> None:
         show_verdict(verdict)
@@ -123,7 +123,7 @@ def show_trained(trained: TrainedTwin) -> None:
     if note := beyond_sentence(trained.scores["twin"].beyond if trained.scores else {}):
         out.print(note, style="bold")
     score_table(trained.scores)
-    network = provenance.get("residual")
+    network = provenance.more.get("residual")
     if network and not network["helps"]:
         out.print("the network does not help on the validation part: this twin is its grey box alone")
 

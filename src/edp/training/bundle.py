@@ -29,6 +29,8 @@ from edp.networks.integer import IntegerPredictor
 from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain, unknown_parts
 from edp.networks.predictor import Predictor
 from edp.registry import missing_parts, origins_in
+from edp.settings.provenance import Provenance
+from edp.settings.tree import Table
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, write_bytes, write_json
 from edp.storage.headers import ARRAYS_BYTES, read_header
@@ -71,8 +73,8 @@ class Bundle:
     inputs: tuple[Channel, ...]
     target_kinds: tuple[Kind, ...]
     descriptions: tuple[str, ...]
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    scores: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
+    scores: Table = field(default_factory=dict)
     adaptation: Adaptation | None = None
 
     @property
@@ -82,10 +84,12 @@ class Bundle:
 
 
 def make_bundle(
-    predictor: Predictor, data: Prepared, provenance: Mapping[str, Any], scores: Mapping[str, Any] | None = None
+    predictor: Predictor, data: Prepared, provenance: Provenance | None = None, scores: Table | None = None
 ) -> Bundle:
     """Create a bundle of a predictor trained with `data`."""
-    return Bundle(predictor, data.inputs, data.target_kinds, data.descriptions, provenance, scores or {})
+    return Bundle(
+        predictor, data.inputs, data.target_kinds, data.descriptions, provenance or Provenance(), scores or {}
+    )
 
 
 def weights_digest(predictor: Predictor) -> str:
@@ -135,7 +139,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
             for name, kind, text in zip(task.targets, bundle.target_kinds, bundle.descriptions, strict=True)
         ],
         "weights": {"file": weights, "blake2b": digest},
-        "provenance": dict(bundle.provenance),
+        "provenance": bundle.provenance.to_table(),
         "scores": dict(bundle.scores),
     }
     referenced = {weights}
@@ -294,7 +298,7 @@ def _assembled(header: dict[str, Any], path: Path) -> Bundle:
         integers = {name: x.numpy() for name, x in load(read_arrays(path, header["integers"])).items()}
         predictor = IntegerPredictor(predictor, Formats(_formats(header["formats"]), integers))
     adaptation = _adaptation(header["adaptation"], task, path) if header["schema"] == ADAPTED_SCHEMA else None
-    provenance = object_with(header["provenance"], (), "its provenance")
+    provenance = Provenance.from_table(object_with(header["provenance"], (), "its provenance"), "its provenance")
     scores = object_with(header["scores"], (), "its scores")
     return Bundle(predictor.eval(), inputs, kinds, texts, provenance, scores, adaptation)
 

@@ -11,7 +11,7 @@ import torch
 from safetensors.numpy import save
 
 from edp.config.experiment import Experiment, experiment_toml, load_experiment, plain_tree
-from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
+from edp.data.frozen import frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
 from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
@@ -35,10 +35,12 @@ from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import FLOOR, note_test_result
+from edp.settings.provenance import Provenance, read_provenance
+from edp.settings.tree import Table
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.headers import digests_of
 from edp.storage.paths import is_folder_at, is_there
-from edp.storage.provenance import read_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.blas import one_blas_thread
@@ -94,7 +96,7 @@ class StrategyFactory:
         frozen: names by digest of sessions that stay frozen for what comes of the run, beside those of its split.
     """
 
-    facts: Mapping[str, Any]
+    facts: Table
     strategy: Callable[[Prepared], TrainingStrategy | DirectFit]
     frozen: Mapping[str, str] = field(default_factory=dict)
 
@@ -144,15 +146,16 @@ def train(
         except Diverged as end:
             if end.fitted is not None:
                 # Without weights from before the divergence there is nothing to keep.
-                provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen) | taught
-                _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
+                provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen)
+                _keep(run, end.fitted, provenance.with_entries(**taught, diverged=str(end)), data)
             run.write_status("diverged", message=str(end), **end.facts)
             raise
-        return _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, frozen) | taught, data)
+        provenance = _provenance(source, experiment, data, fitted.seconds, frozen).with_entries(**taught)
+        return _keep(run, fitted, provenance, data)
 
 
 def keep_fitted(
-    run: Run, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: dict[str, Any]
+    run: Run, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: Table
 ) -> Bundle:
     """Write what `train` writes into an open run, for a training that took place elsewhere.
 
@@ -166,12 +169,13 @@ def keep_fitted(
     """
     run.write_settings(experiment_toml(experiment))
     run.write_history(fitted.history)
-    return _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, {}) | facts, data)
+    provenance = _provenance(source, experiment, data, fitted.seconds, {}).with_entries(**facts)
+    return _keep(run, fitted, provenance, data)
 
 
-def _keep(run: Run, fitted: Fitted, provenance: dict[str, Any], data: Prepared) -> Bundle:
+def _keep(run: Run, fitted: Fitted, provenance: Provenance, data: Prepared) -> Bundle:
     """Write what a training leaves: provenance, footprint and the bundle."""
-    write_json(run.file("provenance.json"), provenance)
+    write_json(run.file(PROVENANCE), provenance.to_table())
     write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json())
     bundle = make_bundle(fitted.predictor, data, provenance)
     save_bundle(bundle, run.file("bundle"))
@@ -194,11 +198,11 @@ def _refuse_diverged(run: Run) -> None:
 
 def _provenance(
     source: DataSource, experiment: Experiment, data: Prepared, seconds: float, frozen: Mapping[str, str]
-) -> dict[str, Any]:
+) -> Provenance:
     training = experiment.training
     sealed = {**frozen, **frozen_of(experiment.split)}
-    facts = {"regime": training.chunks.regime, "device": training.device}
-    return training_provenance(source, data, training.seed, thread_count(training), seconds, sealed) | facts
+    provenance = training_provenance(source, data, training.seed, thread_count(training), seconds, sealed)
+    return provenance.with_entries(regime=training.chunks.regime, device=training.device)
 
 
 JudgedBy = Callable[[ModelBench, str], Mapping[str, JudgedModel]]
@@ -248,7 +252,7 @@ def evaluate(
     key = run_key(how | {"weights": weights_digest(bundle.predictor)}, " ".join(judged))
     scores = earlier_scores(target, key)
     if scores is None:
-        label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
+        label, seconds = describe(bundle.predictor.spec), provenance.seconds or 0.0
         if judged_by is None:
             evaluation = judge(bundle.predictor, data, chosen, label, seconds, progress, minutes)
         else:
@@ -265,13 +269,13 @@ def evaluate(
         scores.write(target)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
-        save_bundle(replace(bundle, scores=scores.models["network"].overall), folder / "bundle")
+        save_bundle(replace(bundle, scores=dict(scores.models["network"].overall)), folder / "bundle")
     return target
 
 
-def other_recordings(source: DataSource | None, provenance: Mapping[str, Any]) -> list[Recording] | None:
+def other_recordings(source: DataSource | None, provenance: Provenance) -> list[Recording] | None:
     """Other recordings, those without a map read with that of the run; None for the held-out ones."""
-    return None if source is None else read_as_before(source, provenance["data"]["reader"]).read()
+    return None if source is None else read_as_before(source, provenance.origin.reader).read()
 
 
 def _check_run_writable(folder: Path) -> None:
@@ -280,7 +284,7 @@ def _check_run_writable(folder: Path) -> None:
         check_writable(folder)
 
 
-def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepared]:
+def trained_run(folder: Path) -> tuple[Bundle, Experiment, Provenance, Prepared]:
     """Bundle, settings, provenance and data of a run, the data checked to be what it was trained on.
 
     Raises:
@@ -290,10 +294,10 @@ def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepa
     provenance = read_provenance(folder)
     experiment = load_experiment(folder / "config.toml", preset=None)
     torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
-    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment, frozen_before(provenance))
-    if data.digest != provenance["data"]["digest"]:
+    data = prepare_data(DataSource.from_plain(provenance.origin.reader), experiment, provenance.origin.frozen)
+    if data.digest != provenance.origin.digest:
         raise DataError(
-            f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "
+            f"the recordings in '{provenance.origin.source}' changed since '{folder}' was trained; the held-out "
             "split would not be the same: train again, or judge other recordings with --data"
         )
     return bundle, experiment, provenance, data

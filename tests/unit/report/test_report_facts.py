@@ -17,6 +17,7 @@ from edp.report.run.facts import (
     verdict_lines,
 )
 from edp.report.run.outputs import judged_line
+from edp.settings.provenance import DataOrigin, DataPart, Provenance
 from edp.storage import write_json
 from edp.wording import decimals_for, duration, listed, number, percent, unbroken
 
@@ -122,7 +123,7 @@ def test_test_logs_are_named_with_what_they_cannot_prove(run_folder):
         network = replace(facts.models[NETWORK], recordings={name: {} for name in names})
         return replace(facts.scores, models={NETWORK: network})
 
-    trained = {"data": {"train": {"names": ["dig_1", "travel_1"]}}}
+    trained = Provenance(data=DataOrigin(train=DataPart(names=("dig_1", "travel_1"))))
     assert judged_line(scores(), trained) == ""
     assert "So few that one odd log decides" in judged_line(scores("dig_2", "dig_3"), trained)
     same = judged_line(scores("dig_2", "dig_3", "dig_4"), trained)

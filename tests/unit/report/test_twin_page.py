@@ -17,6 +17,7 @@ from edp.report.common.interactive import plots
 from edp.report.twin.charts import twin_charts
 from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles, verdict
 from edp.report.twin.page import render
+from edp.settings.provenance import Provenance
 from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
 from edp.workflows.twin.judge_twin import reported_channels, shown_runs, write_scores
@@ -49,6 +50,11 @@ def facts_of(**options):
     return FreeRunFacts("m22", content, shown_runs(runs, intervals))
 
 
+def grounded(ground, data=None):
+    more = {"ground": ground} | ({"ground_data": data} if data else {})
+    return replace(facts_of(), provenance=Provenance(more=more))
+
+
 @pytest.mark.parametrize(
     ("ground", "says"),
     [
@@ -57,16 +63,22 @@ def facts_of(**options):
     ],
 )
 def test_a_ground_is_told_with_what_it_explains(ground, says):
-    lines = verdict(replace(facts_of(), provenance={"ground": ground, "ground_data": {"source": "loam"}}))
+    lines = verdict(
+        replace(facts_of(), provenance=Provenance(more={"ground": ground, "ground_data": {"source": "loam"}}))
+    )
     (line,) = (one for one in lines if "ground" in one)
     assert says in line.replace("\xa0", " ")
     assert line.endswith("free runs and errors of this page are in free air.")
 
 
 def test_a_ground_of_a_stranger_is_text():
-    text = render(replace(facts_of(), provenance={"ground": {"kind": HOSTILE}, "ground_data": {"source": HOSTILE}}))
+    text = render(
+        replace(
+            facts_of(), provenance=Provenance(more={"ground": {"kind": HOSTILE}, "ground_data": {"source": HOSTILE}})
+        )
+    )
     assert "<img src=x" not in text
-    assert not any("ground" in line for line in verdict(replace(facts_of(), provenance={"ground": [HOSTILE]})))
+    assert not any("ground" in line for line in verdict(grounded([HOSTILE])))
 
 
 def plots_of(facts):

@@ -116,7 +116,7 @@ def test_coverage_is_counted_by_channel_and_time():
 def test_they_come_back_with_the_twin_and_earlier_twins_have_none(tmp_path):
     twin, series = twin_and_series()
     intervals = calibrated([(twin, series[:2])], FreeRunJudgeSpec(seconds=2.0))
-    save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin, {}, {}, intervals), tmp_path)
+    save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin, intervals=intervals), tmp_path)
     loaded = load_twin(tmp_path).intervals
     assert loaded.to_plain() == intervals.to_plain()
     save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin), tmp_path)

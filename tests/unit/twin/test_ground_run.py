@@ -57,7 +57,7 @@ def test_a_run_with_a_ground_keeps_equations_and_scores(grounded, start, loam):
     assert isinstance(after.ground, DragLaw)
     assert all((after.twin.arrays()[name] == values).all() for name, values in before.twin.arrays().items())
     assert after.scores == before.scores == trained.scores
-    facts = after.provenance["ground"]["explained"]
+    facts = after.provenance.more["ground"]["explained"]
     assert set(facts) == {"train", "validation"}
     rows = json.loads((run / "datasheet.json").read_text())["numbers"]
     assert [row["element"] for row in rows] == ["pump", *["ground"] * 13]

@@ -248,6 +248,6 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
     if checks:
         fitting = sum(check.fits for check in checks)
         tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
-    elif (facts.provenance or {}).get("parameters") is not None:
-        tiles.append((count_text((facts.provenance or {})["parameters"]), "", "parameters"))
+    elif facts.provenance is not None and facts.provenance.more.get("parameters") is not None:
+        tiles.append((count_text(facts.provenance.more["parameters"]), "", "parameters"))
     return [tile for tile in tiles if tile[0] != MISSING]

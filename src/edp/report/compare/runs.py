@@ -15,6 +15,7 @@ from edp.errors import ConfigError, DataError, count_of
 from edp.evaluation.free_run_file import TWIN, ChannelErrors
 from edp.report.run.facts import NETWORK, TRUTH, Facts, label_of, read_facts, read_history
 from edp.report.twin.facts import holds_free_runs, read_free_runs
+from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import unfinished_text
@@ -189,9 +190,8 @@ def _outputs(facts: Facts) -> list[tuple[str, str]]:
     return [(MEAN, facts.unit), *outputs] if facts.averaged else outputs
 
 
-def _digest(provenance: Mapping[str, Any] | None) -> str:
-    data = (provenance or {}).get("data", {})
-    return str(data.get("digest") or "") if isinstance(data, Mapping) else ""
+def _digest(provenance: Provenance | None) -> str:
+    return "" if provenance is None else provenance.origin.digest or ""
 
 
 def _costs(facts: Facts) -> dict[str, float]:
@@ -236,7 +236,7 @@ def _twin(path: Path, name: str) -> ComparedRun:
         errors=errors,
         curves=curves,
         history=read_history(history) if is_file_at(history) else (),
-        costs=_positive({"Parameters": facts.provenance.get("parameters")}),
+        costs=_positive({"Parameters": facts.provenance.more.get("parameters")}),
         digest=_digest(facts.provenance),
     )
 

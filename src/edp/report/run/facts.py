@@ -14,9 +14,11 @@ from edp.errors import DataError, StorageError, count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, network_verdict
 from edp.evaluation.scores_file import MEAN, ModelScores, ScoredTarget, ScoresFile, error_at
 from edp.report.run.outputs import by_output, judged_line, losses_line, minutes_of, situation_line
+from edp.settings.provenance import DataOrigin, Provenance
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, parse_toml, read_json, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at, is_folder_at
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import unfinished_text
 from edp.storage.seals import HASH, check_sealed_line, is_sealed_line
 from edp.wording import decimals_for, figure, interval, interval_decimals, listed, number, percent, unit_text
@@ -56,7 +58,7 @@ class Facts:
 
     folder: Path
     config: str | None = None
-    provenance: Mapping[str, Any] | None = None
+    provenance: Provenance | None = None
     history: tuple[Mapping[str, Any], ...] = ()
     scores: ScoresFile | None = None
     footprint: Mapping[str, Any] | None = None
@@ -80,7 +82,7 @@ class Facts:
     def rate_hz(self) -> float | None:
         """Samples per second, or None where the run does not say."""
         task_rate = None if self.scores is None else self.scores.task.rate_hz
-        rate = task_rate or (self.provenance or {}).get("data", {}).get("rate_hz")
+        rate = task_rate or (None if self.provenance is None else self.provenance.origin.rate_hz)
         return float(rate) if rate else None
 
     @property
@@ -131,7 +133,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
     def json_part(name: str) -> Any:
         return None if name in absent else read_object(folder / name)
 
-    provenance = json_part("provenance.json")
+    provenance = None if PROVENANCE in absent else Provenance.read(folder)
     facts = Facts(
         folder=folder,
         config=None if "config.toml" in absent else read_settings(folder / "config.toml"),
@@ -192,15 +194,15 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     return tuple(epochs)
 
 
-def read_limit(path: Path | None, provenance: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+def read_limit(path: Path | None, provenance: Provenance | None) -> Mapping[str, Any] | None:
     """The limit in a file, or in the folder that the run's data came from; None where there is none.
 
     Raises:
         StorageError: the file that was named is missing, or a limit is damaged.
     """
     if path is None:
-        data = (provenance or {}).get("data", {})
-        source = Path(str((data.get("reader") or {}).get("path") or data.get("source") or ""))
+        origin = DataOrigin() if provenance is None else provenance.origin
+        source = Path(str(origin.reader.get("path") or origin.source or ""))
         path = source / LIMIT_FILE
         if not is_folder_at(source) or not is_file_at(path):
             return None

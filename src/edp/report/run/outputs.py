@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from edp.data.splits import kind_of_name
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME, NETWORK, lost_outputs
 from edp.evaluation.scores_file import DataSituation, ScoresFile, TargetChange, error_at
+from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.paths import is_file_at
-from edp.storage.provenance import recording_names
 from edp.wording import behind, listed, number, percent
 
 SHOWN = 4
@@ -40,7 +39,7 @@ def losses_line(scores: ScoresFile) -> str:
     return f"At some time ahead a baseline has less error on {len(losses)} of {outputs}: {listed(parts)}{more}."
 
 
-def judged_line(scores: ScoresFile, provenance: Mapping[str, Any] | None) -> str:
+def judged_line(scores: ScoresFile, provenance: Provenance | None) -> str:
     """Which logs were judged, and a warning where they are few or all of one kind; empty where scores name none.
 
     Args:
@@ -52,7 +51,7 @@ def judged_line(scores: ScoresFile, provenance: Mapping[str, Any] | None) -> str
         return ""
     shown = listed(judged[:SHOWN]) if len(judged) <= SHOWN else f"{', '.join(judged[:SHOWN])} and others"
     line = f"Judged on {count_of(len(judged), 'test log')}: {shown}."
-    trained = recording_names(provenance or {}, "train")
+    trained = set() if provenance is None else provenance.recording_names("train")
     kinds = {kind_of_name(name) for name in judged}
     others = {kind_of_name(name) for name in trained} - kinds
     if len(judged) < FEW:

@@ -65,7 +65,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "title": title or (facts.scores.task.name if facts.scores else "") or full_path(facts.folder).name,
         "network": network,
         "run_name": full_path(facts.folder).name,
-        "created": moment((facts.provenance or {}).get("created")),
+        "created": moment(facts.provenance.created if facts.provenance else None),
         "headline": unbroken(run.headline(facts)),
         "verdict": run.verdict_lines(facts),
         "tiles": tables.key_figures(facts),

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +32,7 @@ from edp.evaluation.free_run_file import (
 from edp.evaluation.guard import twin_verdict
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
+from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_file_at
@@ -60,7 +60,7 @@ class FreeRunFacts:
     title: str
     content: FreeRunFile
     shown: Mapping[str, NDArray[np.float32]]
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
     candidates: Sequence[CandidateRow] = ()
     steps: StepResponses | None = None
 
@@ -111,8 +111,8 @@ def read_free_runs(folder: str | Path) -> FreeRunFacts:
     except (OSError, SafetensorError) as error:
         raise StorageError(f"cannot read '{path / RUNS}' ({error}); run edp evaluate {folder}") from error
     header = path / "twin" / "twin.json"
-    provenance = read_object(header).get("provenance") if is_file_at(header) else {}
-    origin = provenance if isinstance(provenance, dict) else {}
+    stated = read_object(header).get("provenance") if is_file_at(header) else {}
+    origin = Provenance.from_table(stated if isinstance(stated, dict) else {}, f"'{header}', provenance")
     facts = FreeRunFacts(full_path(path).name, content, shown, origin, read_candidates(path), read_steps(path))
     _check_arrays(facts, path / RUNS)
     return facts
@@ -170,7 +170,7 @@ def verdict(facts: FreeRunFacts) -> list[str]:
     lines = [
         f"{count_of(twin.runs, 'free run')} of {figure(twin.seconds)} s in "
         f"{count_of(twin.recordings, 'recording')} that trained nothing."
-        if facts.provenance
+        if facts.provenance != Provenance()
         else f"{count_of(twin.runs, 'free run')} of {figure(twin.seconds)} s."
     ]
     lines += [f"It is {sentence}" for sentence in (choice_sentence(facts.candidates),) if sentence]
@@ -186,13 +186,13 @@ def verdict(facts: FreeRunFacts) -> list[str]:
     return lines
 
 
-def ground_line(provenance: Mapping[str, Any]) -> str:
+def ground_line(provenance: Provenance) -> str:
     """The law of the ground and what it explains, in a sentence; empty where the twin knows free air alone.
 
     Args:
         provenance: of the run; what is not as `edp twin` wrote it is passed over.
     """
-    facts = provenance.get("ground")
+    facts = provenance.more.get("ground")
     if not isinstance(facts, Mapping):
         return ""
     explained, kind = facts.get("explained"), facts.get("kind")

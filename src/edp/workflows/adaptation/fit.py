@@ -57,7 +57,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     with Run.create(out, "adaptation", key, experiment_toml(experiment)) as target:
         if is_file_at(folder / HISTORY):
             write_bytes(target.file(HISTORY), (folder / HISTORY).read_bytes())
-        write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})
+        write_json(target.file("provenance.json"), provenance.with_entries(adaptation=adaptation.digest).to_table())
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         # The footprint counts the adaptation too; the one of the source run would state too little.
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json())

@@ -17,6 +17,7 @@ from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
 from edp.progress import SILENT, Progress
 from edp.report.run.choice import FILE, FLOOR, PERSISTENCE, read_choice
+from edp.settings.provenance import Provenance
 from edp.storage import write_json
 from edp.storage.runs import FINISHED, Run, check_claimable, run_key, state_of
 from edp.training import Bundle, load_bundle, make_bundle, save_bundle
@@ -139,7 +140,8 @@ def _write_choice(
     write_json(run.file(FILE), facts)
     if floor is not None and winner is not floor:
         # What the skill is measured against: `edp evaluate` needs its error on the test recordings, too.
-        save_bundle(make_bundle(floor.fitted.predictor, data, {"auto": facts["sentence"]}), run.file(FLOOR))
+        provenance = Provenance().with_entries(auto=facts["sentence"])
+        save_bundle(make_bundle(floor.fitted.predictor, data, provenance), run.file(FLOOR))
     bundle = keep_fitted(run, source, winner.experiment, data, winner.fitted, {"auto": facts["sentence"]})
     return AutoResult(bundle, facts)
 

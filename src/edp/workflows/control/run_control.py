@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,9 @@ from edp.progress import SILENT, Progress
 from edp.report import ControlFacts, write_control_page
 from edp.report.animation.page import scene_of
 from edp.report.common.provenance import provenance_rows
+from edp.settings.provenance import Provenance, new_provenance
 from edp.storage import make_folder, write_json
-from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, check_free, run_key
 from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.control.kept import keep_controller
@@ -82,14 +83,13 @@ def control_loops(
         keep_controller(run.path, bench.plant, bench.models, chosen.twin, (bench.tasks[0], results[0]))
         content = _content(experiment, bench.tasks, results)
         write_json(run.file(RESULTS), content)
-        provenance = new_provenance() | {
-            "seed": experiment.seed,
-            "machine": content["machine"],
-            "plant": content["plant"] if chosen.plant is None else str(chosen.plant),
-            "twin": str(chosen.twin or ""),
-            "predictor": str(chosen.predictor or ""),
-        }
-        write_json(run.file(PROVENANCE), provenance)
+        provenance = replace(new_provenance(), seed=experiment.seed).with_entries(
+            machine=content["machine"],
+            plant=content["plant"] if chosen.plant is None else str(chosen.plant),
+            twin=str(chosen.twin or ""),
+            predictor=str(chosen.predictor or ""),
+        )
+        write_json(run.file(PROVENANCE), provenance.to_table())
         page = write_control_page(_facts(run.path.name, content, results, provenance), run.file(PAGE))
     return ControlRun(content, results, page)
 
@@ -165,7 +165,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _facts(
-    title: str, content: Mapping[str, Any], results: Sequence[LoopResult], provenance: Mapping[str, Any]
+    title: str, content: Mapping[str, Any], results: Sequence[LoopResult], provenance: Provenance
 ) -> ControlFacts:
     recordings = [result.recording for result in results]
     scene = scene_of(recordings[0], str(content["machine"]))

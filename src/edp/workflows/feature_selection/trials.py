@@ -273,7 +273,7 @@ class _Finished:
             bundle.task.inputs,
             len(bundle.task.features.features),
             parameters_of(bundle.predictor),
-            float(bundle.provenance["seconds"]),
+            bundle.provenance.seconds or 0.0,
             ScoresFile.read(run),
         )
 

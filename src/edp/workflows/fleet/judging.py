@@ -16,9 +16,9 @@ from edp.jobs.units import UnitResult, WorkUnit, forget_units, run_units
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.progress import SILENT, Progress
+from edp.settings.provenance import read_provenance
 from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import full_path
-from edp.storage.provenance import read_provenance
 from edp.training.blas import one_blas_thread
 from edp.workflows.judged_data import judged_data
 from edp.workflows.train_evaluate import evaluate, other_recordings, trained_run
@@ -72,7 +72,7 @@ def evaluate_with(
             for name, result in zip(names, results[: len(models)], strict=True)
         }
         measured = (unpacked(result.content or b"", JudgedPart) for result in results[len(models) :])
-        label, seconds = describe(bench.predictor.spec), float(read_provenance(folder)["seconds"])
+        label, seconds = describe(bench.predictor.spec), read_provenance(folder).seconds or 0.0
         judged[NETWORK] = bench.network_of(measured, label, seconds)
         return {name: judged[name] for name in [NETWORK, *by_effort(spec.baselines)]}
 

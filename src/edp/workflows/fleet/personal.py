@@ -159,10 +159,8 @@ def network_of(folder: str | Path, machine: str, out: str | Path, base: str | Pa
     bundle = load_bundle(base or content["source"])
     delta = read_delta(Path(folder, DELTAS, file_of(machine)))
     own = with_delta(bundle.predictor, delta)
-    provenance = {
-        **bundle.provenance,
-        "strategy": {"method": "delta", "source": {"weights": delta.base}, **delta.facts},
-    }
+    strategy = {"method": "delta", "source": {"weights": delta.base}, **delta.facts}
+    provenance = bundle.provenance.with_entries(strategy=strategy)
     return save_bundle(replace(bundle, predictor=own, provenance=provenance, scores={}), out)
 
 

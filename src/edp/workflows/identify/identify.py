@@ -199,7 +199,8 @@ def identify(
             facts | {"numbers": [row.plain() for row in rows], "models": plain_value(scores)},
         )
         seconds = time.process_time() - began
-        write_json(opened.file(PROVENANCE), training_provenance(source, data, settings.training.seed, 1, seconds))
+        provenance = training_provenance(source, data, settings.training.seed, 1, seconds)
+        write_json(opened.file(PROVENANCE), provenance.to_table())
         write_json(opened.file(RESULT), {"schema": 1, "machine": str(target)})
     return Identified(written, rows, scores, notes)
 

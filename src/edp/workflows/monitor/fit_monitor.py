@@ -29,11 +29,12 @@ from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.sandbox.helpers import Helpers
+from edp.settings.provenance import new_provenance
 from edp.signals import Channel
 from edp.storage import write_json
 from edp.storage.headers import model_digest
 from edp.storage.paths import is_there
-from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.reading import object_with
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training.blas import one_blas_thread
@@ -109,7 +110,7 @@ def fit_monitor(
     settings = monitor_toml(experiment)
     models = [model_digest(run) for run in runs]
     origin = source.origin(recordings)
-    key = run_key({"monitor": settings, "models": models}, origin["digest"])
+    key = run_key({"monitor": settings, "models": models}, origin.digest or "")
     with Run.create(out, "monitor", key, settings) as opened:
         if opened.is_finished:
             return _read_fitted(opened.path, experiment)
@@ -121,8 +122,8 @@ def fit_monitor(
             fitted = fit_to_recordings(
                 recordings, experiment, bundles, progress, side_by_side=map if helpers.workers == 1 else side_by_side
             )
-        provenance = new_provenance(origin) | {"seed": experiment.seed, "seconds": round(fitted.seconds, 2)}
-        write_json(opened.file(PROVENANCE), provenance)
+        provenance = replace(new_provenance(origin), seed=experiment.seed, seconds=round(fitted.seconds, 2))
+        write_json(opened.file(PROVENANCE), provenance.to_table())
         return replace(fitted, folder=save_monitor(fitted.monitor, opened.path))
 
 

@@ -16,6 +16,7 @@ from edp.monitor.traces import read_traces
 from edp.report.common.provenance import provenance_rows
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts
 from edp.report.monitor.page import write_monitor_page
+from edp.settings.provenance import Provenance
 from edp.storage import JSON_BYTES, object_with, parse_json, read_object, read_text
 from edp.storage.headers import FILES, check_files
 from edp.storage.paths import full_path, is_there
@@ -82,9 +83,9 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     )
 
 
-def _provenance(folder: Path, content: Mapping[str, Any]) -> Mapping[str, Any]:
+def _provenance(folder: Path, content: Mapping[str, Any]) -> Provenance:
     file = folder / PROVENANCE
-    return {**content, **(read_object(file) if is_there(file) else {})}
+    return Provenance.from_table({**content, **(read_object(file) if is_there(file) else {})}, f"'{file}'")
 
 
 def _remarks(content: Mapping[str, Any], where: str) -> dict[str, list[str]]:

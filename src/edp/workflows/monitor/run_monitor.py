@@ -22,9 +22,10 @@ from edp.monitor.traces import RecordingTrace, RunTraces, write_traces
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.monitor.facts import start_time
+from edp.settings.provenance import new_provenance
 from edp.storage import write_bytes, write_json
 from edp.storage.headers import FILES, digests_of, model_digest
-from edp.storage.provenance import PROVENANCE, new_provenance
+from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, check_claimable, run_key
 
 ALARM_LOG, RESULT = "alarms.jsonl", "monitor_run.json"
@@ -148,9 +149,10 @@ def run_monitor(
     )  # fmt: skip
     if out is not None:
         origin = source.origin(recordings)
-        key = run_key({"monitor": model_digest(folder)}, origin["digest"])
+        key = run_key({"monitor": model_digest(folder)}, origin.digest or "")
         with Run.create(out, "monitor run", key) as opened:
-            write_json(opened.file(PROVENANCE), new_provenance(origin) | {"monitor": str(folder)})
+            provenance = new_provenance(origin).with_entries(monitor=str(folder))
+            write_json(opened.file(PROVENANCE), provenance.to_table())
             _write(run, opened.path, str(folder))
     return run
 

@@ -20,7 +20,6 @@ from edp.config.experiment import (
     plain_tree,
 )
 from edp.data.features import FEATURE_SETS
-from edp.data.frozen import frozen_before
 from edp.data.prepared import Prepared
 from edp.data.splits import ByTime
 from edp.data.task import Task
@@ -61,7 +60,7 @@ class SourceModel:
     @property
     def frozen(self) -> dict[str, str]:
         """Names by digest of sessions that a model search set apart for good."""
-        return frozen_before(self.bundle.provenance)
+        return dict(self.bundle.provenance.origin.frozen)
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from edp.report.common.picture import file_name
 from edp.signals import Channel
 from edp.storage import replacing_folder
 from edp.storage.paths import entries_of, is_folder_at, is_there
-from edp.storage.provenance import recording_names
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.wording import typed
 
@@ -120,7 +119,7 @@ def forecast_logs(
 
 def _chosen_gain(bundle: TwinBundle, recordings: Sequence[Recording], horizons: Sequence[int]) -> float:
     """A gain by logs from which the twin learned; where none of these is among the logs, by the first ones."""
-    learned_names = recording_names(bundle.provenance, "train", "validation")
+    learned_names = bundle.provenance.recording_names("train", "validation")
     chosen = [logged for logged in recordings if logged.name in learned_names] or list(recordings)
     task = bundle.twin.channels.task()
     series = [task.series(_checked(bundle.twin, logged)) for logged in chosen[:CHOICE_LOGS]]

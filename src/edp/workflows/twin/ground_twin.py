@@ -72,8 +72,9 @@ def ground_twin(
         basis = f"{BASIS}; {GROUND_BASIS}"
         write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": basis, "numbers": rows})
         write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows, basis).encode())
-        facts = fitted.facts() | base.provenance() | {"ground_data": {"source": source.label, "digest": data.digest}}
-        bundle = replace(base.bundle, ground=fitted.law, provenance={**base.bundle.provenance, **facts})
+        contact = {"source": source.label, "digest": data.digest}
+        facts = fitted.facts() | base.provenance() | {"ground_data": contact}
+        bundle = replace(base.bundle, ground=fitted.law, provenance=base.bundle.provenance.with_entries(**facts))
         for name in JUDGED:
             # In free air it is the twin that was judged there, so its page needs no evaluation of its own.
             if is_file_at(base.folder / name):

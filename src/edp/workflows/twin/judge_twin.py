@@ -41,7 +41,6 @@ from edp.recording import Recording
 from edp.signals import KINDS, Channel
 from edp.storage import check_writable, make_folder, write_bytes
 from edp.storage.headers import digests_of
-from edp.storage.provenance import recording_names
 from edp.training import load_bundle
 from edp.training.twin_bundle import TwinBundle, load_twin
 from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
@@ -72,7 +71,7 @@ def judge_twin(
     twin, spec = bundle.twin, experiment.judge
     progress.note("free runs of the twin")
     runs = free_runs(twin, data.test, spec.seconds, spec.starts)
-    beyond = commands_beyond(bundle.provenance.get(RANGES), twin.channels, [part.inputs for part in data.test])
+    beyond = commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [part.inputs for part in data.test])
     own = free_run_scores(runs, spec, bundle.intervals, labels)
     scores = {TWIN: replace(own, ahead=_ahead(twin, data, spec), beyond=beyond)}
     for name in spec.floors:
@@ -168,16 +167,16 @@ def evaluate_twin(
     check_writable(folder)
     experiment = load_twin_experiment(folder / "config.toml")
     progress.note("reading recordings")
-    recordings = DataSource.from_plain(bundle.provenance["data"]["reader"]).read()
+    recordings = DataSource.from_plain(bundle.provenance.origin.reader).read()
     channels, data = prepared_twin(recordings, experiment)
-    if data.digest != bundle.provenance["data"]["digest"]:
+    if data.digest != bundle.provenance.origin.digest:
         raise DataError(
-            f"the recordings in '{bundle.provenance['data']['source']}' changed since '{folder}' was trained; the "
+            f"the recordings in '{bundle.provenance.origin.source}' changed since '{folder}' was trained; the "
             "held-out part would not be the same: train again, or judge other recordings with --data"
         )
     target = folder
     if source is not None:
-        source = read_as_before(source, bundle.provenance["data"]["reader"])
+        source = read_as_before(source, bundle.provenance.origin.reader)
         recordings = [matched(channels, recording) for recording in source.read()]
         data = replace(data, test=[channels.task().series(recording) for recording in recordings])
         target = make_folder(folder / f"on_{source.short_name}")
@@ -216,7 +215,7 @@ def beside_predictor(
     predicted = _at_moments(predictor, pieces, ahead)
     columns = {name: predicted[:, task.targets.index(name)] for name in names}
     # A recording that trained the predictor flatters it: a reader must know.
-    trained = recording_names(bundle.provenance, "train")
+    trained = bundle.provenance.recording_names("train")
     seen = sorted({part.name for part in test if part.name in trained})
     return PredictorComparison(
         run=str(run),

@@ -80,7 +80,7 @@ def rollout_log(
     """
     bundle = load_twin(run)
     twin = bundle.twin
-    recording = matched(twin.channels, _only(read_as_before(source, bundle.provenance["data"]["reader"]).read()))
+    recording = matched(twin.channels, _only(read_as_before(source, bundle.provenance.origin.reader).read()))
     measured_columns = _columns(twin, measured)
     series = twin.channels.task().series(recording)
     start, ticks = _span(twin, recording, seconds, start_s)
@@ -104,7 +104,7 @@ def rollout_log(
         start / recording.rate_hz,
         None if intervals is None else intervals.coverage,
         None if intervals is None else intervals.ticks[-1] / recording.rate_hz,
-        commands_beyond(bundle.provenance.get(RANGES), twin.channels, [commands[0, prefix:]]),
+        commands_beyond(bundle.provenance.more.get(RANGES), twin.channels, [commands[0, prefix:]]),
     )
     if out is not None:
         write_recording(result.recording, out)

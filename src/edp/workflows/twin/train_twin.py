@@ -121,14 +121,11 @@ def train_twin(
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         progress.note("calibrating intervals")
         intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
-        provenance = (
-            training_provenance(source, data, experiment.training.seed, 1, fitted.seconds)
-            | _full_strokes(recordings)
-            | _oil(recordings)
-            | result.facts
+        before = None if base is None else base.bundle.provenance.more.get(RANGES)
+        ranges = command_ranges(channels, [*data.train, *data.validation], before)
+        provenance = training_provenance(source, data, experiment.training.seed, 1, fitted.seconds).with_entries(
+            **_full_strokes(recordings), **_oil(recordings), **result.facts, **{RANGES: ranges}
         )
-        before = None if base is None else base.bundle.provenance.get(RANGES)
-        provenance[RANGES] = command_ranges(channels, [*data.train, *data.validation], before)
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, progress)
         write_scores(run.path, scores, runs, intervals)
