@@ -30,10 +30,10 @@ from edp.evaluation.controller import Budget
 from edp.training import load_bundle
 from edp.workflows.compression import (
     FORMATS,
+    CompressedRow,
     CompressionResult,
     CompressionSearchRequest,
     CompressionSearchSpec,
-    Judged,
     search,
 )
 from edp.workflows.compression.planning import RECIPES
@@ -93,19 +93,19 @@ def rows_of(found: CompressionResult, horizon: int) -> list[list[object]]:
 def facts_of(found: CompressionResult, horizon: int, made: dict[str, int]) -> dict[str, Any]:
     """What is kept of a search."""
 
-    def plain(row: Judged) -> dict[str, Any]:
+    def plain(row: CompressedRow) -> dict[str, Any]:
         mae = row.scores[str(horizon)]["mae"]
         return {"name": row.name, "format": row.number_format, "mae": mae, "over_teacher": row.error, "fits": row.fits,
                 "parameters": row.resource_usage.parameters, "bytes": row.resource_usage.parameter_bytes,
                 "cycles": list(row.resource_usage.cycles), "memory": memory(row)}  # fmt: skip
 
-    box = {"error": found.held_out_test["error"], "scores": found.held_out_test["scores"]} if found.best else {}
+    box = {"error": found.held_out_test.error, "scores": found.held_out_test.scores} if found.best else {}
     return {"teacher": plain(found.teacher), "rows": [plain(row) for row in found.rows], "held_out_test": box,
             "chosen": found.best.name if found.best else None, "compiled": made,
             "notes": list(found.notes)}  # fmt: skip
 
 
-def compiled(best: Judged, folder: Path) -> dict[str, int]:
+def compiled(best: CompressedRow, folder: Path) -> dict[str, int]:
     """Bytes of the chosen network as exported, compiled for a Cortex-M4F and run; empty without the programs for it."""
     if any(shutil.which(program) is None for program in ("arm-none-eabi-gcc", "qemu-system-arm")):
         print("needs the Debian packages gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm: estimates are kept")
@@ -117,7 +117,7 @@ def compiled(best: Judged, folder: Path) -> dict[str, int]:
     return {"constants": constants, "program": program, "state": state, "stack": stack}
 
 
-def memory(row: Judged) -> int:
+def memory(row: CompressedRow) -> int:
     """Bytes of state and stack: the weights of a stored network stay in flash."""
     return row.resource_usage.ram_bytes - row.resource_usage.parameter_bytes
 
@@ -137,7 +137,7 @@ def check(bench: Bench, found: Sequence[CompressionResult], objects: Sequence[di
     key = str(horizon)
 
     def boxed(name: str) -> float:
-        return statistics.median(one.held_out_test["scores"][name][key]["mae"] for one in found)
+        return statistics.median(one.held_out_test.scores[name][key]["mae"] for one in found)
 
     taken = [(row.resource_usage.parameter_bytes, memory(row)) for row in best]
     if all(objects):
@@ -190,7 +190,7 @@ def main(bench: Bench) -> object:
             print(f"\nk = {horizon}, seed {seed}: validation part; * is chosen", flush=True)
             table(["network", "MAE mm/s", "over teacher %", "parameters", "bytes", "format", "cycles", "budget"],
                   rows_of(found, horizon))  # fmt: skip
-            box = found.held_out_test["scores"] if found.best else {}
+            box = found.held_out_test.scores if found.best else {}
             print("compiled:", objects[horizon][-1])
             print("sealed test set:", {name: round(score[str(horizon)]["mae"], 4) for name, score in box.items()})
     for k, found in searches.items():

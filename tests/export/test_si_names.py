@@ -104,7 +104,9 @@ def _texts(path):
 
 @pytest.mark.parametrize("target", sorted(TARGETS))
 def test_no_exported_text_joins_a_name_of_another_unit_with_an_si_value(run, target, tmp_path):
-    result = CliRunner().invoke(app, ["export", str(run), "--to", target, "--out", str(tmp_path / "out")])
+    options = ["--set", "binaries=none"] if target == "fmu" else []  # its sources hold the names
+    words = ["export", str(run), "--to", target, *options, "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, (result.output, result.exception)
     texts = [
         text

@@ -104,7 +104,7 @@ def test_the_same_call_trains_and_opens_nothing_again(run, tight, done, monkeypa
     again = search(run, asked(budget=tight, formats=("float32", "w8a16")), folder)
     assert [row.name for row in again.rows] == [row.name for row in found.rows]
     assert [row.error for row in again.rows] == [row.error for row in found.rows]
-    assert len(again.held_out_test["openings"]) == 1
+    assert len(again.held_out_test.openings) == 1
 
 
 @pytest.mark.slow
@@ -134,7 +134,7 @@ def test_another_choice_needs_a_word_and_is_recorded(run, tight, done, tmp_path)
         search(run, other, folder)
     looked = search(run, replace(other, again=True), folder)
     assert looked.best != done[1].best
-    assert len(looked.held_out_test["openings"]) == 2
+    assert len(looked.held_out_test.openings) == 2
 
 
 def test_a_budget_that_nobody_can_meet_is_refused_with_the_nearest(run, tmp_path):
@@ -259,3 +259,22 @@ def test_a_width_that_cannot_be_built_is_refused(tiny, tiny_model):
     teacher = build_model(tiny.task, model, blank_scaler(tiny.task), seed=0)
     with pytest.raises(ConfigError, match="heads = 4 do not divide"):
         make_plan(teacher, Budget(), units=(6,))
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("chosen", 99, "got indices"),
+        ("front", ["first"], r"front = \['first'\]"),
+        ("budget", {"cycles": "many"}, r"budget.cycles = 'many': a text is no number"),
+        ("rows", [{"name": "u4"}], r"'rows\[0\].recipe' is missing"),
+        ("notes", 3, "notes = 3: a list must hold"),
+        ("verdict", "good", "unknown key 'verdict'"),
+    ],
+)
+def test_a_result_that_was_changed_by_hand_is_one_message(done, tmp_path, part, value, message):
+    content = read_json(done[0] / "compression.json") | {part: value}
+    (tmp_path / "compression.json").write_text(json.dumps(content))
+    with pytest.raises(StorageError, match=message) as told:
+        read_compression(tmp_path)
+    assert "run edp compress again" in str(told.value)

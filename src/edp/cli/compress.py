@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,7 +13,8 @@ from edp.cli.options import DataOption, MapOption, RepairOption, SettingsOption,
 from edp.cli.progress import shown_progress
 
 if TYPE_CHECKING:
-    from edp.workflows.compression import Judged
+    from edp.report import CompressionFacts
+    from edp.workflows.compression import CompressedRow
 
 
 def compress(
@@ -65,17 +66,17 @@ def compress(
             _show_next(compression.best, folder)
         out.print(f"report: {page}")
 
-    emit(as_json, dict(facts.content) | {"report": str(page)}, show)
+    emit(as_json, facts.result.to_json() | {"report": str(page)}, show)
 
 
-def _show_next(best: Judged, folder: Path) -> None:
+def _show_next(best: CompressedRow, folder: Path) -> None:
     # An integer network leaves its run in float; quantising it is the next step.
     whole = best.number_format == "w8a16"
     then = f"edp quantise {best.run} --out {folder / 'w8a16'}" if whole else f"edp evaluate {best.run}"
     out.print(f"next: {then}, or edp footprint {best.run}")
 
 
-def _tables(facts: Any) -> None:
+def _tables(facts: CompressionFacts) -> None:
     from edp.report.compression import facts as words
 
     for horizon in facts.horizons:

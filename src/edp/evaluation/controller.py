@@ -104,6 +104,40 @@ class Budget:
         check_bounds("budget", self, **dict.fromkeys(limits, integer(1, MOST_GRANTED)))
 
 
+@dataclass(frozen=True)
+class ResourceUsage:
+    """What a network takes of a controller in one format; cycles, memory beside weights and program are estimates.
+
+    Attributes:
+        parameters: trainable numbers, after folding.
+        macs_tick: multiply-accumulates of a tick.
+        macs_window: the same of a window, as the thesis counts.
+        cycles: low, typical and high estimate of a tick; the high one decides.
+        parameter_bytes: memory for parameters.
+        ram_bytes: weights, state, working memory and stack.
+        flash_bytes: weights and program.
+    """
+
+    parameters: int
+    macs_tick: int
+    macs_window: int
+    cycles: tuple[int, int, int]
+    parameter_bytes: int
+    ram_bytes: int
+    flash_bytes: int
+
+    def over(self, budget: Budget) -> dict[str, tuple[int, int]]:
+        """Limits that are exceeded: what is taken, and what is granted."""
+        # The high estimate of cycles decides: a deadline that is missed at times is missed.
+        pairs = {
+            "cycles": (self.cycles[2], budget.cycles),
+            "parameter_bytes": (self.parameter_bytes, budget.parameter_bytes),
+            "ram_bytes": (self.ram_bytes, budget.ram_bytes),
+            "flash_bytes": (self.flash_bytes, budget.flash_bytes),
+        }
+        return {name: pair for name, pair in pairs.items() if pair[0] > pair[1]}
+
+
 BUDGET_FILE = SettingsTree(what="budget")
 
 

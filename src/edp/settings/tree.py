@@ -336,8 +336,8 @@ class _Form(typing.NamedTuple):
 def _form(hint: Any) -> _Form:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     sequence = origin is tuple
-    choices = () if origin in (tuple, Mapping) else inner
-    table: Any = hint if is_dataclass(hint) else next((c for c in choices if is_dataclass(c)), None)
+    alternatives = () if sequence or origin is Mapping else inner
+    table: Any = hint if is_dataclass(hint) else next((c for c in alternatives if is_dataclass(c)), None)
     item: Any = inner[0] if sequence and inner and is_dataclass(inner[0]) else None
     values = inner[1] if origin is Mapping and inner else None
     return _Form(sequence, Ellipsis in inner, table, item, values)

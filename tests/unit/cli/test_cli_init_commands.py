@@ -47,7 +47,12 @@ def write_rig(folder: Path, logs: int, seconds: float, rate_hz: float) -> Path:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
-    ("logs", "seconds", "rate_hz"), [(1, 60, 100), (6, 30, 100), (3, 60, 50)], ids=["one log", "six logs", "50 Hz"]
+    ("logs", "seconds", "rate_hz"),
+    [
+        pytest.param(1, 60, 50, id="one log at 50 Hz"),
+        pytest.param(6, 30, 100, id="six logs", marks=pytest.mark.slow),
+        pytest.param(3, 60, 100, id="three logs", marks=pytest.mark.slow),
+    ],
 )
 def test_every_command_that_init_prints_and_a_search_run_on_its_files(edp, tmp_path, logs, seconds, rate_hz):
     data = write_rig(tmp_path / "logs", logs, seconds, rate_hz)

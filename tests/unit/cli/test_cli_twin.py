@@ -311,7 +311,8 @@ def test_the_page_of_a_twin_and_that_of_one_run(edp, logs, trained, tmp_path):
     assert "actuators_1 from 2 s" in file.read_text()
     assert "--limit" in edp("report", trained, "--limit", file).err
     (broken := shutil.copytree(trained, tmp_path / "broken") / "free_run.json").write_text('{"schema": 1}')
-    assert "of another version of EDP: schema 1, expected 2; run edp evaluate" in " ".join(edp("report", broken.parent).err.split())
+    refused = " ".join(edp("report", broken.parent).err.split())
+    assert "of another version of EDP: schema 1, expected 2; run edp evaluate" in refused
 
 
 def test_channels_that_stay_measured(edp, logs, trained, tmp_path):

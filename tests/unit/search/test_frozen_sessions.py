@@ -188,7 +188,7 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
         assert {s.name for s in data.test} == set(study.context.test)
         assert {s.name for s in data.train} == set(study.context.training)
         assert {s.name for s in data.validation} == set(study.context.validation)
-    assert found.held_out_test["name"] == SECOND_TEST_SET
+    assert found.held_out_test.name == SECOND_TEST_SET
     held = read_json(tmp_path / "small/compression.json")
     assert held["held_out_test"]["seen_before"]
     with Ledger(study.folder / "ledger") as ledger:
@@ -305,14 +305,15 @@ def test_a_split_that_contradicts_itself_is_refused():
 def test_a_network_of_several_epochs_is_the_same_from_a_state_and_from_nothing(study, plan):
     context = replace(study.context, spec=replace(plan.spec, mode="thesis", epochs=3, updates=6, final_updates=6))
     settings = teacher_settings(context)
-    recipe = replace(recipe_of(context, 2), rounded=True, final="w8a16")
+    recipe = replace(recipe_of(context), units=2, rounded=True, final="w8a16")
     order = order_of(context, settings, recipe, context.second)
     assert (order.epochs, order.validation) == (3, context.validation)
     assert not set(order.train) & {*context.validation, *context.test, *context.second}
     whole, state = make_smaller(order.to_json())
     assert state is None
     earlier = before(order)
-    assert [Recipe.from_json(one.recipe).name for one in earlier] == ["u2_qat", "u2", "teacher"]
+    requests = [Recipe.from_json(one.recipe).order() for one in earlier]
+    assert [request and request.name for request in requests] == ["u2_qat", "u2", None]
     assert not any(set(one.judged) & set(context.second) for one in earlier)
     for one in earlier:
         found = make_smaller(order.to_json(), make_smaller(one.to_json())[1])[0]

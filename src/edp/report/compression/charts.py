@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from edp.evaluation.compression import CompressedRow
 from edp.report.common.chart import (
     BLUE,
     DROPPED,
@@ -22,7 +21,7 @@ from edp.report.common.chart import (
     Symbol,
     with_unit,
 )  # fmt: skip
-from edp.report.compression.facts import COSTS, CompressionFacts
+from edp.report.compression.facts import COSTS, CompressionFacts, cost_of
 
 AHEAD, COST = "horizon", "cost"
 STAGES: tuple[tuple[str, str, Symbol, float, str], ...] = (
@@ -40,10 +39,10 @@ def compression_charts(facts: CompressionFacts) -> list[Chart]:
 def profile_chart(facts: CompressionFacts) -> Chart:
     """Parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
     indices = facts.smallest()
-    rows = [facts.rows[index] for index in indices]
-    names = [row["name"] for row in rows]
-    unit, front = facts.content["unit"], facts.content["front"]
-    sizes = [row["resource_usage"]["parameters"] for row in rows]
+    rows = [facts.result.rows[index] for index in indices]
+    names = [row.name for row in rows]
+    unit, front = facts.result.unit, facts.result.front
+    sizes = [row.resource_usage.parameters for row in rows]
     left: list[Mark] = [
         Bars(positions=names, values=sizes, colours=[RULE] * len(rows), name="parameters", hover="{y:,}"),
     ]
@@ -51,12 +50,12 @@ def profile_chart(facts: CompressionFacts) -> Chart:
     for horizon in facts.horizons:
         when = {AHEAD: horizon}
         for key, name, symbol, size, colour in STAGES:
-            values = [facts.mae(row, horizon, key) for row in rows]
+            values = [getattr(row, key)[horizon]["mae"] for row in rows]
             left.append(DataSeries(
                 x=names, y=values, name=name, symbol=symbol, size=size, colour=colour, second=True, when=when
             ))  # fmt: skip
         right.append(Bars(
-            positions=names, values=[row["scores"][horizon]["composite"] for row in rows], when=when,
+            positions=names, values=[row.scores[horizon]["composite"] for row in rows], when=when,
             colours=[BLUE if index in front else DROPPED for index in indices],
         ))  # fmt: skip
     across = ChartAxis(kind="names", slant=60)
@@ -74,8 +73,8 @@ def profile_chart(facts: CompressionFacts) -> Chart:
 
 def front_chart(facts: CompressionFacts) -> Chart:
     """Error over that of the teacher against a cost, with the limit of the budget."""
-    groups = list(dict.fromkeys(row["label"] for row in facts.rows))
-    errors = [_percent(row) for row in facts.rows]
+    groups = list(dict.fromkeys(row.label for row in facts.result.rows))
+    errors = [_percent(row) for row in facts.result.rows]
     marks: list[Mark] = []
     for cost in COSTS:
         when = {COST: cost}
@@ -84,13 +83,13 @@ def front_chart(facts: CompressionFacts) -> Chart:
             x=[x for x, _ in line], y=[y for _, y in line], name="front", width=2, step="after", when=when, hover=None
         ))  # fmt: skip
         for position, group in enumerate(groups):
-            rows = [row for row in facts.rows if row["label"] == group]
+            rows = [row for row in facts.result.rows if row.label == group]
             marks.append(DataSeries(
-                x=[facts.cost(row, cost) for row in rows], y=[_percent(row) for row in rows], name=group, when=when,
-                symbol="circle", size=9, colour=MUTED[position % len(MUTED)], labels=[row["name"] for row in rows],
+                x=[cost_of(row, cost) for row in rows], y=[_percent(row) for row in rows], name=group, when=when,
+                symbol="circle", size=9, colour=MUTED[position % len(MUTED)], labels=[row.name for row in rows],
                 hover="{label}: {y:+.2f} %, {x:,}",
             ))  # fmt: skip
-        limit = facts.content["budget"][cost]
+        limit = getattr(facts.result.budget, cost)
         marks.append(DataSeries(
             x=[limit, limit], y=[min(errors), max(errors)], name="budget", width=2, colour=SOFT, dash="dot", when=when,
             hover=None,
@@ -108,7 +107,7 @@ def _ticks(facts: CompressionFacts) -> tuple[tuple[float, str], ...]:
     """Five round errors for each horizon, evenly spread on a logarithmic axis."""
     ticks = set()
     for horizon in facts.horizons:
-        values = [facts.mae(row, horizon) for row in facts.rows]
+        values = [row.scores[horizon]["mae"] for row in facts.result.rows]
         low, high = min(values), max(values)
         # A perfect error of zero has no place on a logarithmic axis.
         ticks |= {float(f"{low * (high / low) ** (step / 4):.2g}") for step in range(5)} if low > 0 else set()
@@ -119,14 +118,14 @@ def _ticks(facts: CompressionFacts) -> tuple[tuple[float, str], ...]:
     return tuple((tick, f"{tick:.3g}") for tick in apart)
 
 
-def _percent(row: Any) -> float:
-    return 100 * (float(row["error"]) - 1)
+def _percent(row: CompressedRow) -> float:
+    return 100 * (row.error - 1)
 
 
 def _front(facts: CompressionFacts, cost: str) -> list[tuple[float, float]]:
     """Points that no other one betters in error at no greater cost."""
     line: list[tuple[float, float]] = []
-    for x, y in sorted((facts.cost(row, cost), _percent(row)) for row in facts.rows):
+    for x, y in sorted((cost_of(row, cost), _percent(row)) for row in facts.result.rows):
         if not line or y < line[-1][1]:
             line.append((x, y))
     return line

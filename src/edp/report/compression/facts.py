@@ -2,115 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from edp.errors import StorageError, count_of
+from edp.errors import count_of
+from edp.evaluation.compression import CompressedRow, CompressionResult, read_compression_result
 from edp.report.common.sheets import Column, Sheet, Value, figures
-from edp.storage import read_json
-from edp.storage.paths import is_file_at
 from edp.wording import listed, number, percent
 
-RESULT, SCHEMA = "compression.json", 2
 LIMITS = {"cycles": "cycles", "parameter_bytes": "parameters", "ram_bytes": "memory", "flash_bytes": "flash"}
 COSTS = {"cycles": "Cycles per tick, high estimate", "parameter_bytes": "Memory for parameters [bytes]"}
 
 
 @dataclass(frozen=True)
 class CompressionFacts:
-    """Content of ``compression.json``.
+    """Result of a compression, and the folder where it lies."""
 
-    Attributes:
-        content: plain values.
-        folder: where it lies.
-    """
-
-    content: Mapping[str, Any]
+    result: CompressionResult
     folder: Path
 
-    @property
-    def rows(self) -> Sequence[Mapping[str, Any]]:
-        """All networks in all formats."""
-        rows: Sequence[Mapping[str, Any]] = self.content["rows"]
-        return rows
-
     def smallest(self) -> list[int]:
-        """Places of a row for each network: that of its smallest format; the teacher in float32 comes first."""
-        smallest: dict[tuple[str, bool], int] = {}
-        for index, row in enumerate(self.rows):
-            whole = row["recipe"] == "teacher" and row["number_format"] == "float32"
-            best = smallest.get((row["run"], whole))
-            if (
-                best is None
-                or row["resource_usage"]["parameter_bytes"] < self.rows[best]["resource_usage"]["parameter_bytes"]
-            ):
-                smallest[row["run"], whole] = index
-        return sorted(smallest.values(), key=lambda index: (self.rows[index]["recipe"] != "teacher", index))
+        """Indices of a row for each network: that of its smallest format; the teacher in float32 comes first."""
+        rows, smallest = self.result.rows, dict[tuple[str, bool], int]()
+        for index, row in enumerate(rows):
+            network = row.run, row.recipe == "teacher" and row.number_format == "float32"
+            best = smallest.setdefault(network, index)
+            if row.resource_usage.parameter_bytes < rows[best].resource_usage.parameter_bytes:
+                smallest[network] = index
+        return sorted(smallest.values(), key=lambda index: (rows[index].recipe != "teacher", index))
 
     @property
     def horizons(self) -> list[str]:
         """Look-aheads in samples, as keys of scores."""
-        return [str(horizon) for horizon in self.content["task"]["horizons"]]
-
-    @property
-    def chosen(self) -> Mapping[str, Any] | None:
-        """The network that was chosen, None where none fits."""
-        index = self.content["chosen"]
-        return None if index is None else self.rows[index]
-
-    def mae(self, row: Mapping[str, Any], horizon: str, when: str = "scores") -> float:
-        """MAE on the validation part; `when` is ``scores`` or ``before``."""
-        return float(row[when][horizon]["mae"])
-
-    def cost(self, row: Mapping[str, Any], name: str) -> float:
-        """A name of `COSTS`."""
-        usage = row["resource_usage"][name]
-        return float(usage[2] if name == "cycles" else usage)
+        return [str(horizon) for horizon in self.result.task.horizons]
 
     def ahead(self, horizon: str) -> str:
         """A horizon in words."""
-        return f"{1e3 * int(horizon) / self.content['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
+        return f"{1e3 * int(horizon) / self.result.task.rate_hz:.0f} ms ahead (k = {horizon})"
+
+
+def cost_of(row: CompressedRow, name: str) -> float:
+    """Return a cost of `COSTS`."""
+    usage = row.resource_usage
+    return float(usage.cycles[2] if name == "cycles" else usage.parameter_bytes)
 
 
 def read_compression(folder: str | Path) -> CompressionFacts:
-    """What `edp compress` wrote into a folder.
+    """Return what `edp compress` wrote into a folder.
 
     Raises:
         StorageError: nothing, or something of another version.
     """
-    file = Path(folder) / RESULT
-    if not is_file_at(file):
-        raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp compress")
-    content = read_json(file)
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise StorageError(f"'{file}' is of another version of EDP; run edp compress again")
-    return CompressionFacts(content, Path(folder))
+    return CompressionFacts(read_compression_result(folder), Path(folder))
 
 
 def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
     """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
-    teacher = facts.mae(facts.content["teacher"], horizon)
+    result = facts.result
+    teacher, unit = result.teacher.scores[horizon]["mae"], result.unit
     rows: list[tuple[Value, ...]] = []
-    for row in facts.rows:
-        usage, mae = row["resource_usage"], facts.mae(row, horizon)
+    for row in result.rows:
+        usage, mae = row.resource_usage, row.scores[horizon]["mae"]
         rows.append(
             (
-                row["name"],
-                row["recipe"],
+                row.name,
+                row.recipe,
                 mae,
                 100 * (mae / teacher - 1),
-                usage["parameters"],
-                usage["parameter_bytes"] / 1e6,
-                row["label"],
-                usage["macs_window"] / 1e6,
-                usage["macs_tick"],
-                usage["cycles"][2],
-                "fits" if row["fits"] else f"over: {listed(LIMITS[name] for name in row['over'])}",
+                usage.parameters,
+                usage.parameter_bytes / 1e6,
+                row.label,
+                usage.macs_window / 1e6,
+                usage.macs_tick,
+                usage.cycles[2],
+                "fits" if row.fits else f"over: {listed(LIMITS[name] for name in row.over)}",
             )
         )
-    unit = facts.content["unit"]
     columns = (
         Column("Variant"),
         Column("Made"),
@@ -125,12 +92,12 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
         Column("Budget"),
     )
     caption = f"{facts.ahead(horizon)}, validation part"
-    return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(facts.content["front"]))
+    return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(result.front))
 
 
 def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
     """Teacher and chosen on the sealed test set."""
-    scores = facts.content["held_out_test"].get("scores")
+    scores = facts.result.held_out_test.scores
     if not scores:
         return None
     rows: list[tuple[Value, ...]] = []
@@ -139,7 +106,7 @@ def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
         change = 100 * (last["mae"] / first["mae"] - 1)
         composites = first["composite"], last["composite"]
         rows.append((facts.ahead(horizon), first["mae"], last["mae"], change, *composites))
-    unit = facts.content["unit"]
+    unit = facts.result.unit
     columns = (
         Column("Horizon"),
         Column("MAE, teacher", unit, figures([row[1] for row in rows])),
@@ -153,68 +120,66 @@ def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
 
 def headline(facts: CompressionFacts) -> str:
     """One sentence: what was found."""
-    best, budget = facts.chosen, facts.content["budget"]["name"]
+    best, budget = facts.result.best, facts.result.budget.name
     if best is None:
         return f"None of the networks made fits the budget “{budget}”"
-    change = percent(best["error"] - 1, signed=True)
-    return f"{best['name']} fits “{budget}” with an error {change} against the teacher's"
+    return f"{best.name} fits “{budget}” with an error {percent(best.error - 1, signed=True)} against the teacher's"
 
 
 def verdict(facts: CompressionFacts) -> list[str]:
     """Sentences under the headline."""
-    best, held_out = facts.chosen, facts.content["held_out_test"]
-    if best is None:
-        near = min(facts.rows, key=lambda row: max(value / limit for value, limit in row["over"].values()))
-        over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near["over"].items())
-        return [f"The nearest is {near['name']}: {over}."]
-    usage, budget = best["resource_usage"], facts.content["budget"]
+    result = facts.result
+    if result.best is None:
+        near = min(result.rows, key=lambda row: max(value / limit for value, limit in row.over.values()))
+        over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near.over.items())
+        return [f"The nearest is {near.name}: {over}."]
+    usage, budget = result.best.resource_usage, result.budget
     lines = [
-        f"It takes {usage['cycles'][2]:,} of {budget['cycles']:,} cycles a tick (high estimate) and "
-        f"{usage['parameter_bytes']:,} of {budget['parameter_bytes']:,} bytes for parameters."
+        f"It takes {usage.cycles[2]:,} of {budget.cycles:,} cycles a tick (high estimate) and "
+        f"{usage.parameter_bytes:,} of {budget.parameter_bytes:,} bytes for parameters."
     ]
-    if "error" in held_out:
-        lines.append(
-            f"On the sealed test set its MAE is {percent(held_out['error'] - 1, signed=True)} against the teacher's."
-        )
+    if result.held_out_test.error is not None:
+        change = percent(result.held_out_test.error - 1, signed=True)
+        lines.append(f"On the sealed test set its MAE is {change} against the teacher's.")
     return lines
 
 
 def caveats(facts: CompressionFacts) -> list[str]:
     """What the figures can and cannot show."""
-    held_out, parts = facts.content["held_out_test"], facts.content["recordings"]
+    held_out, parts = facts.result.held_out_test, facts.result.recordings
     lines = [
         "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
         "constants, as the exported C code holds them (INT8 has no such code: one byte for each weight). The high "
         "estimate decides.",
-        f"Networks are compared and chosen on {count_of(parts['validation'], 'validation recording')}, which chose "
+        f"Networks are compared and chosen on {count_of(parts.validation, 'validation recording')}, which chose "
         "their best "
         "epochs too: the least of many errors is a little too good there.",
-        f"The sealed test set, {count_of(parts['test'], 'recording')}, was opened for the chosen network and the "
+        f"The sealed test set, {count_of(parts.test, 'recording')}, was opened for the chosen network and the "
         "teacher alone.",
         "One training each: differences of a percent between neighbours may be chance.",
     ]
-    if held_out.get("seen_before"):
+    if held_out.seen_before:
         lines.append(
             "The run of the teacher was judged on the sealed test set before, so the teacher was perhaps chosen by it. "
             "Recordings that nobody looked at, given with --data, would show more."
         )
-    if len(held_out.get("openings", ())) > 1:
+    if len(held_out.openings) > 1:
         lines.append(
-            f"The sealed test set was opened {len(held_out['openings'])} times; openings after the first show less."
+            f"The sealed test set was opened {len(held_out.openings)} times; openings after the first show less."
         )
-    return [*lines, *facts.content["notes"]]
+    return [*lines, *facts.result.notes]
 
 
 def tiles(facts: CompressionFacts) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, meaning."""
-    best = facts.chosen
+    best, unit = facts.result.best, facts.result.unit
     if best is None:
         return []
-    horizon, usage, teacher = facts.horizons[-1], best["resource_usage"], facts.content["teacher"]
+    horizon, usage = facts.horizons[-1], best.resource_usage
     return [
-        (number(facts.mae(best, horizon)), facts.content["unit"], f"MAE {facts.ahead(horizon)}"),
-        (number(facts.mae(teacher, horizon)), facts.content["unit"], "MAE of the teacher"),
-        (f"{usage['parameter_bytes'] / 1e3:.1f}", "kB", "for parameters"),
-        (f"{usage['cycles'][2] / 1e3:,.0f}", "k", "cycles per tick, high estimate"),
-        (f"{usage['macs_tick'] / 1e3:,.1f}", "k", "MACs per tick"),
+        (number(best.scores[horizon]["mae"]), unit, f"MAE {facts.ahead(horizon)}"),
+        (number(facts.result.teacher.scores[horizon]["mae"]), unit, "MAE of the teacher"),
+        (f"{usage.parameter_bytes / 1e3:.1f}", "kB", "for parameters"),
+        (f"{usage.cycles[2] / 1e3:,.0f}", "k", "cycles per tick, high estimate"),
+        (f"{usage.macs_tick / 1e3:,.1f}", "k", "MACs per tick"),
     ]

@@ -55,8 +55,8 @@ def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
         "caveats": words.caveats(facts),
         "tables": [sheet.table() for sheet in tables if sheet.name != "held_out_test"],
         "held_out": next((sheet.table() for sheet in tables if sheet.name == "held_out_test"), None),
-        "opened": facts.content["held_out_test"].get("opened", ""),
-        "budget": facts.content["budget"],
+        "opened": facts.result.held_out_test.opened,
+        "budget": facts.result.budget,
         **shown(compression_charts(facts)),
     }
     return template("compression.html.jinja").render(**context)

@@ -1,5 +1,7 @@
 """Make a trained network smaller: students, distillation, pruning, dynamic INT8, quantisation-aware training."""
 
+from edp.evaluation.compression import CompressedRow, CompressionResult
+from edp.evaluation.controller import ResourceUsage
 from edp.training.compression.distillation import Distillation, DistillationSpec, SoftmaxDivergence
 from edp.training.compression.int8 import Quantised, dynamic_int8
 from edp.training.compression.pruning import prune
@@ -8,8 +10,7 @@ from edp.training.compression.rounding import NetworkRounding, weight_levels
 from edp.training.compression.taylor import FeatureImportance, importance
 from edp.workflows.compression.bench import Bench, CompressionRequest, tuning
 from edp.workflows.compression.distil import DISTIL_SETTINGS, DistilRequest, DistilSpec, distil
-from edp.workflows.compression.formats import FORMATS, Deployed, ResourceUsage, deploy, resource_usage
-from edp.workflows.compression.judged import CompressionResult, Judged
+from edp.workflows.compression.formats import FORMATS, Deployed, deploy, resource_usage
 from edp.workflows.compression.searching import (
     CompressionSearchRequest,
     CompressionSearchSpec,
@@ -23,6 +24,7 @@ __all__ = [
     "VARIANTS",
     "Bench",
     "CompressedCandidate",
+    "CompressedRow",
     "CompressionRequest",
     "CompressionResult",
     "CompressionSearchRequest",
@@ -33,7 +35,6 @@ __all__ = [
     "Distillation",
     "DistillationSpec",
     "FeatureImportance",
-    "Judged",
     "NetworkRounding",
     "QuantisationAware",
     "Quantised",

@@ -118,5 +118,8 @@ class Bench:
     def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
         """Carry out an order; `start` is the network that it goes on from."""
         strategy = order.strategy([self.teacher], self.data, start)
-        spec = order.training(self.training)
-        return fit(self.data, order.model(self.teacher.spec), spec, strategy=strategy).predictor
+        return fit(self.data, order.model(self.teacher.spec), self.training_of(order), strategy=strategy).predictor
+
+    def training_of(self, order: CompressionRequest) -> TrainingSpec:
+        """How the network of an order is trained."""
+        return order.training(self.training)

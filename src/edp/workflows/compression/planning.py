@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,13 +11,13 @@ import numpy as np
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import ConfigError, ExportError
-from edp.evaluation.controller import Budget
+from edp.evaluation.controller import Budget, ResourceUsage
 from edp.networks.narrow import student, width_of
 from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.training.bundle import blank_scaler
 from edp.training.compression.pruning import check_pruning
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.formats.base import FORMATS, ResourceUsage, resource_usage
+from edp.workflows.compression.formats.base import FORMATS, resource_usage
 from edp.workflows.compression.variants import rounded_order
 
 STEP = 4  # widths are multiples of it: what kernels compute at a time
@@ -48,9 +49,18 @@ class CompressionPlan:
         """How many there are."""
         return sum(len(orders) + self.rounds for orders in self.orders.values())
 
-    def tuned(self, best: CompressionRequest) -> list[CompressionRequest]:
-        """What is made of the better recipe of a width."""
-        return [rounded_order(best)] if self.rounds else []
+    def to_round(self, errors: Mapping[CompressionRequest, float]) -> list[CompressionRequest]:
+        """Return the requests that train the better recipe of each width with rounded numbers.
+
+        Args:
+            errors: in float32, by recipe; one that is not in it did not end well.
+        """
+        if not self.rounds:
+            return []
+        # The better recipe is chosen in float: rounding both would double the trainings.
+        return [
+            rounded_order(min(orders, key=lambda order: errors.get(order, math.inf))) for orders in self.orders.values()
+        ]
 
 
 def make_plan(
@@ -196,6 +206,3 @@ def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str], least_w
         f"{FORMATS[nearest].label}, with {needed}: raise these limits to that at least, leave out blocks, or read "
         "fewer channels"
     )
-
-
-__all__ = ["CompressionPlan", "make_plan"]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.experiment import Change, Experiment, experiment_toml, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.data.prepared import Prepared
-from edp.errors import ConfigError, ExportError, closest
+from edp.errors import ConfigError, closest
+from edp.evaluation.compression import ComparedTask, CompressedRow, CompressionResult, HeldOutTest, RecordingCounts
 from edp.evaluation.controller import Budget
 from edp.logs.source import DataSource
 from edp.networks.narrow import width_of
@@ -18,8 +18,8 @@ from edp.networks.predictor import Predictor
 from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, integer, shown
 from edp.signals import KINDS
-from edp.storage import make_folder, read_object, write_json
-from edp.storage.ledger import Ledger
+from edp.storage import make_folder, read_object
+from edp.storage.ledger import Ledger, Opening
 from edp.storage.paths import is_file_at
 from edp.storage.runs import Run, check_claimable, run_key
 from edp.training import load_bundle
@@ -28,24 +28,24 @@ from edp.training.progress_steps import training_steps
 from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import Bench, CompressionRequest
 from edp.workflows.compression.distil import frozen_sessions, order_facts, read_run
-from edp.workflows.compression.formats.base import FORMATS, Deployed, deploy
-from edp.workflows.compression.judged import (
-    CompressionResult,
-    Judged,
+from edp.workflows.compression.formats.base import FORMATS
+from edp.workflows.compression.pipeline import (
+    TEACHER,
+    Evaluator,
+    NetworkResult,
     choose,
-    deployed_row,
-    measure,
+    formats_of,
     on_validation,
-    relative,
+    relative_error,
+    rows_of,
 )
 from edp.workflows.compression.planning import RECIPES, CompressionPlan, make_plan
-from edp.workflows.compression.variants import VARIANTS, CompressedCandidate
+from edp.workflows.compression.variants import VARIANTS
 from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
 
 TEST_PART = "test"
 THESIS_VARIANTS = {"A_u32": 32, "A_u64": 64, "B_LPTQ": 64, "C_QAT": 0, "C_u64_QAT": 64}
 """Width of the students of Table 4.9; 0 where the teacher keeps its own."""
-RESULT = "compression.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,34 +181,49 @@ def search(
         progress.note(note)
     frozen = frozen_sessions(run, experiment)
     data = prepare_data(source or own, experiment, frozen)
-    held_out = _held_out_test_of(source or own, experiment, data)
+    held_out = _find_sealed(source or own, experiment, data)
     # The judge changes no weights; its settings stay out of the key.
     settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
     with Run.create(out, "compression", key, experiment_toml(experiment)) as folder:
         bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")))
-        # A network judged in several formats is streamed in float only once.
         bench.frozen = frozen
-        evaluator = _Evaluator(bench, spec.budget, Path(run), held_out.data)
-        rows, notes = _rows(bench, evaluator, plan, spec, progress)
-        front, chosen = choose(rows)
-        result = CompressionResult(evaluator.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
+        comparison = _Comparison(bench, spec.budget, Path(run))
+        comparison.make_all(plan, spec, progress)
+        front, chosen = choose(comparison.rows)
+        units = sorted({KINDS[kind].report_unit for kind in data.target_kinds})
+        result = CompressionResult(
+            budget=spec.budget,
+            task=ComparedTask(data.task.horizons, data.task.rate_hz),
+            unit=units[0] if len(units) == 1 else "mixed units",
+            recordings=RecordingCounts(len(data.train), len(data.validation), len(held_out.data.test)),
+            teacher=comparison.teacher,
+            rows=tuple(comparison.rows),
+            front=tuple(front),
+            chosen=chosen,
+            notes=(*plan.notes, *comparison.notes),
+        )
+        test = HeldOutTest()
         if result.best is not None:
-            result = replace(result, held_out_test=_judge_held_out(result, evaluator, folder, held_out, request.again))
-        seen = held_out.seen(result.held_out_test.get("openings", ())) or _seen(Path(run), source, own, held_out)
-        write_json(folder.file(RESULT), _plain(result, spec, data, seen, len(held_out.data.test)))
+            test = comparison.open_test_set(result.best, folder, held_out, request.again)
+        # The test part of the same data that `edp evaluate` has judged is no sealed set any more.
+        same_data = held_out.name == TEST_PART and (source is None or source.to_plain() == own.to_plain())
+        seen = same_data and is_file_at(Path(run) / "scores.json")
+        test = replace(test, seen_before=held_out.opened_before or len(test.openings) > 1 or seen)
+        result = replace(result, held_out_test=test)
+        result.write(folder.path)
     return result
 
 
 @dataclass(frozen=True, eq=False)
-class _HeldOutTest:
-    """The recordings that are looked at once.
+class _SealedRecordings:
+    """Recordings that are evaluated on once.
 
     Attributes:
         data: they are its test part.
         name: of the sealed test set.
         study: folder of the model search that set it apart and records openings; None where none did, or it is gone.
-        opened_before: whether a model search judged on it already.
+        opened_before: whether a model search evaluated networks on it already.
     """
 
     data: Prepared
@@ -216,161 +231,103 @@ class _HeldOutTest:
     study: Path | None = None
     opened_before: bool = False
 
-    def seen(self, openings: Sequence[Mapping[str, Any]]) -> bool:
-        """Whether other networks were judged on it before these."""
-        return self.opened_before or len(openings) > 1
 
-
-def _held_out_test_of(source: DataSource, experiment: Experiment, data: Prepared) -> _HeldOutTest:
-    """The second test set of the model search that a run comes from, else the test part."""
+def _find_sealed(source: DataSource, experiment: Experiment, data: Prepared) -> _SealedRecordings:
+    """Return the second test set of the model search that a run comes from, otherwise the test part."""
     split = experiment.split
     if not isinstance(split, ByFrozen):
-        return _HeldOutTest(data)
+        return _SealedRecordings(data)
     # Sessions count by content: a renamed file is still the same recording.
     there = {recording.digest for recording in source.read()}
     if not any(session.digest in there for session in split.second):
-        return _HeldOutTest(data, opened_before=any(session.digest in there for session in split.test))
+        return _SealedRecordings(data, opened_before=any(session.digest in there for session in split.test))
     study = Path(split.study)
     recorded = split.study and is_file_at(study / "study.json") and is_file_at(study / "ledger" / "about.json")
     opened = prepare_data(source, replace(experiment, split=split.opened()))
-    return _HeldOutTest(opened, SECOND_TEST_SET, study if recorded else None)
+    return _SealedRecordings(opened, SECOND_TEST_SET, study if recorded else None)
 
 
-def _rows(
-    bench: DiskBench, evaluator: _Evaluator, plan: CompressionPlan, spec: CompressionSearchSpec, progress: Progress
-) -> tuple[list[Judged], list[str]]:
-    """Every network in every format that it can be in, and what could not be."""
-    names = _variants(bench) if spec.thesis else []
-    bench.networks = progress.stage("network", plan.trainings + len(names))
-    rows, notes = [], []
+class _Comparison:
+    """Networks of a bench, compared on the validation part.
 
-    def judge(order: CompressionRequest | None, network: Predictor, formats: Sequence[str]) -> None:
-        for name in formats:
-            try:
-                rows.append(evaluator.judged(order, network, name))
-            except ExportError as error:
-                notes.append(f"{'teacher' if order is None else order.name} in {FORMATS[name].label}: {error}")
+    Args:
+        bench: makes the networks.
+        budget: what the controller grants.
+        run: folder of the teacher.
 
-    judge(None, bench.teacher, plan.formats)
-    for orders in plan.orders.values():
-        networks = {order: bench.network(order) for order in orders}
-        for order, network in networks.items():
-            judge(order, network, plan.formats)
-        # The better recipe is chosen in float: rounding is tried on one of them only, since it costs a training.
-        plain = {order: evaluator.float_error(network) for order, network in networks.items()}
-        for order in plan.tuned(min(plain, key=plain.__getitem__)):
-            judge(order, bench.network(order), [name for name in plan.formats if FORMATS[name].rounded])
-    for name in names:
-        make = VARIANTS[name]
-        rows.append(evaluator.variant(make(bench)))
-    return rows, notes
+    Attributes:
+        teacher: the teacher in float32.
+        rows: every network in every format that it can be in.
+        notes: which formats were left out, and why.
+    """
 
+    def __init__(self, bench: DiskBench, budget: Budget, run: Path) -> None:
+        self.bench, self.run = bench, run
+        self.evaluator = Evaluator(on_validation(bench.data), budget)
+        first = self.evaluator.evaluate(bench.teacher, ["float32"])
+        self.teacher = replace(rows_of(None, first, first.plain, str(run))[0], name=TEACHER)
+        self.rows: list[CompressedRow] = []
+        self.notes: list[str] = []
+        self._networks = {TEACHER: bench.teacher}
 
-def _variants(bench: Bench) -> list[str]:
-    """Variants whose students are narrower than the teacher."""
-    full = width_of(bench.teacher.spec)
-    return [name for name, units in THESIS_VARIANTS.items() if units < full]
+    def make_all(self, plan: CompressionPlan, spec: CompressionSearchSpec, progress: Progress) -> None:
+        """Make the networks of a plan, and the variants of the thesis that are narrower than the teacher."""
+        full = width_of(self.bench.teacher.spec)
+        variants = [name for name, units in THESIS_VARIANTS.items() if spec.thesis and units < full]
+        self.bench.networks = progress.stage("network", plan.trainings + len(variants))
+        requests = [order for orders in plan.orders.values() for order in orders]
+        results = self._evaluate_all(requests, plan)
+        errors = {order: relative_error(result.plain, self.teacher.scores) for order, result in results.items()}
+        results |= self._evaluate_all(plan.to_round(errors), plan)
+        self._add(None, self.evaluator.evaluate(self.bench.teacher, plan.formats), self.bench.teacher)
+        for order in sorted(results, key=lambda order: -order.units):
+            self._add(order, results[order], self.bench.network(order))
+        for name in variants:
+            variant = VARIANTS[name](self.bench)
+            result = self.evaluator.evaluate(variant.network, [variant.number_format], variant.parameter_bytes)
+            self._add(variant.order, result, variant.network, name)
 
+    def _evaluate_all(
+        self, requests: Sequence[CompressionRequest], plan: CompressionPlan
+    ) -> dict[CompressionRequest, NetworkResult]:
+        return {
+            order: self.evaluator.evaluate(self.bench.network(order), formats_of(order, plan.formats))
+            for order in requests
+        }
 
-class _Evaluator:
-    """Judges networks on the validation part, and at the end two on the test set: the test part of `held_out`."""
-
-    def __init__(self, bench: DiskBench, budget: Budget, run: Path, held_out: Prepared) -> None:
-        self.bench, self.budget, self.held_out = bench, budget, held_out
-        self.data, self.skip = on_validation(bench.data), bench.teacher.spec.window
-        self.deployed: dict[str, tuple[Deployed, Predictor]] = {}
-        self._float: dict[int, dict[str, dict[str, float]]] = {}
-        self.run = run
-        plain = self._row("teacher", None, bench.teacher, "float32")
-        self.teacher = replace(plain, error=1.0)
-
-    def judged(self, order: CompressionRequest | None, network: Predictor, number_format: str) -> Judged:
-        """A network in a format."""
-        name = f"{'teacher' if order is None else order.name} {FORMATS[number_format].label}"
-        row = self._row(name, order, network, number_format)
-        return replace(row, error=relative(row.scores, self.teacher.scores))
-
-    def variant(self, candidate: CompressedCandidate) -> Judged:
-        """A variant of the thesis under its name, with bytes counted as the thesis counts them."""
-        row = self._row(
-            candidate.name, candidate.order, candidate.network, candidate.number_format, candidate.parameter_bytes
-        )
-        return replace(row, error=relative(row.scores, self.teacher.scores))
-
-    def float_error(self, network: Predictor) -> float:
-        """Error in float32, over the teacher's."""
-        return relative(self._plain(network), self.teacher.scores)
-
-    def on_held_out_test(self, row: Judged) -> dict[str, dict[str, float]]:
-        """Scores on the sealed test set."""
-        return measure(self.deployed[row.name][0], self.held_out, self.skip)
-
-    def key(self, row: Judged) -> str:
-        """What is judged: weights and format."""
-        return f"{weights_digest(self.deployed[row.name][1])} {row.number_format}"
-
-    def _plain(self, network: Predictor) -> dict[str, dict[str, float]]:
-        if id(network) not in self._float:
-            deployed = deploy(network, "float32", self.bench.data.train, self.budget)
-            self._float[id(network)] = measure(deployed, self.data, self.skip)
-        return self._float[id(network)]
-
-    def _row(
-        self,
-        name: str,
-        order: CompressionRequest | None,
-        network: Predictor,
-        number_format: str,
-        stored: int | None = None,
-    ) -> Judged:
-        deployed = deploy(network, number_format, self.bench.data.train, self.budget, stored)
-        self.deployed[name] = deployed, network
-        before = self._plain(network)
-        scores = before if number_format == "float32" else measure(deployed, self.data, self.skip)
+    def _add(
+        self, order: CompressionRequest | None, result: NetworkResult, network: Predictor, variant: str = ""
+    ) -> None:
+        """Add the rows of a network; those of a variant of the thesis have its name."""
         run = self.run if order is None else self.bench.folder / order.name
-        return deployed_row(name, order, deployed, (scores, before), self.budget, str(run))
+        for row in rows_of(order, result, self.teacher.scores, str(run)):
+            self.rows.append(replace(row, name=variant or row.name))
+            self._networks[self.rows[-1].name] = network
+        name = TEACHER if order is None else order.name
+        self.notes += [f"{name} in {FORMATS[key].label}: {reason}" for key, reason in result.left_out.items()]
 
-
-def _judge_held_out(
-    result: CompressionResult, evaluator: _Evaluator, folder: Run, held_out: _HeldOutTest, again: bool
-) -> dict[str, Any]:
-    """Judge teacher and chosen on the sealed test set, once; the opening is recorded before it is made."""
-    pair = {"teacher": result.teacher, "chosen": result.best}
-    # Weights and format are the key of an opening: the same pair may be judged again without a second look.
-    keys = [evaluator.key(row) for row in pair.values() if row is not None]
-    why = "the network chosen by edp compress, and its teacher"
-    ledgers = [folder.file("ledger")] if held_out.study is None else [held_out.study / "ledger", folder.file("ledger")]
-    openings: list[dict[str, Any]] = []
-    for ledger_folder in ledgers:  # that of the search first: it knows of openings from other folders
-        with Ledger(ledger_folder) as ledger:
-            opening = ledger.open_test_set(held_out.name, keys, why, again)
-            openings = openings or [asdict(one) for one in ledger.openings(held_out.name)]
-    scores = {name: evaluator.on_held_out_test(row) for name, row in pair.items() if row is not None}
-    error = relative(scores["chosen"], scores["teacher"])
-    return {"name": held_out.name, "opened": opening.time, "openings": openings, "scores": scores, "error": error}
-
-
-def _seen(run: Path, source: DataSource | None, own: DataSource, held_out: _HeldOutTest) -> bool:
-    """Whether the sealed test set is the test part and was judged before, by ``edp evaluate``."""
-    # The test part of the same data that `edp evaluate` has judged is no sealed set any more.
-    same = held_out.name == TEST_PART and (source is None or source.to_plain() == own.to_plain())
-    return same and is_file_at(run / "scores.json")
-
-
-def _plain(
-    result: CompressionResult, spec: CompressionSearchSpec, data: Prepared, seen: bool, sealed: int
-) -> dict[str, Any]:
-    units = sorted({KINDS[kind].report_unit for kind in data.target_kinds})
-    return {
-        "schema": 2,
-        "budget": asdict(spec.budget),
-        "task": {"horizons": list(data.task.horizons), "rate_hz": data.task.rate_hz},
-        "unit": units[0] if len(units) == 1 else "mixed units",
-        "recordings": {"train": len(data.train), "validation": len(data.validation), "test": sealed},
-        "teacher": result.teacher.to_json(),
-        "rows": [row.to_json() for row in result.rows],
-        "front": result.front,
-        "chosen": result.chosen,
-        "held_out_test": dict(result.held_out_test) | {"seen_before": seen},
-        "notes": list(result.notes),
-    }
+    def open_test_set(self, best: CompressedRow, folder: Run, held_out: _SealedRecordings, again: bool) -> HeldOutTest:
+        """Evaluate the teacher and the chosen network on the sealed test set; the opening is recorded before."""
+        pair = {TEACHER: self.teacher, "chosen": best}
+        # Weights and format are the key of an opening: the same pair may be evaluated again without a second look.
+        keys = [f"{weights_digest(self._networks[row.name])} {row.number_format}" for row in pair.values()]
+        why = "the network chosen by edp compress, and its teacher"
+        openings: list[Opening] = []
+        # The ledger of the search comes first: it knows of openings from other folders.
+        for ledger_folder in [*([held_out.study / "ledger"] if held_out.study else []), folder.file("ledger")]:
+            with Ledger(ledger_folder) as ledger:
+                opening = ledger.open_test_set(held_out.name, keys, why, again)
+                openings = openings or ledger.openings(held_out.name)
+        # Ranges of activations come from the series that the networks were trained on.
+        evaluator = Evaluator(replace(held_out.data, train=self.bench.data.train), self.evaluator.budget)
+        scores = {
+            name: evaluator.evaluate(self._networks[row.name], [row.number_format]).formats[row.number_format].scores
+            for name, row in pair.items()
+        }
+        return HeldOutTest(
+            name=held_out.name,
+            opened=opening.time,
+            openings=tuple(openings),
+            scores=scores,
+            error=relative_error(scores["chosen"], scores[TEACHER]),
+        )

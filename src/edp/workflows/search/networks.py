@@ -20,9 +20,10 @@ from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import Run, run_key
 from edp.training import make_bundle, save_bundle
 from edp.training.provenance import training_provenance
+from edp.workflows.compression.pipeline import TEACHER
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases.compression import NAME
-from edp.workflows.search.smaller import TEACHER, Recipe, network_of
+from edp.workflows.search.smaller import Recipe, network_of
 from edp.workflows.search.trainings import TrainingRequest, experiment_of
 
 FOLDER, CHOSEN = "networks", "chosen"

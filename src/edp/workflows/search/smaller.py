@@ -8,32 +8,27 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 from safetensors.torch import load, save
 from torch import Tensor
 
-from edp.config.experiment import Experiment
+from edp.config.experiment import Experiment, Table, build
 from edp.data.prepared import Prepared
 from edp.data.task import Task
-from edp.errors import DataError, ExportError
+from edp.errors import DataError
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import score_predictions
-from edp.evaluation.scores_file import ModelScores, metric
 from edp.networks.predictor import ModelSpec, Predictor
-from edp.networks.running import stream_predictions
 from edp.training.bundle import blank_scaler
 from edp.training.checkpoint import pack, unpack
 from edp.training.fit import fit
-from edp.workflows.compression import FORMATS, CompressionRequest, deploy
-from edp.workflows.compression.bench import TUNING_EPOCHS
+from edp.training.spec import TrainingSpec
+from edp.workflows.compression.bench import TUNING_EPOCHS, Bench, CompressionRequest
+from edp.workflows.compression.pipeline import TEACHER, Evaluator, formats_of
 from edp.workflows.compression.variants import rounded_order
-from edp.workflows.search.trainings import SCORES, TrainingRequest, experiment_of, mean_scores, prepared
+from edp.workflows.search.trainings import TrainingRequest, experiment_of, mean_scores, prepared, session_scores
 
-TEACHER = "teacher"
 Weights = dict[str, Tensor]
 
 
@@ -62,49 +57,36 @@ class Recipe:
     rounded: bool = False
     final: str = ""
 
-    @property
-    def name(self) -> str:
-        """Of the network."""
-        return TEACHER if self.units is None else f"{'p' if self.pruned else 'u'}{self.units}{'_qat' * self.rounded}"
-
     def order(self) -> CompressionRequest | None:
         """How it is made of the teacher; None for the teacher."""
         if self.units is None:
             return None
         # Rounded networks are made of plain ones, whose order comes first.
-        plain = CompressionRequest(
-            name=f"{'p' if self.pruned else 'u'}{self.units}", units=self.units, pruned=self.pruned
-        )
+        name = f"{'p' if self.pruned else 'u'}{self.units}"
+        plain = CompressionRequest(name=name, units=self.units, pruned=self.pruned)
         return rounded_order(plain) if self.rounded else plain
-
-    def model(self, experiment: Experiment) -> ModelSpec:
-        """Settings of the network."""
-        order = self.order()
-        return experiment.model if order is None else order.model(experiment.model)
 
     def experiment(self, experiment: Experiment) -> Experiment:
         """The experiment of the last training that makes the network, where `experiment` is the teacher's."""
         order = self.order()
         if order is None:
             return experiment
-        epochs, steps = experiment.training.epochs, self.updates
-        if order.rounding is not None and epochs == 1:
-            # Tuning is a third of the training (see `bench`); of several epochs the epochs are fewer instead.
-            steps = max(1, round(TUNING_EPOCHS * steps))  # of several epochs a third is left
-        each = max(1, steps // epochs) if steps else 0
-        training = order.training(replace(experiment.training, updates=each))
-        return replace(experiment, model=self.model(experiment), training=training)
+        training = shortened(order, experiment.training, self.updates)
+        return replace(experiment, model=order.model(experiment.model), training=training)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Table:
         """Plain values."""
         lists = {"formats": list(self.formats), "validation": list(self.validation)}
         return {**vars(self), **lists, "budget": asdict(self.budget)}
 
     @staticmethod
-    def from_json(plain: Mapping[str, Any]) -> Recipe:
-        """The recipe that `to_json` gave."""
-        lists = {name: tuple(plain[name]) for name in ("formats", "validation")}
-        return Recipe(**{**plain, **lists, "budget": Budget(**plain["budget"])})
+    def from_json(plain: Table) -> Recipe:
+        """The recipe that `to_json` gave.
+
+        Raises:
+            ConfigError: a value of another kind.
+        """
+        return build(Recipe, plain, "of an order", "recipe")
 
 
 def before(order: TrainingRequest) -> list[TrainingRequest]:
@@ -121,18 +103,17 @@ def before(order: TrainingRequest) -> list[TrainingRequest]:
     return [replace(order, judged=one.validation, recipe=replace(one, final="").to_json()) for one in chain]
 
 
-def make_smaller(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[dict[str, Any], bytes | None]:
-    """Make the network of an order with a recipe, and judge it.
+def make_smaller(plain: Table, start: bytes | None = None) -> tuple[Table, bytes | None]:
+    """Make the network of an order with a recipe, and evaluate it.
 
     Args:
-        plain: of `CompressionRequest.to_json`.
+        plain: of `TrainingRequest.to_json`.
         start: the state of one of the orders of `before`; it saves time and changes nothing else.
 
     Returns:
-        What `edp.workflows.search.trainings.train_order` returns, with ``formats``: by name the scores on the judging
-        sessions by horizon (``mae``, ``composite``), what the network takes and which limits it exceeds; ``plain``: the
-        scores in float32; ``left_out``: why a format is not there; for a recipe with `final`, ``weights``: its tensors
-        as base64 of safetensors. And the state that later orders go on from; None for one with `final`.
+        What `edp.workflows.search.trainings.train_order` returns, with the parts of
+        `edp.workflows.compression.pipeline.NetworkResult`; for a recipe with `final`, ``weights``: its tensors as
+        base64 of safetensors. And the state that later orders continue from; None for one with `final`.
 
     Raises:
         ConfigError: settings that contradict one another or the data, or a network that cannot be pruned.
@@ -148,12 +129,24 @@ def make_smaller(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[
     began = time.perf_counter()
     experiment = experiment_of(order)
     data = prepared(order, experiment)
-    weights_by_name: dict[str, Weights] = {} if start is None else unpack(start)
-    network = _made(recipe, experiment, data, weights_by_name)
-    result = _judged(recipe, network, data) | {"seconds": round(time.perf_counter() - began, 3)}
+    weights: dict[str, Weights] = {} if start is None else unpack(start)
+    bench = _StateBench(recipe.updates, experiment, data, weights)
+    request = recipe.order()
+    network = bench.teacher if request is None else bench.network(request)
+    formats = [recipe.final] if recipe.final else formats_of(request, recipe.formats)
+    evaluated = Evaluator(data, recipe.budget).evaluate(network, formats)
+    sessions = session_scores(evaluated.recordings.get(recipe.final, evaluated.recordings["float32"]))
+    counted = footprint(network)
+    result = {
+        "sessions": sessions,
+        "scores": mean_scores(sessions),
+        "parameters": counted.parameters,
+        "macs_tick": counted.macs_tick,
+        "seconds": round(time.perf_counter() - began, 3),
+    } | evaluated.to_json()
     if recipe.final:
         return result | {"weights": base64.b64encode(save(_weights(network))).decode()}, None
-    return result, pack(weights_by_name)
+    return result, pack(weights)
 
 
 def network_of(weights: str, task: Task, model: ModelSpec) -> Predictor:
@@ -161,65 +154,41 @@ def network_of(weights: str, task: Task, model: ModelSpec) -> Predictor:
     return _restored(load(base64.b64decode(weights)), task, model)
 
 
-def _made(recipe: Recipe, experiment: Experiment, data: Prepared, weights_by_name: dict[str, Weights]) -> Predictor:
-    """The network of a recipe; it and all that it is made of are in `weights_by_name` afterwards."""
-    if recipe.name not in weights_by_name:
-        own = recipe.experiment(experiment)
-        order, strategy = recipe.order(), None
-        if order is not None:
-            plain = replace(recipe, rounded=False)
-            teacher = _made(replace(plain, pruned=False, units=None), experiment, data, weights_by_name)
-            begun = _made(plain, experiment, data, weights_by_name) if recipe.rounded else None
-            strategy = order.strategy([teacher], data, begun)
-        weights_by_name[recipe.name] = _weights(fit(data, own.model, own.training, strategy=strategy).predictor)
-    # Always through its weights, so that a network that was kept and one that was trained just now are the same.
-    return _restored(weights_by_name[recipe.name], data.task, recipe.model(experiment))
+class _StateBench(Bench):
+    """Bench that keeps the weights of its networks by name, so that later orders continue from them.
+
+    Args:
+        updates: training steps of a smaller network (`Recipe.updates`).
+        experiment: of the teacher.
+        data: to train on.
+        weights: of the networks that are there already; those that are trained now are added.
+    """
+
+    def __init__(self, updates: int, experiment: Experiment, data: Prepared, weights: dict[str, Weights]) -> None:
+        self.updates, self.weights = updates, weights
+        if TEACHER not in weights:
+            weights[TEACHER] = _weights(fit(data, experiment.model, experiment.training).predictor)
+        super().__init__(_restored(weights[TEACHER], data.task, experiment.model), data, experiment.training)
+
+    def training_of(self, order: CompressionRequest) -> TrainingSpec:
+        """How a smaller network is trained, for the steps of the recipe."""
+        return shortened(order, self.training, self.updates)
+
+    def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
+        """Train the network of an order, unless its weights are there."""
+        if order.name not in self.weights:
+            self.weights[order.name] = _weights(super().train(order, start))
+        # Always through its weights, so that a network that was kept and one that was trained just now are the same.
+        return _restored(self.weights[order.name], self.data.task, order.model(self.teacher.spec))
 
 
-def _judged(recipe: Recipe, network: Predictor, data: Prepared) -> dict[str, Any]:
-    skip = network.spec.window
-    plain = score_predictions(stream_predictions(network, data.test), data, skip)
-    formats, left_out, shown = {}, {}, plain
-    for name in [recipe.final] if recipe.final else recipe.formats:
-        # A network trained for rounding is judged in the formats that round.
-        if recipe.rounded and not FORMATS[name].rounded:
-            continue
-        try:
-            deployed = deploy(network, name, data.train, recipe.budget)
-        except ExportError as error:
-            left_out[name] = str(error)
-            continue
-        scored = plain if name == "float32" else score_predictions(deployed.predict(data.test), data, skip)
-        usage = {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in vars(deployed.resource_usage).items()
-        }
-        over = {
-            limit: list(pair) for limit, pair in deployed.resource_usage.over(recipe.budget).items()
-        }  # as a ledger says it
-        formats[name] = {"scores": _overall(scored), "resource_usage": usage, "over": over}
-        shown = scored if recipe.final else plain
-    sessions = {
-        name: {k: {score: metric(scores["mean"], score) for score in SCORES} for k, scores in horizons.items()}
-        for name, horizons in shown.recordings.items()
-    }
-    counted = footprint(network)
-    return {
-        "sessions": sessions,
-        "scores": mean_scores(sessions),
-        "plain": _overall(plain),
-        "formats": formats,
-        "left_out": left_out,
-        "parameters": counted.parameters,
-        "macs_tick": counted.macs_tick,
-    }
-
-
-def _overall(scored: ModelScores) -> dict[str, dict[str, float]]:
-    return {
-        horizon: {score: metric(scores["mean"], score) for score in ("mae", "composite")}
-        for horizon, scores in scored.overall.items()
-    }
+def shortened(order: CompressionRequest, training: TrainingSpec, updates: int) -> TrainingSpec:
+    """Return how a smaller network is trained in `updates` steps, where its teacher has `training`."""
+    if order.rounding is not None and training.epochs == 1:
+        # Tuning is a third of the training (see `bench`); of several epochs the epochs are fewer instead.
+        updates = max(1, round(TUNING_EPOCHS * updates))
+    each = max(1, updates // training.epochs) if updates else 0
+    return order.training(replace(training, updates=each))
 
 
 def _weights(network: Predictor) -> Weights:

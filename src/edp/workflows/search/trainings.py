@@ -17,7 +17,7 @@ from edp.errors import ConfigError, DataError
 from edp.evaluation.footprint import parameters_and_macs
 from edp.evaluation.judge import JudgeSpec, judge, score_predictions
 from edp.evaluation.mac_check import check_counted
-from edp.evaluation.scores_file import metric
+from edp.evaluation.scores_file import MEAN, ByHorizon, metric
 from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
 from edp.networks.running import window_predictions
@@ -27,6 +27,8 @@ from edp.training.bundle import blank_scaler
 from edp.training.parts import fit_part
 
 SCORES = ("mae", "rmse", "p95", "p99", "composite")
+SessionScores = dict[str, dict[str, dict[str, float]]]
+"""Scores by session and horizon, report units, means over outputs."""
 
 
 @dataclass(frozen=True)
@@ -177,13 +179,7 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
         by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip).recordings
     else:
         by_recording = judge(fitted.predictor, data, spec, "").scores.models["network"].recordings
-    sessions = {
-        name: {
-            k: {score: metric(horizon_scores["mean"], score) for score in SCORES}
-            for k, horizon_scores in horizons.items()
-        }
-        for name, horizons in by_recording.items()
-    }
+    sessions = session_scores(by_recording)
     parameters, macs_tick = parameters_and_macs(fitted.predictor.costs())
     result = {
         "sessions": sessions,
@@ -215,6 +211,16 @@ def experiment_of(order: TrainingRequest) -> Experiment:
         seed=order.seed,
     )
     return replace(experiment, training=training)
+
+
+def session_scores(recordings: Mapping[str, ByHorizon]) -> SessionScores:
+    """Return the means over outputs of the scores by recording and horizon that `score_predictions` gives."""
+    return {
+        name: {
+            horizon: {score: metric(scores[MEAN], score) for score in SCORES} for horizon, scores in horizons.items()
+        }
+        for name, horizons in recordings.items()
+    }
 
 
 def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:

@@ -6,7 +6,6 @@ from edp.workflows.compression.formats.base import (
     Deployed,
     Format,
     Predict,
-    ResourceUsage,
     deploy,
     resource_usage,
 )
@@ -16,7 +15,6 @@ __all__ = [
     "Deployed",
     "Format",
     "Predict",
-    "ResourceUsage",
     "deploy",
     "dynamic_int8",
     "float32",

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.series import Series
-from edp.evaluation.controller import Budget, Estimate
+from edp.evaluation.controller import Budget, Estimate, ResourceUsage
 from edp.evaluation.footprint import footprint
 from edp.networks.predictor import Predictor
 from edp.registry import Registry
@@ -42,40 +42,6 @@ class Format(Protocol):
 
 
 FORMATS: Registry[type[Format]] = Registry("number format")
-
-
-@dataclass(frozen=True)
-class ResourceUsage:
-    """What a network takes of a controller in one format; cycles, memory beside weights and program are estimates.
-
-    Attributes:
-        parameters: trainable numbers, after folding.
-        macs_tick: multiply-accumulates of a tick.
-        macs_window: the same of a window, as the thesis counts.
-        cycles: low, typical and high estimate of a tick; the high one decides.
-        parameter_bytes: memory for parameters.
-        ram_bytes: weights, state, working memory and stack.
-        flash_bytes: weights and program.
-    """
-
-    parameters: int
-    macs_tick: int
-    macs_window: int
-    cycles: tuple[int, int, int]
-    parameter_bytes: int
-    ram_bytes: int
-    flash_bytes: int
-
-    def over(self, budget: Budget) -> dict[str, tuple[int, int]]:
-        """Limits that are exceeded: what is taken, and what is granted."""
-        # The high estimate of cycles decides: a deadline that is missed at times is missed.
-        pairs = {
-            "cycles": (self.cycles[2], budget.cycles),
-            "parameter_bytes": (self.parameter_bytes, budget.parameter_bytes),
-            "ram_bytes": (self.ram_bytes, budget.ram_bytes),
-            "flash_bytes": (self.flash_bytes, budget.flash_bytes),
-        }
-        return {name: pair for name, pair in pairs.items() if pair[0] > pair[1]}
 
 
 def resource_usage(
@@ -120,10 +86,6 @@ class Deployed:
     number_format: str
     predict: Predict
     resource_usage: ResourceUsage
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values of what it takes."""
-        return {"format": self.number_format, "label": FORMATS[self.number_format].label} | vars(self.resource_usage)
 
 
 def deploy(

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Generator, Sequence
+from dataclasses import asdict, replace
+from statistics import fmean
 
 from edp.config.experiment import Experiment, Table, build
 from edp.errors import ConfigError
+from edp.evaluation.compression import CompressedRow
 from edp.networks.narrow import width_of
 from edp.networks.predictor import build_model
-from edp.stats.pareto import pareto
 from edp.training.bundle import blank_scaler
 from edp.wording import percent
-from edp.workflows.compression import FORMATS
-from edp.workflows.compression.judged import recipe_text, relative
+from edp.workflows.compression import FORMATS, CompressionRequest
+from edp.workflows.compression.pipeline import TEACHER, NetworkResult, choose, relative_error, rows_of
 from edp.workflows.compression.planning import CompressionPlan, make_plan
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.phases.base import PHASES, Course
@@ -22,24 +22,6 @@ from edp.workflows.search.smaller import Recipe
 from edp.workflows.search.trainings import TrainingRequest
 
 NAME = "compression"
-Row = dict[str, Any]
-
-
-@dataclass
-class _Made:
-    """A network and what came of it."""
-
-    recipe: Recipe
-    outcome: Outcome
-
-    @property
-    def error(self) -> float:
-        """MAE in float32, the mean over horizons; infinite where it was not trained to its end."""
-        result = self.outcome.result
-        # A failed network must never be the least.
-        if result is None:
-            return float("inf")
-        return sum(float(scores["mae"]) for scores in result["plain"].values()) / len(result["plain"])
 
 
 class CompressionPhase:
@@ -68,7 +50,6 @@ class CompressionPhase:
         settings = teacher_settings(context)
         # The teacher first: all others are made of it.
         (first,) = yield [order_of(context, settings, recipe_of(context))]
-        teacher = _Made(recipe_of(context), first)
         if first.result is None:
             return _nothing(
                 context, f"The teacher's training at length did not end well ({first.message or first.status})."
@@ -77,78 +58,76 @@ class CompressionPhase:
             plan = plan_of(context, settings)
         except ConfigError as error:
             return _nothing(context, f"No network was made: {error}.")
-        networks = [teacher]
-        recipes = [recipe_of(context, order.units, order.pruned) for orders in plan.orders.values() for order in orders]
-        outcomes = yield [order_of(context, settings, recipe) for recipe in recipes]
-        networks += map(_Made, recipes, outcomes)
+        teacher = NetworkResult.from_json(first.result)
+        requests = [order for orders in plan.orders.values() for order in orders]
+        results = yield from _make(context, settings, requests)
         if plan.rounds:
-            # The better recipe of each width is rounded; rounding both would double the trainings.
-            better = [replace(_better(networks, units).recipe, rounded=True) for units in plan.orders]
-            outcomes = yield [order_of(context, settings, recipe) for recipe in better]
-            networks += map(_Made, better, outcomes)
-        rows = rows_of(context, teacher, networks)
-        chosen = chosen_of(rows)
-        if chosen is None:
-            # The second test set is not opened where nothing fits.
-            return self.decide(context, plan, rows, None, ())
-        # Teacher and choice alone are judged there: more evaluations would make it a validation set.
-        final = [replace(recipe_of(context), final="float32"), _final(context, rows[chosen])]
-        outcomes = yield [order_of(context, settings, recipe, context.second) for recipe in final]
-        return self.decide(context, plan, rows, chosen, outcomes)
-
-    def decide(
-        self,
-        context: SearchContext,
-        plan: CompressionPlan,
-        rows: list[Row],
-        chosen: int | None,
-        outcomes: Sequence[Outcome],
-    ) -> Decision:
-        """The network with the least error among those that fit, and what the second test set says of it."""
-        points = [
-            (row["error"], row["resource_usage"]["cycles"][2], row["resource_usage"]["parameter_bytes"]) for row in rows
-        ]
-        budget = context.spec.compression.budget
-        facts: dict[str, Any] = {
-            "on": True,
-            "budget": recipe_of(context).to_json()["budget"],
+            # The mean over horizons of the MAE itself, not over the teacher's as in the rows.
+            errors = {order: fmean(one["mae"] for one in result.plain.values()) for order, result in results.items()}
+            results |= yield from _make(context, settings, plan.to_round(errors))
+        networks: list[tuple[CompressionRequest | None, NetworkResult]] = [(None, teacher), *results.items()]
+        rows = [(order, row) for order, result in networks for row in rows_of(order, result, teacher.plain)]
+        front, chosen = choose([row for _, row in rows])
+        facts = _facts(context, tuple(plan.notes)) | {
             "sessions": {"train": list(context.training), "validation": list(context.validation)},
-            "second": list(context.second),
-            "rows": rows,
-            "front": pareto(points),
+            "rows": [_row_table(order, row) for order, row in rows],
+            "front": front,
             "chosen": chosen,
-            "notes": list(plan.notes),
-            "held_out_test": None,
         }
         sentences = [f"{len(rows)} networks and formats were compared on {', '.join(context.validation)}."]
+        budget = context.spec.compression.budget
         if chosen is None:
+            # The second test set is not opened where nothing fits.
             return Decision(NAME, facts, (*sentences, f"None of them fits the budget '{budget.name}'."))
-        row = rows[chosen]
-        usage = row["resource_usage"]
+        order, row = rows[chosen]
+        usage = row.resource_usage
         sentences.append(
-            f"Chosen for '{budget.name}': {row['name']} with {usage['parameter_bytes']:,} bytes of parameters "
-            f"and {usage['cycles'][2]:,} cycles a tick; its error there is {percent(row['error'] - 1, signed=True)} "
+            f"Chosen for '{budget.name}': {row.name} with {usage.parameter_bytes:,} bytes of parameters "
+            f"and {usage.cycles[2]:,} cycles a tick; its error there is {percent(row.error - 1, signed=True)} "
             "against the teacher's."
         )
-        formats = ("float32", row["format"])
-        format_results = [
-            o.result["formats"].get(f) if o.result is not None else None for o, f in zip(outcomes, formats)
+        # Teacher and choice alone are judged there: more evaluations would make it a validation set.
+        final = [
+            replace(recipe_of(context), final="float32"),
+            replace(recipe_of(context, order), final=row.number_format),
         ]
-        if None in format_results or not format_results:
+        outcomes = yield [order_of(context, settings, recipe, context.second) for recipe in final]
+        scores = {
+            who: result.scores
+            for who, recipe, outcome in zip((TEACHER, "chosen"), final, outcomes, strict=True)
+            if outcome.result is not None
+            if (result := NetworkResult.from_json(outcome.result).formats.get(recipe.final)) is not None
+        }
+        if len(scores) < len(final):
             sentences.append("A network could not be judged on the second test set.")
             return Decision(NAME, facts, tuple(sentences))
-        scores = {
-            who: one["scores"]
-            for who, one in zip(("teacher", "chosen"), format_results, strict=True)
-            if one is not None
-        }
-        error = relative(scores["chosen"], scores["teacher"])
-        facts["held_out_test"] = {"scores": scores, "error": error}
+        ratio = relative_error(scores["chosen"], scores[TEACHER])
         sentences.append(
             f"On the second test set ({', '.join(context.second)}), opened for these two alone: "
-            f"{percent(error - 1, signed=True)} against the teacher's error."
+            f"{percent(ratio - 1, signed=True)} against the teacher's error."
         )
-        return Decision(NAME, facts, tuple(sentences))
+        return Decision(NAME, facts | {"held_out_test": {"scores": scores, "error": ratio}}, tuple(sentences))
+
+
+def _make(
+    context: SearchContext, settings: Table, requests: Sequence[CompressionRequest]
+) -> Generator[list[TrainingRequest], list[Outcome], dict[CompressionRequest, NetworkResult]]:
+    """Have networks made; those that were not trained to their end are left out."""
+    outcomes = yield [order_of(context, settings, recipe_of(context, request)) for request in requests]
+    return {
+        request: NetworkResult.from_json(outcome.result)
+        for request, outcome in zip(requests, outcomes, strict=True)
+        if outcome.result is not None
+    }
+
+
+def _row_table(order: CompressionRequest | None, row: CompressedRow) -> Table:
+    table = {name: getattr(row, name) for name in ("name", "recipe", "over", "scores", "before", "error")}
+    table |= {"format": row.number_format, "resource_usage": vars(row.resource_usage)}
+    if order is None:
+        return table | {"units": None, "pruned": False, "rounded": False}
+    pruned = order.pruned if order.of is None else order.of.pruned
+    return table | {"units": order.units, "pruned": pruned, "rounded": order.rounding is not None}
 
 
 def teacher_settings(context: SearchContext) -> Table:
@@ -157,11 +136,15 @@ def teacher_settings(context: SearchContext) -> Table:
     return settings
 
 
-def recipe_of(context: SearchContext, units: int | None = None, pruned: bool = False) -> Recipe:
-    """A recipe under the settings of this search."""
+def recipe_of(context: SearchContext, order: CompressionRequest | None = None) -> Recipe:
+    """Return the recipe of a network under the settings of this search; without an order that of the teacher."""
     spec = context.spec.compression
     steps = spec.updates or context.spec.final_updates
-    return Recipe(steps, spec.formats or tuple(FORMATS), spec.budget, context.validation, units, pruned)
+    recipe = Recipe(steps, spec.formats or tuple(FORMATS), spec.budget, context.validation)
+    if order is None:
+        return recipe
+    pruned = order.pruned if order.of is None else order.of.pruned
+    return replace(recipe, units=order.units, pruned=pruned, rounded=order.rounding is not None)
 
 
 def order_of(context: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
@@ -193,62 +176,13 @@ def plan_of(context: SearchContext, settings: Table) -> CompressionPlan:
     return make_plan(network, spec.budget, units, spec.formats, shares=spec.shares)
 
 
-def _better(networks: Sequence[_Made], units: int) -> _Made:
-    """Of the networks of a width the one with the least error in float32."""
-    return min((one for one in networks if one.recipe.units == units), key=lambda one: one.error)
-
-
-def rows_of(context: SearchContext, teacher: _Made, networks: Sequence[_Made]) -> list[Row]:
-    """Every network in every format that it can be in, in the order in which they were made."""
-    rows: list[Row] = []
-    base = teacher.outcome.result or {}
-    for one in networks:
-        result = one.outcome.result
-        if result is None:
-            continue
-        order = one.recipe.order()
-        for name, format_result in result["formats"].items():
-            rows.append(
-                {
-                    "name": f"{one.recipe.name} {FORMATS[name].label}",
-                    "recipe": "teacher" if order is None else recipe_text(order),
-                    "units": one.recipe.units,
-                    "pruned": one.recipe.pruned,
-                    "rounded": one.recipe.rounded,
-                    "format": name,
-                    "resource_usage": format_result["resource_usage"],
-                    "over": format_result["over"],
-                    "scores": format_result["scores"],
-                    "before": result["plain"],
-                    "error": relative(format_result["scores"], base["plain"]),
-                }
-            )
-    return rows
-
-
-def chosen_of(rows: Sequence[Row]) -> int | None:
-    """Place of the row that fits with the least error, of equals the cheapest; None where none fits."""
-    fitting = [index for index, row in enumerate(rows) if not row["over"]]
-    # Ties of error go to fewer cycles, then to fewer bytes.
-    return min(
-        fitting,
-        key=lambda i: (
-            rows[i]["error"],
-            rows[i]["resource_usage"]["cycles"][2],
-            rows[i]["resource_usage"]["parameter_bytes"],
-        ),
-        default=None,
-    )
-
-
-def _final(context: SearchContext, row: Row) -> Recipe:
-    return replace(recipe_of(context, row["units"], row["pruned"]), rounded=row["rounded"], final=row["format"])
+def _facts(context: SearchContext, notes: tuple[str, ...]) -> Table:
+    facts = {"on": True, "rows": [], "front": [], "chosen": None, "notes": list(notes), "held_out_test": None}
+    return facts | {"second": list(context.second), "budget": asdict(context.spec.compression.budget)}
 
 
 def _nothing(context: SearchContext, why: str) -> Decision:
-    facts = {"on": True, "rows": [], "front": [], "chosen": None, "notes": [why], "held_out_test": None}
-    facts |= {"second": list(context.second), "budget": recipe_of(context).to_json()["budget"]}
-    return Decision(NAME, facts, (why, "The second test set stays closed."))
+    return Decision(NAME, _facts(context, (why,)), (why, "The second test set stays closed."))
 
 
 PHASES.register(NAME)(CompressionPhase())

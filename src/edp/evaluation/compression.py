@@ -1,0 +1,161 @@
+"""Result of a compression: networks in number formats, evaluated against a budget; the file ``compression.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from edp.errors import ConfigError, StorageError
+from edp.evaluation.controller import Budget, ResourceUsage
+from edp.settings.tree import SettingsTree, Table
+from edp.storage import read_json, write_json
+from edp.storage.ledger import Opening
+from edp.storage.paths import is_file_at
+
+FILE, SCHEMA = "compression.json", 2
+Scores = Mapping[str, Mapping[str, float]]
+"""``mae`` and ``composite`` by horizon: mean over outputs, report units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressedRow:
+    """A network in one number format.
+
+    Attributes:
+        name: network and format.
+        recipe: how the network was made, in words.
+        number_format: a name of `edp.workflows.compression.FORMATS`; `label`: as tables show it.
+        resource_usage: what it takes of the controller.
+        over: limits that it exceeds: what it takes, and what is granted; `fits`: whether there are none.
+        scores: on the recordings that compare, in its format.
+        before: the same in float32.
+        error: MAE divided by that of the teacher in float32, the mean over horizons.
+        run: folder of the network's run; empty for one of a search.
+    """
+
+    name: str
+    recipe: str
+    number_format: str
+    label: str
+    resource_usage: ResourceUsage
+    over: Mapping[str, tuple[int, int]]
+    fits: bool
+    scores: Scores
+    before: Scores
+    error: float
+    run: str = ""
+
+    @property
+    def costs(self) -> tuple[float, int, int]:
+        """Error, cycles (high estimate) and bytes of parameters: what a choice compares, in this order."""
+        return self.error, self.resource_usage.cycles[2], self.resource_usage.parameter_bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOutTest:
+    """Evaluation on recordings that took part in no choice.
+
+    Attributes:
+        seen_before: whether networks were evaluated on them before these.
+        name: of the sealed test set; empty where it stayed closed.
+        opened: when, in ISO 8601.
+        openings: of the test set, oldest first.
+        scores: of ``teacher`` and ``chosen``.
+        error: MAE of the chosen network divided by the teacher's, mean over horizons.
+    """
+
+    seen_before: bool = False
+    name: str = ""
+    opened: str = ""
+    openings: tuple[Opening, ...] = ()
+    scores: Mapping[str, Scores] = field(default_factory=dict)
+    error: float | None = None
+
+
+@dataclass(frozen=True)
+class ComparedTask:
+    """Horizons in samples, and the rate in Hz."""
+
+    horizons: tuple[int, ...]
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class RecordingCounts:
+    """Number of recordings of each part; `test` counts those of the sealed test set."""
+
+    train: int
+    validation: int
+    test: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CompressionResult:
+    """Content of ``compression.json``.
+
+    Attributes:
+        budget: what the controller grants.
+        task: of the teacher.
+        unit: of the scores.
+        recordings: number of recordings.
+        teacher: the teacher in float32.
+        rows: all networks in all formats.
+        front: indices of the rows that no other one surpasses in error, cycles and bytes of parameters.
+        chosen: index of the row that fits with the smallest error; None if none fits.
+        held_out_test: scores of teacher and chosen network on recordings that took part in no choice.
+        notes: what was left out, and why.
+    """
+
+    budget: Budget
+    task: ComparedTask
+    unit: str
+    recordings: RecordingCounts
+    teacher: CompressedRow
+    rows: tuple[CompressedRow, ...]
+    front: tuple[int, ...]
+    chosen: int | None
+    held_out_test: HeldOutTest = field(default_factory=HeldOutTest)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        indices = (*self.front, *([] if self.chosen is None else [self.chosen]))
+        if not all(0 <= index < len(self.rows) for index in indices):
+            raise ConfigError(f"front or chosen: got indices {list(indices)} of {len(self.rows)} rows")
+        horizons = {str(horizon) for horizon in self.task.horizons}
+        scores = [part for row in (self.teacher, *self.rows) for part in (row.scores, row.before)]
+        for part in (*scores, *self.held_out_test.scores.values()):
+            if set(part) != horizons or any(not {"mae", "composite"} <= set(row) for row in part.values()):
+                raise ConfigError(f"scores: got those of {', '.join(part)}, expected horizons {', '.join(horizons)}")
+
+    @property
+    def best(self) -> CompressedRow | None:
+        """The chosen row."""
+        return None if self.chosen is None else self.rows[self.chosen]
+
+    def to_json(self) -> Table:
+        """Return the content as plain values."""
+        closed = {} if self.held_out_test.name else {"held_out_test": {"seen_before": self.held_out_test.seen_before}}
+        return {"schema": SCHEMA} | asdict(self) | closed
+
+    def write(self, folder: Path) -> None:
+        """Write ``compression.json`` into a folder."""
+        write_json(folder / FILE, self.to_json())
+
+
+def read_compression_result(folder: str | Path) -> CompressionResult:
+    """Return the checked content of the ``compression.json`` in a folder.
+
+    Raises:
+        StorageError: the folder has no such file, or the file is damaged or of another version.
+    """
+    file = Path(folder) / FILE
+    if not is_file_at(file):
+        raise StorageError(f"'{folder}' holds no {FILE}; give the folder of edp compress")
+    content = read_json(file)
+    if not isinstance(content, dict) or content.pop("schema", None) != SCHEMA:
+        raise StorageError(f"'{file}' is of another version of EDP; run edp compress again")
+    try:
+        return SettingsTree(what="result").build(CompressionResult, content, f"'{file}'")
+    except ConfigError as error:
+        raise StorageError(f"{error}\nrun edp compress again: it reads the finished networks") from error
