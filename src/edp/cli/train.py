@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,7 @@ from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
     from edp.logs.source import DataSource
+    from edp.report.run.choice import AutoChoice
     from edp.training import Bundle
 
 AUTO = "auto"
@@ -95,47 +96,48 @@ def _train_auto(
         err.print(f"train: reads the logs, then trains for at most about {limit} of processor time (--minutes)")
     with shown_progress("train", quiet) as progress:
         result = train_auto(source, settings, folder, progress, workers)
-    facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.facts}
+    facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.choice.to_table()}
 
     def show() -> None:
         out.print(result.sentence)
-        for note in result.facts.get("notes", ()):
+        for note in result.choice.notes or ():
             out.print(note)
-        _promise_table(result.facts)
-        _expected_table(result.facts)
+        _promise_table(result.choice)
+        _expected_table(result.choice)
         out.print(f"bundle in {folder / 'bundle'}")
         out.print(f"next: edp evaluate {folder}")
 
     emit(quiet, facts, show)
 
 
-def _promise_table(facts: dict[str, Any]) -> None:
+def _promise_table(choice: AutoChoice) -> None:
     """Print the expected error of each candidate by output."""
     rows = []
-    for name, one in facts["candidates"].items():
-        mark = "*" if name == facts["chosen"] else ""
-        share = percent(math.expm1(facts["excess"][name] - facts["excess"][facts["chosen"]]), signed=True)
-        rows.append([f"{one['label']} {mark}".strip(), f"{one['parameters']:,}", duration(one["seconds"]), share])
-    title = f"error on left-out data against the model that is kept (*), within {figure(facts['minutes'])} min"
+    for name, one in choice.candidates.items():
+        mark = "*" if name == choice.chosen else ""
+        share = percent(math.expm1(choice.excess[name] - choice.excess[choice.chosen]), signed=True)
+        rows.append([f"{one.label} {mark}".strip(), f"{one.parameters:,}", duration(one.seconds), share])
+    title = f"error on left-out data against the model that is kept (*), within {figure(choice.minutes)} min"
     table(title, ["model", "parameters", "trained in", "error"], rows)
 
 
-def _expected_table(facts: dict[str, Any]) -> None:
+def _expected_table(choice: AutoChoice) -> None:
     """Print the error to expect of each output at the longest horizon."""
-    if "interval" not in facts:
+    interval, skill = choice.interval, choice.skill
+    if interval is None or skill is None:
         return  # a run of an earlier version
-    promised, interval, skill = facts["candidates"][facts["chosen"]]["promise"], facts["interval"], facts["skill"]
+    promised = choice.candidates[choice.chosen].promise
     horizon = max(promised, key=int)
-    expected = [promised[horizon], interval["low"][horizon], interval["high"][horizon]]
+    expected = [promised[horizon], interval.low[horizon], interval.high[horizon]]
     rows = [
         [
             target,
             *(figure(values[target]) for values in expected),
-            number(skill["promise"][horizon][target], 2),
+            number(skill.promise[horizon][target], 2),
         ]
         for target in list(promised[horizon])[:MOST_EXPECTED]
     ]
-    beside = "persistence's" if skill["against"] == "persistence" else "the linear model's"
+    beside = "persistence's" if skill.against == "persistence" else "the linear model's"
     heads = ["output", "error", "90 % of tests: from", "to", f"over {beside}"]
     table(f"error (RMSE) to expect of tests that are like the training, k = {horizon}", heads, rows)
 

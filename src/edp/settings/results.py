@@ -22,8 +22,8 @@ AGAIN = "remove it and give the command that wrote it again"
 class ResultFile:
     """Base of the frozen dataclasses of result files.
 
-    A field without a default is always written, None as null. A field whose default is None, an empty tuple or an
-    empty mapping is left out of the file while it is empty.
+    A field whose default is None, an empty tuple or an empty mapping is left out of the file while it has this default.
+    Any other field is always written, None as null.
 
     Attributes:
         NAME: of the file.
@@ -94,9 +94,9 @@ def read_part(cls: type[T], table: Mapping[str, Any], where: str, what: str = "r
 
 def plain_fields(value: Any) -> Table:
     """Return the fields of a dataclass of results as JSON has them; see `ResultFile` for those that are left out."""
-    optional = _optional_fields(value.__class__)
+    empty = _empty_defaults(value.__class__)
     values = ((entry.name, getattr(value, entry.name)) for entry in fields(value))
-    return {name: plain_value(entry) for name, entry in values if name not in optional or not _is_empty(entry)}
+    return {name: plain_value(entry) for name, entry in values if name not in empty or entry != empty[name]}
 
 
 def plain_value(value: Any) -> Any:
@@ -110,15 +110,11 @@ def plain_value(value: Any) -> Any:
     return str(value) if isinstance(value, Enum | Path) else value
 
 
-def _is_empty(value: Any) -> bool:
-    return value is None or (isinstance(value, tuple | list | Mapping) and not value)
-
-
 @cache
-def _optional_fields(cls: type) -> frozenset[str]:
-    """Return the names of the fields whose default is empty."""
+def _empty_defaults(cls: type) -> Mapping[str, Any]:
+    """Return the defaults that are empty, by name of the field."""
     defaults = {
         entry.name: entry.default_factory() if entry.default_factory is not MISSING else entry.default
         for entry in fields(typing.cast(Any, cls))
     }
-    return frozenset(name for name, default in defaults.items() if _is_empty(default))
+    return {name: default for name, default in defaults.items() if default is None or default in ((), {})}

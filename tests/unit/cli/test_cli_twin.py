@@ -21,6 +21,7 @@ from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import ModelSpec, build_model
 from edp.networks.twin import TWINS
 from edp.networks.twin.n4sid import N4sid
+from edp.settings.provenance import DataOrigin, DataPart, Provenance
 from edp.signals import Kind
 from edp.storage import read_object, write_json
 from edp.testing.twins import sample_actuators
@@ -245,7 +246,7 @@ def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, l
     task = Task(FeatureSet("speeds", (*speeds, "lever_1", "lever_2")), speeds, (1, 5), TargetMode.DELTA, 50.0)
     model = ModelSpec(backbone=HybridSpec(channels=(4,), kernel=3, units=4, dropout=0.0), window=20)
     data = prepare([recording] * 3, task, ByRecording(), 20)
-    names = {"data": {"train": {"names": [recording.name]}}}
+    names = Provenance(data=DataOrigin(train=DataPart(names=(recording.name,))))
     save_bundle(make_bundle(build_model(task, model, data.scaler(), 0).eval(), data, names), tmp_path / "predictor")
     before = read_object(run / "free_run.json")
     again = edp("evaluate", run, "--json").json

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sample_scores import sample_errors, sample_free_run_scores
 
 from edp.config.twin import load_twin_experiment
 from edp.control.plants import plant_of
@@ -14,6 +15,7 @@ from edp.logs.source import DataSource
 from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
 from edp.report.twin.facts import ground_line
+from edp.settings.results import plain_value
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import write_json
 from edp.testing.control import sample_excavator_twin, sample_grey_box
@@ -29,7 +31,8 @@ GROUND = ("ground=drag", "judge.floors=[]")
 def start(tmp_path_factory):
     """A run folder of a grey box that nobody fitted, with a datasheet of a row."""
     run = tmp_path_factory.mktemp("start")
-    save_twin(replace(sample_grey_box(), scores={"twin": {}}), run / "twin")
+    scores = plain_value({"twin": sample_free_run_scores(sample_errors(1.0, 1.0))})
+    save_twin(replace(sample_grey_box(), scores=scores), run / "twin")
     row = {"element": "pump", "name": "flow", "unit": "m^3/s", "value": 1.0, "low": 0.9, "high": 1.1, "excited": True}
     write_json(run / "datasheet.json", {"schema": 1, "basis": "", "numbers": [row]})
     for name in JUDGED:

@@ -101,15 +101,13 @@ def situations_of(facts: run.Facts) -> tables.TextTable | None:
 
 def choice_of(facts: run.Facts) -> dict[str, Any]:
     """What the preset auto chose, as sentence and tables; empty for any other run."""
-    content = read_choice(facts.folder)
-    if content is None:
+    choice = read_choice(facts.folder)
+    if choice is None:
         return {}
     return {
-        "sentence": unbroken(
-            " ".join(filter(None, (content["sentence"], *content.get("notes", ()), promise_line(content))))
-        ),
-        "tables": [entry for entry in (candidates_table(content), promise_table(facts, content)) if entry is not None],
-        "models": model_tables(facts, content),
+        "sentence": unbroken(" ".join(filter(None, (choice.sentence, *(choice.notes or ()), promise_line(choice))))),
+        "tables": [entry for entry in (candidates_table(choice), promise_table(facts, choice)) if entry is not None],
+        "models": model_tables(facts, choice),
     }
 
 
