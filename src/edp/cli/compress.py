@@ -80,7 +80,7 @@ def _tables(facts: CompressionFacts) -> None:
     from edp.report.compression import facts as words
 
     for horizon in facts.horizons:
-        sheet = words.table_sheet(facts, horizon)
+        sheet = words.front_table(facts, horizon)
         marked = [("* " if row in sheet.marked else "  ") + cells[0] for row, cells in enumerate(sheet.texts())]
         rows = [[name, *cells[2:]] for name, cells in zip(marked, sheet.texts(), strict=True)]
         first, _, *others = sheet.heads()

@@ -154,7 +154,7 @@ def _tables(facts: Transfer) -> None:
     from edp.report.transfer import facts as words
 
     for horizon in facts.horizons:
-        for sheet in words.sheets_of(facts, horizon):
+        for sheet in words.transfer_tables(facts, horizon):
             table(sheet.caption, sheet.heads(), sheet.texts())
             out.print()
     out.print(words.headline(facts))

@@ -93,7 +93,7 @@ def inspect(
     if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
 
-        build_coverage_page(coverage_facts, page, full_path(data[0]).stem, quality)
+        build_coverage_page(coverage_facts, full_path(data[0]).stem, quality).write(page)
 
     def show() -> None:
         few = len(quality.reports) == 1 and len(quality.reports[0].channels) <= MOST_CHANNELS

@@ -10,7 +10,7 @@ from noted_progress import NotedProgress
 from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageError
 from edp.jobs import Workforce
 from edp.logs.source import DataSource
-from edp.report.fleet.facts import fleet_facts, headline, machine_sheet, verdict, worst_sheet
+from edp.report.fleet.facts import fleet_facts, headline, machine_table, verdict, worst_table
 from edp.report.fleet.page import render
 from edp.storage import write_json
 from edp.training import load_bundle
@@ -172,8 +172,8 @@ def test_reasons_are_what_departs_from_the_fleet(content):
     assert why["m0"] == ""
     assert headline(facts).startswith("12 machines, median error")
     assert "1 of 12 machines drift" in verdict(facts)[0]
-    assert len(worst_sheet(facts).rows) == 10
-    assert machine_sheet(facts).marked
+    assert len(worst_table(facts).rows) == 10
+    assert machine_table(facts).marked
     page = render(facts)
     assert "<b>m4</b>" not in page
     assert "too short" in page

@@ -4,6 +4,7 @@ from html.parser import HTMLParser
 
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.errors import StorageError
 from edp.report import build_report
@@ -130,7 +131,7 @@ def test_unknown_keys_are_ignored_and_unscored_metrics_are_dashes(run_folder):
     scores["models"]["persistence"]["overall"]["10"]["mean"]["r2"] = None
     write_json(run_folder / "scores.json", scores)
     table = context(read_facts(run_folder))["comparisons"][0]
-    r2 = [heading for heading, _ in table.columns].index("R²")
+    r2 = [column.heading for column in table.columns].index("R²")
     assert next(row for row in table.rows if row[0] == "Persistence")[r2] == "–"
 
 
@@ -143,6 +144,14 @@ def test_the_table_marks_the_network_and_leads_with_the_longest_horizon(run_fold
 def test_a_page_that_cannot_be_written_says_so(run_folder):
     with pytest.raises(StorageError, match="cannot"):
         build_report(run_folder, output=run_folder / "config.toml" / "report.html")
+
+
+@pytest.mark.parametrize("missing", ["", "scores.json", "footprint.json"])
+def test_the_text_of_the_page(run_folder, missing):
+    if missing:
+        (run_folder / missing).unlink()
+    text = render(read_facts(run_folder), "Velocities").replace(str(run_folder), "RUN")
+    check_text(text, f"run{missing and '_without_' + missing.split('.')[0]}")
 
 
 @pytest.mark.processes

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from edp.errors import ConfigError, count_of
 from edp.evaluation.scores_file import MEAN, ByHorizon, ModelScores, ScoredTarget, ScoresFile, error_at, metric
-from edp.report.common.tables import TextTable
 from edp.report.run.facts import NETWORK, Facts, horizon_text, label_of, score
 from edp.report.run.figures import horizons_shown
 from edp.settings.results import ResultFile
 from edp.storage.paths import is_file_at
+from edp.table import Column, Table
 from edp.wording import MISSING, decimals_for, number, percent
 
 FLOOR, PERSISTENCE = "linear", "persistence"
@@ -168,7 +168,7 @@ def _errors(overall: ByHorizon) -> Errors:
     }
 
 
-def candidates_table(choice: AutoChoice) -> TextTable:
+def candidates_table(choice: AutoChoice) -> Table:
     """Each candidate's error on left-out data relative to the one that is kept."""
     chosen, excess = choice.chosen, choice.excess
     rows = []
@@ -177,11 +177,11 @@ def candidates_table(choice: AutoChoice) -> TextTable:
         share = math.expm1(excess[name] - excess[chosen])
         rows.append((one.label, f"{one.parameters:,}", "kept" if name == chosen else percent(share, signed=True)))
     marked = frozenset(row for row, name in enumerate(choice.candidates) if name == chosen)
-    columns = (("Model", ""), ("Parameters", ""), ("Error on left-out data", "against the one kept"))
-    return TextTable("The models that were tried", columns, tuple(rows), marked)
+    columns = (Column("Model"), Column("Parameters"), Column("Error on left-out data", "against the one kept"))
+    return Table("The models that were tried", columns, tuple(rows), marked)
 
 
-def model_tables(facts: Facts, choice: AutoChoice) -> list[TextTable]:
+def model_tables(facts: Facts, choice: AutoChoice) -> list[Table]:
     """Every model that was tried and every baseline, a table an output: left-out data beside the test recordings.
 
     A candidate's error on left-out data is its cross-validated promise, a baseline's is that on the validation part,
@@ -190,7 +190,7 @@ def model_tables(facts: Facts, choice: AutoChoice) -> list[TextTable]:
     return [table for table in (_of_output(facts, choice, target) for target in facts.targets) if table.rows]
 
 
-def _of_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> TextTable:
+def _of_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> Table:
     horizons, chosen = horizons_shown(facts), choice.chosen
 
     def tested(name: str, k: int) -> float | None:
@@ -216,14 +216,16 @@ def _of_output(facts: Facts, choice: AutoChoice, target: ScoredTarget) -> TextTa
         for label, values in rows
     )
     marked = frozenset(index for index, name in enumerate(choice.candidates) if name == chosen)
-    columns = [("Model", "")]
+    columns = [Column("Model")]
     for k in horizons:
-        columns += [(f"{horizon_text(facts, k)} ahead, {part}", target.unit) for part in ("left-out data", "test")]
+        columns += [
+            Column(f"{horizon_text(facts, k)} ahead, {part}", target.unit) for part in ("left-out data", "test")
+        ]
     caption = f"{target.description}: RMSE of every model on left-out data and on the test recordings"
-    return TextTable(caption, tuple(columns), cells, marked)
+    return Table(caption, tuple(columns), cells, marked)
 
 
-def promise_table(facts: Facts, choice: AutoChoice) -> TextTable | None:
+def promise_table(facts: Facts, choice: AutoChoice) -> Table | None:
     """By output and horizon the error promised and that on the test recordings, both beside a simple model's."""
     promised, unknown = choice.candidates[choice.chosen].promise, ErrorBounds(low={}, high={})
     interval = choice.interval or unknown
@@ -258,16 +260,16 @@ def promise_table(facts: Facts, choice: AutoChoice) -> TextTable | None:
         return None
     beside = "Error over the linear model's" if skill.against == FLOOR else "Error over persistence's"
     columns = (
-        ("Output", ""),
-        ("Unit", ""),
-        ("Promised (90 % of tests)", "RMSE"),
-        ("On the test recordings", "RMSE"),
-        ("Test against promise", ""),
-        (f"{beside}, promised (90 %)", ""),
-        ("the same, test", ""),
-        ("Present value kept, left-out data", "RMSE"),
+        Column("Output"),
+        Column("Unit"),
+        Column("Promised (90 % of tests)", "RMSE"),
+        Column("On the test recordings", "RMSE"),
+        Column("Test against promise"),
+        Column(f"{beside}, promised (90 %)"),
+        Column("the same, test"),
+        Column("Present value kept, left-out data", "RMSE"),
     )
-    return TextTable("What left-out data promised, and what came of it", columns, tuple(rows))
+    return Table("What left-out data promised, and what came of it", columns, tuple(rows))
 
 
 def promise_line(choice: AutoChoice) -> str:

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from edp.report.common import tables
 from edp.report.common.chart import Chart
+from edp.report.common.page import DRAWING
 from edp.report.common.provenance import provenance_rows
-from edp.report.common.templates import asset, stylesheet, template
+from edp.report.common.templates import asset, json_text, stylesheet, template
 from edp.report.run import facts as run
+from edp.report.run import tables
 from edp.report.run.charts import DOTS_AT_MOST, run_charts, signal_chart, signals_of
 from edp.report.run.choice import candidates_table, model_tables, promise_line, promise_table, read_choice
 from edp.report.run.residuals import correlogram, fit_table
 from edp.report.run.sheets import contexts_sheet, machines_sheet, parts_sheet, situation_sheet
 from edp.storage import write_bytes
 from edp.storage.paths import full_path
+from edp.table import Table
 from edp.wording import moment, unbroken
-
-DRAWING = ("figure_axes.js", "figure_marks.js", "figures.js")
-"""Draw the figures of a page from plotly's description of each; plotly has 4.8 MB and takes a second to start."""
 
 
 def build_report(
@@ -55,7 +53,7 @@ def build_report(
 
 def render(facts: run.Facts, title: str | None = None) -> str:
     """The page's text."""
-    return template("page.html.jinja").render(**context(facts, title))
+    return template("run.html.jinja").render(**context(facts, title))
 
 
 def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
@@ -92,11 +90,11 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
     }
 
 
-def situations_of(facts: run.Facts) -> tables.TextTable | None:
+def situations_of(facts: run.Facts) -> Table | None:
     """Errors by what the axes did, at the headline's horizon; None where the scores do not tell."""
     horizon = run.main_horizon(facts)
     sheet = None if facts.scores is None or horizon is None else situation_sheet(facts.scores, horizon)
-    return None if sheet is None else sheet.table()
+    return None if sheet is None else sheet
 
 
 def choice_of(facts: run.Facts) -> dict[str, Any]:
@@ -111,14 +109,14 @@ def choice_of(facts: run.Facts) -> dict[str, Any]:
     }
 
 
-def foundation_tables(facts: run.Facts) -> dict[str, tables.TextTable]:
+def foundation_tables(facts: run.Facts) -> dict[str, Table]:
     """Machines that were never seen, of a run over many machines; empty for any other."""
     foundation = facts.foundation
     if foundation is None:
         return {}
     unit = facts.unit or "report units"
     sheets = (parts_sheet(foundation), contexts_sheet(foundation, unit), machines_sheet(foundation, unit))
-    return {sheet.name: sheet.table() for sheet in sheets}
+    return {sheet.name: sheet for sheet in sheets}
 
 
 def shown(charts: Iterable[Chart]) -> dict[str, Any]:
@@ -129,14 +127,8 @@ def shown(charts: Iterable[Chart]) -> dict[str, Any]:
     drawn = plots(charts)
     return {
         "plots": drawn,
-        "specs": script_json([plot.spec() for plot in drawn.values()]),
+        "specs": json_text([plot.spec() for plot in drawn.values()]),
         "style": Markup(stylesheet("page.css")),
         "script": Markup(asset("page.js")),
         "drawing": Markup("\n".join(asset(name) for name in DRAWING)),
     }
-
-
-def script_json(value: Any) -> Markup:
-    """JSON that cannot end its script element, whatever names it holds."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))

@@ -28,7 +28,6 @@ from edp.report.common.chart import (
     Texts,
     with_unit,
 )
-from edp.report.common.sheets import chance
 from edp.report.search.facts import StudyFacts
 from edp.report.search.views import (
     COSTS,
@@ -44,6 +43,7 @@ from edp.report.search.views import (
     top_of,
     tracks,
 )
+from edp.table import chance
 from edp.wording import decimals_for, number
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edp.errors import count_of
-from edp.report.common.sheets import Column, Sheet, chance, figures
 from edp.report.search.facts import StudyFacts, known, of_phase, real
+from edp.table import Column, Table, chance, figures
 from edp.wording import interval
 
 GROUPS = {
@@ -21,7 +21,7 @@ GROUPS = {
 OTHER = "Other"
 
 
-def modules_sheets(study: StudyFacts) -> tuple[Sheet, ...]:
+def modules_tables(study: StudyFacts) -> tuple[Table, ...]:
     """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
     if "screening" not in study.facts:
         return ()
@@ -38,7 +38,7 @@ def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 @of_phase("screening", ())
-def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet | None, ...]:
+def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table | None, ...]:
     evidence = _evidence(study)
     rows, marked = [], set()
     for group, name in ordered(facts["registered"]):
@@ -63,23 +63,23 @@ def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet |
             marked.add(len(rows) - 1)
     columns = (
         Column("Module"),
-        Column("Group"),
+        Column("Group", is_text=True),
         Column("Phase 2", "change, %", figures([], signed=True, decimals=2)),
         Column("Phase 3", "change, %", figures([], signed=True, decimals=2)),
         Column("95 % interval", "%"),
         Column("p", "one-sided", chance),
         Column("p", "adjusted", chance),
         Column("d_z", "Cohen", figures([], signed=True, decimals=2)),
-        Column("Verdict"),
+        Column("Verdict", is_text=True),
     )
     caption = (
         f"Modules in phases 2 and 3; below zero is better, p is adjusted over all {len(facts['registered'])} modules"
     )
-    return Sheet("modules", caption, columns, tuple(rows), frozenset(marked)), _tests(study), _effects(study)
+    return Table(caption, columns, tuple(rows), frozenset(marked), name="modules"), _tests(study), _effects(study)
 
 
 @of_phase("screening", None)
-def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Main effects of the two-level design."""
     rows = []
     for _, name in ordered(facts["registered"]):
@@ -92,10 +92,10 @@ def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
         Column("Change", "%", figures([], signed=True, decimals=2)),
         Column("p", "one-sided", chance),
         Column("Importance", "% of what is explained", figures([], decimals=0)),
-        Column("Verdict"),
+        Column("Verdict", is_text=True),
     )
     caption = "Phase 2: main effects of the two-level design, on average over all other modules"
-    return Sheet("effects", caption, columns, tuple(rows))
+    return Table(caption, columns, tuple(rows), name="effects")
 
 
 def _evidence(study: StudyFacts) -> dict[str, Mapping[str, Any]]:
@@ -114,7 +114,7 @@ def _verdict(study: StudyFacts, name: str, entry: Mapping[str, Any] | None, pass
 
 
 @of_phase("confirmation", None)
-def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """What other tests say of the modules that phase 3 tested."""
     rows = []
     for entry in facts["evidence"]:
@@ -140,11 +140,11 @@ def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
         Column("d_z", "95 % interval"),
         Column("Runs won", "%", figures([], decimals=0)),
     )
-    return Sheet("tests", "Other tests on the same trainings; all one-sided, not adjusted", columns, tuple(rows))
+    return Table("Other tests on the same trainings; all one-sided, not adjusted", columns, tuple(rows), name="tests")
 
 
 @of_phase("screening", ())
-def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet | None, ...]:
+def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Table | None, ...]:
     evidence = study.facts.get("confirmation", {}).get("evidence", ())
     metrics = list(dict.fromkeys(str(entry["metric"]) for entry in evidence))
     by_cell = {(entry["module"], entry["metric"]): entry for entry in evidence}
@@ -172,7 +172,13 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet 
         Column("Runs won", "%", figures([], decimals=0)),
     )
     gain = Column("Δp₂", study.unit, figures([row[2] for row in rows], signed=True))
-    first = (Column("Module"), Column("Group"), gain, *tests_columns, Column("Verdict"))
+    first = (
+        Column("Module"),
+        Column("Group", is_text=True),
+        gain,
+        *tests_columns,
+        Column("Verdict", is_text=True),
+    )
     shown = f"; tests on {metrics[0].upper()}, a module is confirmed on any metric" if metrics else ""
     caption = f"Modules in phases 2 and 3, the thesis's procedure: better is Δp₂ > 0 and d_z < 0{shown}"
     second = (
@@ -184,8 +190,8 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet 
         *(*tests_columns, Column("Gates")),
     )
     return (
-        Sheet("modules", caption, first, tuple(rows), frozenset(marked)),
-        Sheet("tests", "The thesis's gates on every metric", second, tuple(every)),
+        Table(caption, first, tuple(rows), frozenset(marked), name="modules"),
+        Table("The thesis's gates on every metric", second, tuple(every), name="tests"),
     )
 
 

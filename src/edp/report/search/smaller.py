@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from edp.report.common.sheets import Column, Sheet, figures
 from edp.report.search.facts import StudyFacts, of_phase, real
+from edp.table import Column, Table, figures
 from edp.wording import number, percent
 
 
 @of_phase("compression", None)
-def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+def smaller_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Every network in every number format: what it takes, its error, and whether it fits; the front is marked."""
     rows = tuple(
         (
@@ -31,7 +31,7 @@ def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     count = figures([], decimals=0)
     columns = (
         Column("Network"),
-        Column("Made by"),
+        Column("Made by", is_text=True),
         Column("Parameters", "", count),
         Column("Parameters", "bytes", count),
         Column("Cycles", "per tick, high", count),
@@ -39,10 +39,10 @@ def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
         Column("MAE", study.unit, figures([row[6] for row in rows])),
         Column("Composite", study.unit, figures([row[7] for row in rows])),
         Column("Change", "% of the teacher's MAE", figures([], signed=True, decimals=1)),
-        Column("Budget"),
+        Column("Budget", is_text=True),
     )
     caption = "Smaller networks of the teacher on development sessions that do not train; marked: the front"
-    return Sheet("compression", caption, columns, rows, frozenset(map(int, facts.get("front", ()))))
+    return Table(caption, columns, rows, frozenset(map(int, facts.get("front", ()))), name="compression")
 
 
 def _mean(scores: Mapping[str, Mapping[str, Any]], name: str) -> float:

@@ -9,32 +9,32 @@ import numpy as np
 
 from edp.errors import count_of
 from edp.report.common.chart import with_unit
-from edp.report.common.sheets import Column, Sheet, Value, chance, figures, plainly
 from edp.report.search.facts import StudyFacts, known, of_phase, real
-from edp.report.search.modules import modules_sheets, ordered, span
-from edp.report.search.smaller import smaller_sheet
+from edp.report.search.modules import modules_tables, ordered, span
+from edp.report.search.smaller import smaller_table
 from edp.report.search.views import arm_views, titled
+from edp.table import Column, Table, Value, chance, figures, plainly
 from edp.wording import count_text, duration, moment, number, percent
 
 
-def sheets(study: StudyFacts) -> dict[str, Sheet]:
+def study_tables(study: StudyFacts) -> dict[str, Table]:
     """Every table that there are facts for, by name."""
     sheets = (
-        variance_sheet(study),
-        features_sheet(study),
-        calibration_sheet(study),
-        *modules_sheets(study),
-        selection_sheet(study),
-        identifiers_sheet(study),
-        holdout_sheet(study),
-        smaller_sheet(study),
-        openings_sheet(study),
-        phases_sheet(study),
+        variance_table(study),
+        features_table(study),
+        calibration_table(study),
+        *modules_tables(study),
+        selection_table(study),
+        identifiers_table(study),
+        holdout_table(study),
+        smaller_table(study),
+        openings_table(study),
+        phases_table(study),
     )
     return {sheet.name: sheet for sheet in sheets if sheet is not None and sheet.rows}
 
 
-def variance_sheet(study: StudyFacts) -> Sheet | None:
+def variance_table(study: StudyFacts) -> Table | None:
     """Table 4.3: mean error and its standard deviations, of MAE and of the composite score."""
     rows = []
     for arm in arm_views(study):
@@ -48,7 +48,7 @@ def variance_sheet(study: StudyFacts) -> Sheet | None:
     seeds = count_of(facts["seeds"], "seed")
     caption = f"Variance by architecture and feature set: {count_of(facts['runs'], 'run')} of {seeds} each"
     marked = frozenset(index for index, row in enumerate(rows) if row[1] == facts["features"])
-    return Sheet("variance", caption, columns, tuple(rows), marked)
+    return Table(caption, columns, tuple(rows), marked, name="variance")
 
 
 def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) -> tuple[Column, ...]:
@@ -57,7 +57,7 @@ def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) 
 
 
 @of_phase("isolation", None)
-def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+def features_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """The chosen feature set against the next best, by backbone; the best backbone with it against the others."""
     rows: tuple[tuple[Value, ...], ...] = tuple(
         (
@@ -87,11 +87,11 @@ def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
         Column("95 % interval", "%"),
         Column("p", "one-sided", chance),
     )
-    return Sheet("features", "Feature sets and architectures on the same folds with the same seeds", columns, rows)
+    return Table("Feature sets and architectures on the same folds with the same seeds", columns, rows, name="features")
 
 
 @of_phase("calibration", None)
-def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+def calibration_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Table 4.4: scores of all questions of each architecture, and what the efficiency rule takes."""
     rows = []
     final = facts["final"]["scores"] if "final" in facts else {}
@@ -124,7 +124,7 @@ def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | No
     marked = frozenset(i for i, name in enumerate(facts["backbones"]) if name == facts["backbone"])
     features = study.facts["isolation"]["features"]
     caption = f"Questions of phase 1 with feature set {features}; chosen is the smallest size that no larger one repays"
-    return Sheet("calibration", caption, columns, tuple(rows), marked)
+    return Table(caption, columns, tuple(rows), marked, name="calibration")
 
 
 def _spread(values: Sequence[float]) -> tuple[float | None, float | None]:
@@ -137,7 +137,7 @@ def _count(value: Value) -> str:
     return count_text(value) if isinstance(value, int | float) else plainly(value)
 
 
-def selection_sheet(study: StudyFacts) -> Sheet | None:
+def selection_table(study: StudyFacts) -> Table | None:
     """Table 4.6: how often each module was on among the questions of phases 4 and 5."""
     on = {name: study.facts[name]["on"] for name in ("synthesis", "exploration") if name in study.facts}
     names = list(dict.fromkeys(name for counts in on.values() for name in counts))
@@ -153,7 +153,7 @@ def selection_sheet(study: StudyFacts) -> Sheet | None:
         Column("Mean", "%", figures([], decimals=1)),
     )
     caption = "How often each module was on among the questions"
-    return Sheet("selection", caption, columns, tuple((module, *shares) for module, shares in rows))
+    return Table(caption, columns, tuple((module, *shares) for module, shares in rows), name="selection")
 
 
 def identifiers(study: StudyFacts) -> dict[str, str]:
@@ -161,15 +161,15 @@ def identifiers(study: StudyFacts) -> dict[str, str]:
     return {name: f"M{number}" for number, (_, name) in enumerate(ordered(list(study.modules)), 1)}
 
 
-def identifiers_sheet(study: StudyFacts) -> Sheet | None:
+def identifiers_table(study: StudyFacts) -> Table | None:
     """Table 4.7."""
     rows = tuple((short, study.module(name), name) for name, short in identifiers(study).items())
-    columns = (Column("ID"), Column("Module"), Column("Name in settings"))
-    return Sheet("identifiers", "Module identifiers", columns, rows) if "synthesis" in study.facts else None
+    columns = (Column("ID"), Column("Module", is_text=True), Column("Name in settings", is_text=True))
+    return Table("Module identifiers", columns, rows, name="identifiers") if "synthesis" in study.facts else None
 
 
 @of_phase("synthesis", None)
-def holdout_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+def holdout_table(study: StudyFacts, facts: Mapping[str, Any]) -> Table | None:
     """Table 4.8: baseline and winners; in brackets the change against the baseline."""
     calibrated = study.facts["calibration"]
     base = calibrated["backbones"][calibrated["backbone"]]
@@ -198,7 +198,9 @@ def holdout_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     names = ("Baseline", "Winner of phase 4", "Winner of phase 5")[: len(arms)]
     seeds = study.spec.get("run_seeds", "–")
     caption = f"Baseline and winners; test scores are means of {seeds} seeds, in brackets the change to the baseline"
-    return Sheet("holdout", caption, (Column("Metric"), *(Column(name) for name in names)), tuple(rows))
+    return Table(
+        caption, (Column("Metric"), *(Column(name, is_text=True) for name in names)), tuple(rows), name="holdout"
+    )
 
 
 def _against(value: float, reference: float | None, show: Any) -> str:
@@ -208,7 +210,7 @@ def _against(value: float, reference: float | None, show: Any) -> str:
     return f"{show(value)} ({percent(value / reference - 1, signed=True)})"
 
 
-def openings_sheet(study: StudyFacts) -> Sheet | None:
+def openings_table(study: StudyFacts) -> Table | None:
     """Every opening of the sealed test sets."""
     rows = tuple(
         (
@@ -219,11 +221,11 @@ def openings_sheet(study: StudyFacts) -> Sheet | None:
         )
         for opening in study.openings
     )
-    columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Test set"))
-    return Sheet("openings", "Openings of the sealed test sets", columns, rows)
+    columns = (Column("When"), Column("Why", is_text=True), Column("Trainings"), Column("Test set", is_text=True))
+    return Table("Openings of the sealed test sets", columns, rows, name="openings")
 
 
-def phases_sheet(study: StudyFacts) -> Sheet | None:
+def phases_table(study: StudyFacts) -> Table | None:
     """Trainings and time of each phase, and their sums."""
     rows: list[tuple[Value, ...]] = [
         (p.heading, p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s, _status(study, p.name))
@@ -247,7 +249,7 @@ def phases_sheet(study: StudyFacts) -> Sheet | None:
         Column("State"),
     )
     caption = "Trainings and time by phase; one that an earlier phase asked for counts there"
-    return Sheet("phases", caption, columns, tuple(rows), frozenset({len(rows) - 1}))
+    return Table(caption, columns, tuple(rows), frozenset({len(rows) - 1}), name="phases")
 
 
 def _time(value: Value) -> str:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from edp.evaluation.free_run_file import CandidateRow, CandidatesFile
-from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.storage.paths import is_file_at
+from edp.table import Column, Table, Value, figures
 
 MOST_CANDIDATES = 100
 """Rows that are read; a choice leaves a dozen."""
@@ -39,7 +39,7 @@ def choice_sentence(rows: Sequence[CandidateRow]) -> str:
     return f"{text}; {label} {rank} ({error:.2f})."
 
 
-def candidate_sheet(rows: Sequence[CandidateRow]) -> Sheet:
+def candidate_sheet(rows: Sequence[CandidateRow]) -> Table:
     """The candidates as a table, the chosen one marked."""
     lines: list[tuple[Value, ...]] = [(row.label, row.error, row.seconds, row.why) for row in rows]
     marked = frozenset(i for i, row in enumerate(rows) if row.chosen)
@@ -54,4 +54,4 @@ def candidate_sheet(rows: Sequence[CandidateRow]) -> Sheet:
     caption = (
         "Candidates on free runs that their fits had not seen: the simplest one that is as good as the best is kept"
     )
-    return Sheet("candidates", caption, heads, tuple(lines), marked)
+    return Table(caption, heads, tuple(lines), marked, name="candidates")

@@ -30,12 +30,12 @@ from edp.evaluation.free_run_file import (
     StrokeErrors,
 )
 from edp.evaluation.guard import twin_verdict
-from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.settings.provenance import Provenance
 from edp.storage import read_object
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_file_at
+from edp.table import Column, Table, Value, figures
 from edp.wording import figure, listed, number, percent, short_labels
 
 SITUATIONS = {"end_stops": "at an end stop", "rest": "at rest (idling)", "motion": "in motion"}
@@ -226,7 +226,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     return rows
 
 
-def sheets_of(facts: FreeRunFacts) -> dict[str, Sheet]:
+def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
     """Every table by name; those of which nothing is known are left out."""
     twin = facts.twin
     sheets = [
@@ -262,7 +262,7 @@ def _summary_sheet(
     first: str,
     summaries: Mapping[str, RunSummary | FreeRunScores],
     marked: frozenset[int] = frozenset(),
-) -> Sheet:
+) -> Table:
     """A row of errors for each of several sets of runs."""
     rows: list[tuple[Value, ...]] = []
     heads: list[tuple[str, str]] = []
@@ -280,10 +280,10 @@ def _summary_sheet(
     titles = [titles[i] for i in full]
     shown = [Column(title, u, figures(row[2 + i] for row in rows)) for i, (title, u) in enumerate(titles)]
     count = Column("Runs", "", figures([], decimals=0))
-    return Sheet(name, caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked)
+    return Table(caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked, name=name)
 
 
-def _situation_sheet(twin: FreeRunScores) -> Sheet:
+def _situation_sheet(twin: FreeRunScores) -> Table:
     rows: list[tuple[Value, ...]] = []
     for name, row in twin.situations.items():
         strokes = None if row.stroke_error is None else row.stroke_error.mean
@@ -294,10 +294,10 @@ def _situation_sheet(twin: FreeRunScores) -> Sheet:
     titles = [("Velocity MAE", velocity), ("Stroke error", stroke), ("Pressure NRMSE", "")]
     shown = [Column(title, unit, figures(row[2 + i] for row in rows)) for i, (title, unit) in enumerate(titles)]
     heads = (Column("What the actuator did"), Column("Share of the time"), *shown)
-    return Sheet("situations", "At end stops, at rest and in motion", heads, tuple(rows))
+    return Table("At end stops, at rest and in motion", heads, tuple(rows), name="situations")
 
 
-def _coverage_sheet(intervals: IntervalCoverage) -> Sheet:
+def _coverage_sheet(intervals: IntervalCoverage) -> Table:
     covered = [(row.at_s, row.parts()) for row in intervals.at]
     parts = list(covered[0][1]) if covered else []
     rows: list[tuple[Value, ...]] = []
@@ -310,10 +310,10 @@ def _coverage_sheet(intervals: IntervalCoverage) -> Sheet:
         cells = [cell for part in parts for cell in (percent(row[part].share), row[part].half_width.mean)]
         rows.append((f"{figure(at_s)} s", *cells))
     caption = f"Share of the free runs whose truth lies in intervals meant to hold {percent(intervals.coverage)}"
-    return Sheet("intervals", caption, tuple(heads), tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows), name="intervals")
 
 
-def _ahead_sheet(facts: FreeRunFacts, first: AheadErrors) -> Sheet:
+def _ahead_sheet(facts: FreeRunFacts, first: AheadErrors) -> Table:
     caption = f"{figure(first.seconds)} s ahead of measured ports, told the commands in between"
     if mixed_units(facts.twin):
         return ahead_by_actuator(facts.models, caption)
@@ -325,10 +325,10 @@ def _ahead_sheet(facts: FreeRunFacts, first: AheadErrors) -> Sheet:
     units = (first.velocity_mae.unit or "", first.stroke_error.unit or "", "")
     titles = ("Velocity MAE", "Stroke error", "Pressure NRMSE")
     shown = [Column(t, u, figures(r[1 + i] for r in rows)) for i, (t, u) in enumerate(zip(titles, units, strict=True))]
-    return Sheet("ahead", caption, (Column("Model"), *shown), tuple(rows), frozenset({0}))
+    return Table(caption, (Column("Model"), *shown), tuple(rows), frozenset({0}), name="ahead")
 
 
-def _beside_sheet(beside: PredictorComparison) -> Sheet:
+def _beside_sheet(beside: PredictorComparison) -> Table:
     rows: list[tuple[Value, ...]] = [
         (part, row.twin.unit, row.twin.mean, row.predictor.mean) for part, row in beside.errors.items()
     ]
@@ -340,7 +340,7 @@ def _beside_sheet(beside: PredictorComparison) -> Sheet:
         Column(beside.label, "", both),
     )
     caption = f"Beside a look-ahead predictor, {figure(beside.seconds)} s ahead at the same {beside.moments:,} moments"
-    return Sheet("beside", caption, heads, tuple(rows))
+    return Table(caption, heads, tuple(rows), name="beside")
 
 
 def mixed_units(scores: FreeRunScores) -> bool:
@@ -348,7 +348,7 @@ def mixed_units(scores: FreeRunScores) -> bool:
     return bool(scores.velocity_mae.units)
 
 
-def actuator_sheet(models: Mapping[str, FreeRunScores]) -> Sheet:
+def actuator_sheet(models: Mapping[str, FreeRunScores]) -> Table:
     """A row for each actuator and model: errors of its velocity, and of its stroke by time, with their units."""
     columns = {
         name: [
@@ -360,7 +360,7 @@ def actuator_sheet(models: Mapping[str, FreeRunScores]) -> Sheet:
     return _by_actuator("actuators", "The twin and its floors, each actuator in its units", columns)
 
 
-def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Sheet:
+def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Table:
     """The same a few ticks ahead of measured ports."""
     columns = {
         name: [("Velocity MAE", one.ahead.velocity_mae), ("Stroke error", one.ahead.stroke_error)]
@@ -370,7 +370,7 @@ def ahead_by_actuator(models: Mapping[str, FreeRunScores], caption: str) -> Shee
     return _by_actuator("ahead", caption, columns)
 
 
-def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Sheet:
+def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, ChannelErrors]]]) -> Table:
     """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
     first = next(iter(columns.values()))
     rows: list[tuple[Value, ...]] = []
@@ -384,7 +384,7 @@ def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[s
             rows.append((velocity, model, *cells))
     titles = [title for title, row in first if row.by_channel]
     heads = tuple(Column(title) for title in ("Actuator", "Model", *titles))
-    return Sheet(name, caption, heads, tuple(rows), frozenset(range(0, len(rows), len(columns))))
+    return Table(caption, heads, tuple(rows), frozenset(range(0, len(rows), len(columns))), name=name)
 
 
 def actuator_tiles(twin: FreeRunScores) -> list[tuple[str, str, str]]:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from edp.report import Facts, headline
-from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, score_figure, score_tables, study_figure, study_html, text_of
 from edp.report.run.facts import METRICS, comparison_rows, score
 from edp.report.search import words
 from edp.report.search.facts import StudyFacts, facts_of
 from edp.storage.study_file import read_study
+from edp.table import Table
 from edp.workflows.api.frames import OneFrame
 
 
@@ -23,7 +23,7 @@ class ShownTable:
         tables: one below the other.
     """
 
-    def __init__(self, tables: list[TextTable]) -> None:
+    def __init__(self, tables: list[Table]) -> None:
         self._tables = tables
 
     def __repr__(self) -> str:

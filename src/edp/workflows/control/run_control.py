@@ -18,7 +18,7 @@ from edp.control.loop import LoopResult
 from edp.control.tasks import TASKS, ControlTask
 from edp.logs import write_recording
 from edp.progress import SILENT, Progress
-from edp.report import ControlFacts, write_control_page
+from edp.report import ControlFacts, build_control_page
 from edp.report.animation.page import scene_of
 from edp.report.common.provenance import provenance_rows
 from edp.settings.provenance import Provenance, new_provenance
@@ -90,7 +90,7 @@ def control_loops(
             predictor=str(chosen.predictor or ""),
         )
         write_json(run.file(PROVENANCE), provenance.to_table())
-        page = write_control_page(_facts(run.path.name, content, results, provenance), run.file(PAGE))
+        page = build_control_page(_facts(run.path.name, content, results, provenance)).write(run.file(PAGE))
     return ControlRun(content, results, page)
 
 

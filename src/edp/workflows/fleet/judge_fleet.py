@@ -22,7 +22,7 @@ from edp.networks.running import stream_errors
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.fleet.facts import FleetFacts, fleet_facts
-from edp.report.fleet.page import write_fleet_page
+from edp.report.fleet.page import build_fleet_page
 from edp.signals import KINDS
 from edp.storage import check_writable, read_bytes, write_json
 from edp.storage.ledger import TrainingIdentity
@@ -111,7 +111,7 @@ def report_fleet(
     }
     write_json(folder / RESULT, content)
     facts = fleet_facts(content, full_path(Path(question.store)).name)
-    write_fleet_page(facts, folder / PAGE)
+    build_fleet_page(facts).write(folder / PAGE)
     forget_units(folder / UNITS)
     return facts
 

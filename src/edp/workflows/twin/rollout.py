@@ -18,7 +18,7 @@ from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
 from edp.recording import Recording
-from edp.report import FreeRunFacts, write_rollout_plots, write_twin_page
+from edp.report import FreeRunFacts, build_twin_page, write_rollout_plots
 from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
@@ -113,7 +113,7 @@ def rollout_log(
     if page is not None:
         content = FreeRunFile(channels=reported_channels(twin.channels), models={TWIN: result.scores})
         title = f"{recording.name} from {typed(result.start_s)} s"
-        write_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals)), page)
+        build_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals))).write(page)
     return result
 
 

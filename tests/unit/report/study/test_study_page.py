@@ -7,14 +7,15 @@ import random
 
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.errors import EdpError, StorageError
 from edp.report import write_study_page
 from edp.report.common.interactive import plots
 from edp.report.search.charts import study_charts
 from edp.report.search.facts import NUMBERS, facts_of
-from edp.report.search.page import render_study, study_text
-from edp.report.search.tables import identifiers, sheets
+from edp.report.search.page import build_study_page, study_text
+from edp.report.search.tables import identifiers, study_tables
 from edp.report.search.views import PointView, arm_views, forests, front, point_views, top_of, tracks
 from edp.report.search.words import caveats, decided, headline, missing, tiles, verdict
 from edp.storage.study_file import read_study
@@ -38,7 +39,7 @@ def plots_of(facts):
 
 def page_of(study):
     facts = facts_of(study)
-    return render_study(facts, sheets(facts))
+    return build_study_page(facts, study_tables(facts)).html()
 
 
 def figures_of(text):
@@ -76,7 +77,7 @@ def test_everything_is_written_and_loads_nothing(sound, tmp_path):
 
 
 def test_the_tables_hold_what_the_phases_found(sound):
-    tables = sheets(facts_of(sound))
+    tables = study_tables(facts_of(sound))
     facts = {held["phase"]: held["facts"] for held in sound["decisions"]}
     arm = facts["isolation"]["arms"]["hybrid FG2"]
     row = next(row for row in tables["variance"].rows if row[:2] == ("Hybrid", "FG2"))
@@ -112,7 +113,7 @@ def test_the_thesis_mode_has_its_own_figures(thesis, tmp_path):
     spec = figures_of(page_of(thesis))["confirmation"]
     assert {trace["meta"]["phase"] for trace in spec["figure"]["data"]} == set(shown) - {"screening"}
     assert any("follows the thesis's tests" in line for line in caveats(facts))
-    tests = sheets(facts)["tests"]
+    tests = study_tables(facts)["tests"]
     assert len(tests.rows) == len(decision["facts"]["evidence"])
 
 
@@ -135,7 +136,7 @@ def test_a_study_that_is_only_partly_done(request, unfinished, mode, last):
     assert ended == len(facts.history) < len(study["history"]) or last == "planning"
     assert "not decided yet" in missing(facts, last)
     assert "not decided yet" in text.split("<script>")[0] or last == "planning"
-    assert study_text(facts, sheets(facts)).startswith("# Model search on m22.toml")
+    assert study_text(facts, study_tables(facts)).startswith("# Model search on m22.toml")
 
 
 def test_an_empty_study_is_a_report_too(unfinished, sound, tmp_path):
@@ -219,7 +220,7 @@ def test_what_was_pruned_is_no_failure(sound, tmp_path):
     assert named["pruned"].x == (place + 1,)
     assert len(named["failed"].x) == failed
     assert tiles(facts)[0][2] == f"trainings, 1 of them pruned, {failed} of them failed"
-    sheet = sheets(facts)["phases"]
+    sheet = study_tables(facts)["phases"]
     assert [column.heading for column in sheet.columns].index("Pruned") == 3
     assert [row[3] for row in sheet.rows] == [0, 1, 0, 0, 0, 0, 0, 0, 1]
     assert write_study_page(sound, tmp_path).pictures
@@ -302,6 +303,15 @@ def damage(value, rng):
         else:
             value[key] = rng.choice([None, "odd", -1, [], {}, 1e300, True])
         return
+
+
+@pytest.mark.parametrize("mode", ["sound", "thesis"])
+def test_the_text_of_the_page(request, mode):
+    check_text(page_of(request.getfixturevalue(mode)), f"study_{mode}")
+
+
+def test_the_text_of_the_page_of_an_unfinished_study(sound, unfinished):
+    check_text(page_of(unfinished(sound, "screening")), "study_unfinished")
 
 
 @pytest.mark.processes

@@ -1,9 +1,9 @@
-"""The tables of the report, worded: columns with units, cells as text, the network's row marked."""
+"""Tables and key figures of a run's page; the network's row is marked."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE_NAME
@@ -19,38 +19,14 @@ from edp.report.run.facts import (
     main_horizon,
 )
 from edp.report.run.figures import recording_errors
+from edp.table import Column, Table
 from edp.wording import MISSING, count_text, decimals_for, duration, number, percent, unit_text
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """Text in rows; the first column is a name, the others are right-aligned figures.
-
-    Attributes:
-        columns: (heading, unit) of each column.
-        marked: Places of the rows that are the network's.
-    """
-
-    caption: str
-    columns: tuple[tuple[str, str], ...]
-    rows: tuple[tuple[str, ...], ...]
-    marked: frozenset[int] = frozenset()
-
-    @property
-    def filled(self) -> TextTable:
-        """Table without the columns that are empty in every row, such as pressures of a machine without them."""
-        filled_places = [i for i in range(len(self.columns)) if not i or any(row[i] != MISSING for row in self.rows)]
-        if not self.rows or len(filled_places) == len(self.columns):
-            return self
-        columns = tuple(self.columns[i] for i in filled_places)
-        return replace(self, columns=columns, rows=tuple(tuple(row[i] for i in filled_places) for row in self.rows))
-
 
 _TILES = 3
 """Outputs that have a tile of their own where they have no common unit."""
 
 
-def comparison_tables(facts: Facts) -> list[TextTable]:
+def comparison_tables(facts: Facts) -> list[Table]:
     """Metrics of every model, one table per horizon, the headline's horizon first.
 
     Means over outputs where they have one unit, else the error of each output.
@@ -61,16 +37,16 @@ def comparison_tables(facts: Facts) -> list[TextTable]:
     return [table for table in (_comparison(facts, horizon) for horizon in order) if table.rows]
 
 
-def _comparison(facts: Facts, horizon: int) -> TextTable:
+def _comparison(facts: Facts, horizon: int) -> Table:
     rows = comparison_rows(facts, horizon)
     unit = facts.unit
     shown = [metric for metric in ("rmse", "mae", "p95", "p99", "composite") if _any(rows, metric)]
     places = {metric: decimals_for(row.metric(metric) for row in rows) for metric in shown}
     names = {"mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99", "composite": "Composite"}
     with_bias, with_r2, with_time = _any(rows, "bias"), _any(rows, "r2"), _any(rows, "seconds")
-    columns = [("Model", ""), *((names[metric], unit) for metric in shown)]
-    columns += [("Bias", unit)] * with_bias + [("R²", "")] * with_r2
-    columns += [("Network relative to it", MEASURE_NAME)] + [("Fitted in", "")] * with_time
+    columns = [Column("Model"), *(Column(names[metric], unit) for metric in shown)]
+    columns += [Column("Bias", unit)] * with_bias + [Column("R²")] * with_r2
+    columns += [Column("Network relative to it", MEASURE_NAME)] + [Column("Fitted in")] * with_time
     lines = []
     for row in rows:
         cells = [row.label, *(number(row.metric(metric), places[metric]) for metric in shown)]
@@ -80,19 +56,19 @@ def _comparison(facts: Facts, horizon: int) -> TextTable:
         cells += [duration(row.seconds)] * with_time
         lines.append(tuple(cells))
     marked = frozenset(index for index, row in enumerate(rows) if row.is_network)
-    return TextTable(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
+    return Table(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
 
 
 def _any(rows: Sequence[ComparisonRow], key: str) -> bool:
     return any(row.metric(key) is not None for row in rows)
 
 
-def output_table(facts: Facts) -> TextTable | None:
+def output_table(facts: Facts) -> Table | None:
     """Error by output at the longest horizon; None where `comparison_tables` shows it already."""
     return _by_output(facts, main_horizon(facts)) if facts.averaged else None
 
 
-def _by_output(facts: Facts, horizon: int | None) -> TextTable | None:
+def _by_output(facts: Facts, horizon: int | None) -> Table | None:
     rows = comparison_rows(facts, horizon)
     if horizon is None or not rows or len(facts.targets) < 2:
         return None
@@ -100,12 +76,12 @@ def _by_output(facts: Facts, horizon: int | None) -> TextTable | None:
     places = {name: decimals_for(row.outputs[name] for row in rows) for name in names}
     lines = tuple((row.label, *(number(row.outputs[name], places[name]) for name in names)) for row in rows)
     units = [unit_text(target.unit) for target in facts.targets]
-    columns = (("Model", ""), *((target.description, unit) for target, unit in zip(facts.targets, units)))
+    columns = (Column("Model"), *(Column(target.description, unit) for target, unit in zip(facts.targets, units)))
     marked = frozenset(index for index, row in enumerate(rows) if row.is_network)
-    return TextTable(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
+    return Table(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
 
 
-def interval_table(facts: Facts) -> TextTable | None:
+def interval_table(facts: Facts) -> Table | None:
     """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
     network = facts.models.get(NETWORK)
     rows = [] if network is None else [(k, row) for k in facts.horizons for row in network.intervals.get(str(k), ())]
@@ -121,7 +97,7 @@ def interval_table(facts: Facts) -> TextTable | None:
         )
         for k, row in rows
     )
-    columns = (("Interval", ""), ("Meant to hold", ""), ("Holds", ""), ("Mean width", facts.unit))
+    columns = (Column("Interval"), Column("Meant to hold"), Column("Holds"), Column("Mean width", facts.unit))
     caption = "The network's intervals: share of the truth inside, mean over outputs"
     scores = network.weighted_interval_score
     if scores:
@@ -131,10 +107,10 @@ def interval_table(facts: Facts) -> TextTable | None:
             if str(k) in scores
         )
         caption += f"; weighted interval score (a point's is its MAE) {listed}"
-    return TextTable(caption, columns, lines)
+    return Table(caption, columns, lines)
 
 
-def worst_recordings_table(facts: Facts, most: int = 10) -> TextTable | None:
+def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
     """The recordings on which the network does worst, worst first."""
     horizon = main_horizon(facts)
     if horizon is None or NETWORK not in facts.models:
@@ -146,8 +122,8 @@ def worst_recordings_table(facts: Facts, most: int = 10) -> TextTable | None:
     places = decimals_for(errors[NETWORK]) if NETWORK in errors else 2
     picked = list(range(len(order)))[::-1][:most]
     lines = tuple((order[i], *(number(errors[name][i], places) for name in models)) for i in picked)
-    columns = (("Recording", ""), *((label_of(facts, name), facts.unit) for name in models))
-    return TextTable(
+    columns = (Column("Recording"), *(Column(label_of(facts, name), facts.unit) for name in models))
+    return Table(
         f"The {count_of(len(picked), 'hardest recording')}, {horizon_text(facts, horizon)} ahead", columns, lines
     )
 
@@ -195,15 +171,19 @@ def _amount(value: float | None) -> str:
     return count_text(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
 
 
-def parts_table(facts: Facts) -> TextTable | None:
+def parts_table(facts: Facts) -> Table | None:
     """Parameters and multiply-accumulates of each part of the network."""
     rows = (facts.footprint or {}).get("rows", [])
     if not rows:
         return None
     keys = [key for key in ("parameters", "macs_tick", "macs_window") if any(row.get(key) is not None for row in rows)]
-    names = {"parameters": ("Parameters", ""), "macs_tick": ("Per tick", "MAC"), "macs_window": ("Per window", "MAC")}
+    names = {
+        "parameters": Column("Parameters"),
+        "macs_tick": Column("Per tick", "MAC"),
+        "macs_window": Column("Per window", "MAC"),
+    }
     lines = tuple((str(row["part"]), *(count_text(row.get(key)) for key in keys)) for row in rows)
-    return TextTable("By part", (("Part", ""), *(names[key] for key in keys)), lines)
+    return Table("By part", (Column("Part"), *(names[key] for key in keys)), lines)
 
 
 def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
