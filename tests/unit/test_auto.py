@@ -225,7 +225,7 @@ def test_page_and_file_show_every_model_on_left_out_data_and_on_the_test_part(re
     assert table.rows[marked][0] == kept["label"]
     promise, test = (float(cell) for cell in rows[kept["label"]][-2:])
     assert promise == pytest.approx(kept["promise"]["4"]["y"], rel=0.01)
-    assert test == pytest.approx(models["network"]["overall"]["4"]["y"]["rmse"], rel=0.01)
+    assert test == pytest.approx(models["network"].overall["4"]["y"]["rmse"], rel=0.01)
     others = [
         cells for label, cells in rows.items() if label in {"the linear model", "the committee"} - {kept["label"]}
     ]
