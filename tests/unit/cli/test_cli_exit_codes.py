@@ -5,6 +5,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer
@@ -86,13 +87,14 @@ def adapted(*ratios):
 class Methods:
     """Scores of a fine-tuned network with error 1 beside one other method."""
 
-    horizons, methods, content = (1,), {"tuned": {"label": "Tuned"}, "direct": {"label": "Direct"}}, {"method": "tuned"}
+    horizons, content = (1,), SimpleNamespace(method="tuned")
+    methods = {"tuned": SimpleNamespace(label="Tuned"), "direct": SimpleNamespace(label="Direct")}
 
     def __init__(self, ratios):
         self.ratios = ratios
 
-    def score(self, name, horizon):
-        return {"mae": 1.0 if name == "tuned" else sum(self.ratios) / len(self.ratios)}
+    def mae(self, name, horizon):
+        return 1.0 if name == "tuned" else sum(self.ratios) / len(self.ratios)
 
     def recordings(self, name, horizon):
         return {f"r{i}": 1.0 if name == "tuned" else ratio for i, ratio in enumerate(self.ratios)}

@@ -28,8 +28,8 @@ def without_times(value):
 def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small, tmp_path):
     order = FinetuneRequest(spec=small, method="full", baselines=("low_rank", "ridge_arx"))
     noted = NotedProgress()
-    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", noted)
-    here = finetune(run, target, order, tmp_path / "here")
+    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", noted).to_table()
+    here = finetune(run, target, order, tmp_path / "here").to_table()
     assert json.dumps(without_times(there)) == json.dumps(without_times(here))
     assert [note for note in noted.notes if note.startswith("trained:")] == [
         "trained: full, 1 of 2",

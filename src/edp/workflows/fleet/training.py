@@ -12,6 +12,7 @@ from typing import Any
 
 from edp.config.experiment import Experiment, build, plain_tree
 from edp.errors import ConfigError
+from edp.evaluation.transfer_file import TransferFile
 from edp.jobs import Workforce
 from edp.jobs.units import UnitResult, WorkUnit, run_units
 from edp.logs.source import DataSource
@@ -75,7 +76,7 @@ def finetune_with(
     order: FinetuneRequest,
     out: str | Path,
     progress: Progress = SILENT,
-) -> dict[str, Any]:
+) -> TransferFile:
     """As `edp.workflows.transfer.finetune`, with a unit for each method that trains; this process judges them.
 
     Args:

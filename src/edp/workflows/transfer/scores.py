@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from edp.data.prepared import Prepared
 from edp.evaluation.judge import Predictions, score_predictions
 from edp.evaluation.scores_file import MEAN, ByHorizon, metric
+from edp.evaluation.transfer_file import ErrorDistribution
 from edp.signals import KINDS
 
 # An odd number, so that one bin is centred on zero error.
@@ -76,7 +76,7 @@ def skew(errors: NDArray[np.float64]) -> float:
     return float(np.mean((centred / deviation) ** 3)) if deviation > 0 else 0.0
 
 
-def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[str, Any]:
+def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[str, dict[str, ErrorDistribution]]:
     """Share of ticks by error, on edges that all methods have in common.
 
     Args:
@@ -84,9 +84,9 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
         targets: names.
 
     Returns:
-        By horizon and target ``edges`` and the ``shares`` of each method; what lies beyond the edges is in none.
+        Histograms by horizon and target; errors beyond the edges are in no bin.
     """
-    histograms: dict[str, Any] = {}
+    histograms: dict[str, dict[str, ErrorDistribution]] = {}
     for horizon in next(iter(errors.values())):
         histograms[horizon] = {}
         for index, target in enumerate(targets):
@@ -100,10 +100,10 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
             )
             edges = np.linspace(-reach, reach, BINS + 1)
             shares = {
-                name: (np.histogram(method_errors[horizon][:, index], edges)[0] / len(method_errors[horizon])).tolist()
-                for name, method_errors in errors.items()
+                name: tuple((np.histogram(rows[horizon][:, index], edges)[0] / len(rows[horizon])).tolist())
+                for name, rows in errors.items()
             }
-            histograms[horizon][target] = {"edges": edges.tolist(), "shares": shares}
+            histograms[horizon][target] = ErrorDistribution(edges=tuple(edges.tolist()), shares=shares)
     return histograms
 
 
