@@ -46,6 +46,7 @@ from edp.export.c.target import CTarget
 from edp.export.follower import FollowerParts, write_follower
 from edp.export.follower.parts import GOLDEN_TICKS
 from edp.ir.rls import Adaptation, AdaptationSpec, RlsCorrector
+from edp.jobs import IN_PROCESS
 from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import Predictor, build_model
 from edp.networks.running import stream_hidden, stream_predictions
@@ -128,7 +129,7 @@ def machines(folder: Path) -> dict[str, tuple[str, str]]:
 def simulated(folder: Path, of: tuple[str, str], minutes: float, recordings: int, seed: int) -> DataSource:
     materials = {of[1]: 1.0} if of[1] else {}
     order = SimulationOrder(machine=of[0], minutes=minutes, recordings=recordings, seed=seed, materials=materials)
-    simulate_data_set(folder, order, workers=1)
+    simulate_data_set(folder, order, workers=IN_PROCESS)
     return DataSource.of(folder)
 
 

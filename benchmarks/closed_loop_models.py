@@ -13,6 +13,7 @@ from common import table
 from edp.config.twin import load_twin_experiment
 from edp.data.series import Series
 from edp.evaluation.ahead import EACH, look_ahead
+from edp.jobs import IN_PROCESS
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
 from edp.networks.twin.load import LoadEstimate
@@ -142,12 +143,12 @@ class Models:
         return self._twin(source, name, ("twin.kind=greybox", f"twin.linkage={guess}", *fit))
 
     def _simulated(self, name: str, order: SimulationOrder) -> DataSource:
-        simulate_data_set(self.folder / name, order, workers=1)
+        simulate_data_set(self.folder / name, order, workers=IN_PROCESS)
         return DataSource.of(self.folder / name)
 
     def _twin(self, source: DataSource, name: str, settings: Sequence[str], start: Path | None = None) -> Path:
         experiment = load_twin_experiment(None, (*settings, *JUDGED))
-        train_twin(source, experiment, self.folder / name, workers=1, start=start)
+        train_twin(source, experiment, self.folder / name, workers=IN_PROCESS, start=start)
         return self.folder / name
 
 

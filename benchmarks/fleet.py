@@ -31,18 +31,14 @@ import numpy as np
 
 from common import WORK, Bench, benchmark, kept, table
 from edp.config.experiment import Experiment, load_experiment
-from edp.jobs import Workforce
+from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.base import Executor
-from edp.jobs.units import WorkUnit, run_units
+from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import load_bundle
-from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
-from edp.workflows.fleet.judging import evaluate_with
 from edp.workflows.fleet.personal import PersonalOrder, errors_by_machine, finetune_fleet
-from edp.workflows.fleet.simulating import simulate_with
-from edp.workflows.fleet.storing import store_with
-from edp.workflows.train_evaluate import train
+from edp.workflows.train_evaluate import evaluate, train
 from edp.workflows.transfer import FinetuneSpec
 
 SPEEDUP, SHARE, NEAR = 1.8, 0.03, 1.05
@@ -93,7 +89,7 @@ class Fleet:
 
     def logs(self, name: str, order: SimulationOrder) -> Path:
         """Logs, simulated where they are not there yet."""
-        simulate_data_set(self.work / name, order, workers=1)
+        simulate_data_set(self.work / name, order, workers=IN_PROCESS)
         return self.work / name
 
     def experiment(self, *changes: str) -> Experiment:
@@ -209,7 +205,7 @@ def metered() -> Iterator[Meter]:
     looking.join()
 
 
-Command = Callable[[Workforce, Path, str], object]
+Command = Callable[[Workers, Path, str], object]
 
 
 def commands(fleet: Fleet) -> dict[str, Command]:
@@ -225,25 +221,24 @@ def commands(fleet: Fleet) -> dict[str, Command]:
 
     if fleet.quick:  # starting processes takes longest: two commands stand for all
         return {
-            "simulate": lambda workforce, out, name: simulate_with(workforce, out / "logs", orders[name]),
-            "store": lambda workforce, out, name: store_with(workforce, source(name), out / "store"),
+            "simulate": lambda workers, out, name: simulate_data_set(out / "logs", orders[name], workers),
+            "store": lambda workers, out, name: source(name).store(out / "store", workers),
         }
 
-    def evaluate(workforce: Workforce, out: Path, name: str) -> object:
+    def evaluate_copy(workers: Workers, out: Path, name: str) -> object:
         shutil.copytree(run, out / "run")
-        return evaluate_with(workforce, out / "run", source(name), BASELINES)
+        return evaluate(out / "run", source(name), BASELINES, workers=workers)
 
     return {
-        "simulate": lambda workforce, out, name: simulate_with(workforce, out / "logs", orders[name]),
-        "store": lambda workforce, out, name: store_with(workforce, source(name), out / "store"),
-        "inspect": lambda workforce, out, name: inspect_with(workforce, source(name), CoverageOrder()),
-        "screen (inspection)": lambda workforce, out, name: inspect_with(workforce, source(name)),
-        "evaluate": evaluate,
+        "simulate": lambda workers, out, name: simulate_data_set(out / "logs", orders[name], workers),
+        "store": lambda workers, out, name: source(name).store(out / "store", workers),
+        "inspect": lambda workers, out, name: source(name).inspect(workers=workers),
+        "evaluate": evaluate_copy,
     }
 
 
-class WarmPool(Workforce):
-    """A workforce whose workers stay from one command to the next, so that starting them is done once."""
+class WarmPool(Workers):
+    """Workers whose processes stay from one command to the next, so that starting them is done once."""
 
     pools: ClassVar[list[Executor]] = []
 
@@ -257,24 +252,24 @@ class WarmPool(Workforce):
             self.pools.pop().close()
 
 
-def in_turn(command: Command, workforce: Workforce) -> tuple[float, float, list[float]]:
+def in_turn(command: Command, workers: Workers) -> tuple[float, float, list[float]]:
     """Processor time of starting (the busiest process on next to nothing), then of this process and of each worker."""
     with metered() as meter, tempfile.TemporaryDirectory() as out:
         for name in ("few", "many"):
             (Path(out) / name).mkdir()
-        command(workforce, Path(out) / "few", "few")
+        command(workers, Path(out) / "few", "few")
         meter.look()
         started = meter.busiest()
         meter.mark()
-        command(workforce, Path(out) / "many", "many")
+        command(workers, Path(out) / "many", "many")
         meter.look()
         return started, meter.here(), meter.each()
 
 
 def two_against_one(command: Command) -> dict[str, Any]:
     """Processor time of a command in one process and in two workers."""
-    _, alone, _ = in_turn(command, Workforce())
-    two = WarmPool(workers=2)
+    _, alone, _ = in_turn(command, Workers())
+    two = WarmPool(count=2)
     try:
         started, here, workers = in_turn(command, two)
     finally:
@@ -290,7 +285,7 @@ def coordinating(workers: int) -> dict[str, float]:
     """The coordinator's processor time a unit over many that take none."""
     units = [WorkUnit("fleet:rest", f"unit {n}", {"number": n}) for n in range(UNITS)]
     began, wall = time.process_time(), time.perf_counter()
-    run_units(units, Workforce(workers=workers))
+    list(Workers(count=workers).map(units))
     spent = time.process_time() - began
     return {
         "units": UNITS,
@@ -329,10 +324,10 @@ def deltas(fleet: Fleet) -> dict[str, Any]:
     orders = fleet_orders(fleet)
     base = trained(fleet, "fleet", orders["fleet"])
     store = fleet.work / "unseen_store"
-    DataSource.of(fleet.logs("unseen", orders["unseen"])).store(store, 1)
+    DataSource.of(fleet.logs("unseen", orders["unseen"])).store(store)
     found: dict[str, Any] = {"parameters": sum(p.numel() for p in load_bundle(base).predictor.parameters())}
     spec = FinetuneSpec(rounds=3 if fleet.quick else 10)
-    content = finetune_fleet(Workforce(), base, store, PersonalOrder(method="full", spec=spec), fleet.work / "own")
+    content = finetune_fleet(Workers(), base, store, PersonalOrder(method="full", spec=spec), fleet.work / "own")
     rows = errors_by_machine(content)
     found["full"] = {
         "machines": [list(row) for row in rows],
@@ -364,7 +359,7 @@ def unit_seconds(fleet: Fleet) -> list[float]:
             last[0] = time.process_time()
 
         order = fleet.order(fleet.size.minutes, fleet.size.recordings)
-        simulate_with(Workforce(), Path(out) / "logs", order, note)
+        simulate_data_set(Path(out) / "logs", order, IN_PROCESS, note)
     return seconds
 
 

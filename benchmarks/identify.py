@@ -20,6 +20,7 @@ import numpy as np
 
 from common import DATA, WORK, Bench, PrintedProgress, benchmark, kept, option, table
 from edp.config.twin import load_twin_experiment
+from edp.jobs import IN_PROCESS
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.sim.machine.machine import Machine
@@ -83,7 +84,7 @@ def one_machine(given: Any, name: str) -> dict[str, Any]:
         folder = Path(temporary)
         source = (given.data or folder) / name
         order = SimulationOrder(machine=name, minutes=minutes, recordings=recordings, seed=seed + 1)
-        simulate_data_set(source, order, workers=1)
+        simulate_data_set(source, order, workers=IN_PROCESS)
         truth = load_machine(name)
         write_bytes(folder / f"{name}_measured.toml", machine_text(measured(truth), [], {}).encode())
         began = time.process_time()

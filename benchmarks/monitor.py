@@ -32,11 +32,10 @@ from edp.monitor.fitting import fit_from_blocks
 from edp.monitor.monitor_file import load_monitor
 from edp.monitor.residuals.base import SideBySide
 from edp.monitor.session_blocks import SessionBlocks
-from edp.sandbox.helpers import Helpers
 from edp.sim.faults import FAULTS, parse_fault
 from monitor_metrics import Case, curves, false_alarm_rate, judged, summary
 from monitor_rival_runs import rival_results
-from monitor_sessions import DURATION_S, NUISANCES, died, session_facts
+from monitor_sessions import DURATION_S, NUISANCES, processes, session_facts
 from monitor_watching import (
     BEGAN,
     NEVER_H,
@@ -351,10 +350,10 @@ def main(bench: Bench) -> object:
     )  # fmt: skip
     if given.quick:
         plan = replace(plan, hours=QUICK_HOURS, minutes=0.05, settings=(*QUICK_SETTINGS, *plan.settings))
-    with Helpers(plan.workers, died) as helpers:
+    with processes(plan.workers) as side_by_side:
         # Processes end with the thread that starts them: work beside the run must find them all there.
-        list(helpers.ordered(_started, [_Start(f"process {n + 1}") for n in range(plan.workers)]))
-        found = measure(plan, given.seed, helpers.ordered)
+        list(side_by_side(_started, [_Start(f"process {n + 1}") for n in range(plan.workers)]))
+        found = measure(plan, given.seed, side_by_side)
     show(found)
     check(bench, found, plan.hours)
     return found

@@ -13,18 +13,20 @@ the noise of real sensors. What only the simulator knows is in the JSON file: th
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from io import BytesIO
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.monitor.residuals.base import SideBySide
+from edp.monitor.residuals.base import ONE_BY_ONE, SideBySide
 from edp.recording import Recording
-from edp.sandbox.helpers import Helpers
 from edp.signals import TABLE_A1, VOCABULARY
 from edp.sim import Scenario, simulate
 from edp.sim.excitation import EXCITATIONS
@@ -33,7 +35,6 @@ from edp.sim.faults import FAULTS, fault_text, ladder
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.plan import DEFAULT_MIX, hand_out
-from edp.sim.scenario import SimulationError
 from edp.sim.view import View
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.training.identification.machine_text import machine_text
@@ -292,7 +293,7 @@ def _write(job: _Job) -> str:
     return job.plan.name
 
 
-def write_sessions(plans: Sequence[SessionPlan], folder: Path, side_by_side: SideBySide = map) -> None:
+def write_sessions(plans: Sequence[SessionPlan], folder: Path, side_by_side: SideBySide = ONE_BY_ONE) -> None:
     """Simulate what is not in the folder yet."""
     make_folder(folder)
     jobs = [_Job(plan, folder, plan.name) for plan in plans if not (folder / f"{plan.name}.json").exists()]
@@ -335,9 +336,31 @@ def plans_of(part: str, counts: dict[str, int], seconds: float = DURATION_S) -> 
     return plans
 
 
-def died(label: str) -> SimulationError:
-    """What is raised where a process ended by itself."""
-    return SimulationError(f"a process died at '{label}', out of memory or stopped from outside: take fewer workers")
+class Processes:
+    """Calls a function for each of some jobs in processes, also from several threads of this one.
+
+    Args:
+        executor: the processes.
+    """
+
+    is_elsewhere = True
+
+    def __init__(self, executor: ProcessPoolExecutor) -> None:
+        self.executor = executor
+
+    def __call__(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
+        """Yield ``function(job)`` of each job, in order."""
+        return self.executor.map(function, jobs)
+
+
+@contextmanager
+def processes(count: int) -> Iterator[SideBySide]:
+    """Yield what calls functions in `count` processes, which end with the block; in this process for 1."""
+    if count == 1:
+        yield ONE_BY_ONE
+        return
+    with ProcessPoolExecutor(count, get_context("spawn")) as executor:
+        yield Processes(executor)
 
 
 def main() -> None:
@@ -346,9 +369,9 @@ def main() -> None:
     options.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     options.add_argument("--workers", type=int, default=2)
     given = options.parse_args()
-    with Helpers(given.workers, died) as helpers:
+    with processes(given.workers) as side_by_side:
         for part in given.parts:
-            write_sessions(plans_of(part, COUNTS[part]), given.data / part, helpers.ordered)
+            write_sessions(plans_of(part, COUNTS[part]), given.data / part, side_by_side)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from edp.monitor.chain import BlockVerdict, ChainState, MonitorChain
 from edp.monitor.fitting import fit_from_blocks
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
-from edp.monitor.residuals.base import ResidualSource, SideBySide
+from edp.monitor.residuals.base import ONE_BY_ONE, ResidualSource, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.session_blocks import SessionBlocks, blocks_of
 from edp.recording import Recording
@@ -203,7 +203,7 @@ def _watch(job: _WatchJob) -> list[MonitorAlarm]:
 def watched(
     plan: Plan,
     names: Sequence[str],
-    side_by_side: SideBySide = map,
+    side_by_side: SideBySide = ONE_BY_ONE,
     monitor: Path | None = None,
     columns: Sequence[int] = (),
 ) -> dict[str, list[MonitorAlarm]]:
@@ -232,7 +232,7 @@ def same_alarms(plan: Plan, found: dict[str, list[MonitorAlarm]], count: int = 6
     return same, len(names)
 
 
-def fitted(plan: Plan, side_by_side: SideBySide = map) -> dict[str, Any]:
+def fitted(plan: Plan, side_by_side: SideBySide = ONE_BY_ONE) -> dict[str, Any]:
     """Fit the monitor where it is not there yet, without its dictionary; what is kept of it."""
     facts = plan.monitor / "fit.json"
     if not facts.exists():
@@ -260,7 +260,7 @@ def fitted(plan: Plan, side_by_side: SideBySide = map) -> dict[str, Any]:
     return result_facts
 
 
-def add_dictionary(plan: Plan, side_by_side: SideBySide = map) -> bool:
+def add_dictionary(plan: Plan, side_by_side: SideBySide = ONE_BY_ONE) -> bool:
     """The monitor with a dictionary of faults in a folder of its own; false where there is no machine to simulate."""
     if not (plan.named / "monitor.json").exists():
         monitor, spec = load_monitor(plan.monitor), plan.experiment.dictionary
@@ -283,7 +283,7 @@ def columns_without_flow(monitor: Monitor) -> tuple[list[ResidualSource], list[i
     return kept, residuals, [place * each + number for place in residuals for number in range(each)]
 
 
-def fit_without_flow(plan: Plan, side_by_side: SideBySide = map) -> list[int]:
+def fit_without_flow(plan: Plan, side_by_side: SideBySide = ONE_BY_ONE) -> list[int]:
     """The monitor less its balances of flow, all behind them fitted anew; columns of the summaries that it has."""
     monitor = load_monitor(plan.monitor)
     kept, residuals, columns = columns_without_flow(monitor)

@@ -103,7 +103,7 @@ def main() -> None:
     """Run the cases."""
     top, full, first, count, seconds = Path(sys.argv[1]), sys.argv[2], *map(int, sys.argv[3:5]), float(sys.argv[5])
     # Imported once; children inherit them.
-    import edp.sandbox.helpers
+    import edp.jobs
     import edp.workflows.api
     import edp.workflows.monitor
     import edp.workflows.search  # noqa: F401

@@ -1,12 +1,10 @@
 """No process outlives the command that started it, however that ends; a request to end is taken as Ctrl-C is."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,34 +13,26 @@ import torch
 
 from edp.cli import process
 from edp.cli.console import run_app
-from edp.errors import LostError
-from edp.sandbox.helpers import Helpers
-from edp.training.free_run import FreeRunDiverged
-from edp.workflows.twin.fit_twin import member_died
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 # Two jobs that last for ever in a pool of two; the process says who works for it once both have begun.
 FOREVER = """
-import multiprocessing, os, sys, time
-from dataclasses import dataclass
+import os, sys, time
 from pathlib import Path
-from edp.sim.plan import ordered
+from edp.jobs.workers import WorkUnit, Workers
 
-@dataclass(frozen=True)
-class Job:
-    label: str
-
-def forever(job):
-    Path(sys.argv[1], job.label).write_text(str(os.getpid()))
+def forever(identity, where):
+    Path(where["folder"], identity.config["name"]).write_text(str(os.getpid()))
     while True:
         time.sleep(0.01)
 
 if __name__ == "__main__":
-    sys.argv = ["x", "FOLDER"]
+    sys.path.insert(0, "FOLDER")
     from edp.cli import process
     process.stop_on_request()
     try:
-        list(ordered(forever, [Job("a"), Job("b"), Job("c")], 2))
+        units = [WorkUnit("forever:forever", name, {"name": name}, where={"folder": "FOLDER"}) for name in "abc"]
+        list(Workers(count=2).map(units))
     except KeyboardInterrupt:
         sys.exit(process.stopped_code(130))
 """
@@ -92,7 +82,7 @@ def heeds_interrupts() -> None:
 )
 def test_helpers_of_a_simulation_end_with_it(tmp_path, number, code):
     script = tmp_path / "forever.py"
-    script.write_text(FOREVER.replace("FOLDER", str(tmp_path)).replace("sys.argv[1], job", f"{str(tmp_path)!r}, job"))
+    script.write_text(FOREVER.replace("FOLDER", str(tmp_path)))
     command = [sys.executable, str(script)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heeds_interrupts) as parent:
         until(lambda: (tmp_path / "a").exists() and (tmp_path / "b").exists())
@@ -167,42 +157,3 @@ def test_other_errors_are_not_taken_for_want_of_memory():
 
     with pytest.raises(RuntimeError, match="shapes"):
         run_app(app)
-
-
-@dataclass(frozen=True)
-class Member:
-    label: str
-    ends: str
-
-
-def ending_job(job):
-    if job.ends == "killed":
-        os._exit(1)
-    if job.ends == "diverged":
-        raise FreeRunDiverged(f"{job.label} is not finite any more")
-    return job.label
-
-
-@pytest.mark.parametrize(
-    ("ends", "error", "message"),
-    [
-        ("killed", LostError, r"a worker process died during 'a' .* run the same command again with fewer workers"),
-        ("diverged", FreeRunDiverged, "a is not finite any more"),
-    ],
-)
-def test_the_end_of_a_helper_is_told_as_it_would_be_without_one(ends, error, message):
-    before = set(multiprocessing.active_children())
-    with pytest.raises(error, match=message), Helpers(2, member_died) as helpers:
-        list(helpers.ordered(ending_job, [Member("a", ends), Member("b", "well")]))
-    until(lambda: set(multiprocessing.active_children()) <= before)
-
-
-def test_helpers_answer_in_the_order_of_the_jobs_and_one_worker_starts_no_process():
-    jobs = [Member(name, "well") for name in "abcdef"]
-    with Helpers(2, member_died) as helpers:
-        assert list(helpers.ordered(ending_job, jobs)) == list("abcdef")
-        assert list(helpers.ordered(ending_job, jobs[:2])) == ["a", "b"]  # the same processes again
-    before = set(multiprocessing.active_children())
-    with Helpers(1, member_died) as helpers:
-        assert list(helpers.ordered(ending_job, jobs)) == list("abcdef")
-        assert set(multiprocessing.active_children()) <= before

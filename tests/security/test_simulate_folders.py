@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from edp.errors import BusyError, ConfigError, EdpError, StorageError
+from edp.jobs import IN_PROCESS
 from edp.sim import data_set as data_sets
 from edp.sim.data_set import LOCK, MANIFEST, SimulationOrder, simulate_data_set
 from edp.sim.predictability import LimitSpec
@@ -27,10 +28,7 @@ def recording_of(scenario):
 def quick(monkeypatch):
     """Simulating takes no time: what is claimed here is the folder."""
 
-    def simulate_many(scenarios, workers):
-        yield from map(recording_of, scenarios)
-
-    monkeypatch.setattr(data_sets, "simulate_many", simulate_many)
+    monkeypatch.setattr(data_sets, "simulate", recording_of)
 
 
 def test_a_second_order_is_refused_while_the_first_one_runs(tmp_path, quick):
@@ -38,16 +36,16 @@ def test_a_second_order_is_refused_while_the_first_one_runs(tmp_path, quick):
 
     def on_done(recording, kept):
         with pytest.raises(BusyError, match=f"process {os.getpid()} on .* simulates into"):
-            simulate_data_set(tmp_path, SimulationOrder(seed=2, **SHORT))
+            simulate_data_set(tmp_path, SimulationOrder(seed=2, **SHORT), IN_PROCESS)
         seen.append(recording.name)
 
-    made = simulate_data_set(tmp_path, SimulationOrder(seed=1, **SHORT), 1, on_done)
+    made = simulate_data_set(tmp_path, SimulationOrder(seed=1, **SHORT), IN_PROCESS, on_done)
     assert len(seen) == 2
     assert sorted(os.listdir(tmp_path)) == sorted([MANIFEST, *(path.name for path in made)])
     with pytest.raises(StorageError, match="holds another simulated data set"):
-        simulate_data_set(tmp_path, SimulationOrder(seed=2, **SHORT))
+        simulate_data_set(tmp_path, SimulationOrder(seed=2, **SHORT), IN_PROCESS)
     with pytest.raises(StorageError, match="holds another simulated data set"):
-        simulate_data_set(tmp_path, SimulationOrder(seed=1, suffix=".csv", **SHORT))
+        simulate_data_set(tmp_path, SimulationOrder(seed=1, suffix=".csv", **SHORT), IN_PROCESS)
 
 
 def test_the_manifest_is_read_after_the_folder_is_held(tmp_path, quick, monkeypatch):
@@ -57,12 +55,12 @@ def test_the_manifest_is_read_after_the_folder_is_held(tmp_path, quick, monkeypa
 
     def after_the_other(path):
         monkeypatch.setattr(data_sets, "hold", real)
-        simulate_data_set(tmp_path, first)
+        simulate_data_set(tmp_path, first, IN_PROCESS)
         return real(path)
 
     monkeypatch.setattr(data_sets, "hold", after_the_other)
     with pytest.raises(StorageError, match="holds another simulated data set"):
-        simulate_data_set(tmp_path, second)
+        simulate_data_set(tmp_path, second, IN_PROCESS)
     assert len(list(tmp_path.glob("*.parquet"))) == 2
 
 
@@ -73,10 +71,10 @@ def test_a_stopped_data_set_goes_on_and_leftovers_go(tmp_path, quick):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate_data_set(tmp_path, order, 1, stop)
+        simulate_data_set(tmp_path, order, IN_PROCESS, stop)
     (tmp_path / ".x.parquet.0123456789ab.tmp").write_bytes(b"half")
     kept = []
-    simulate_data_set(tmp_path, order, 1, lambda recording, was: kept.append(was))
+    simulate_data_set(tmp_path, order, IN_PROCESS, lambda recording, was: kept.append(was))
     assert kept == [True, False]
     assert not list(tmp_path.glob(".*"))
 
@@ -86,7 +84,7 @@ def test_a_lock_that_was_removed_ends_it(tmp_path, quick):
         (tmp_path / LOCK).unlink()
 
     with pytest.raises(StorageError, match="removed or replaced"):
-        simulate_data_set(tmp_path, SimulationOrder(seed=1, **SHORT), 1, remove)
+        simulate_data_set(tmp_path, SimulationOrder(seed=1, **SHORT), IN_PROCESS, remove)
     assert len(list(tmp_path.glob("*.parquet"))) == 1
 
 
@@ -94,7 +92,7 @@ def test_a_lock_that_was_removed_ends_it(tmp_path, quick):
 def test_a_hostile_manifest_is_one_message(tmp_path, content):
     (tmp_path / MANIFEST).write_text(content)
     with pytest.raises(StorageError, match=r"data_set\.json|holds another"):
-        simulate_data_set(tmp_path, SimulationOrder(**SHORT))
+        simulate_data_set(tmp_path, SimulationOrder(**SHORT), IN_PROCESS)
     assert sorted(os.listdir(tmp_path)) == [MANIFEST]
 
 

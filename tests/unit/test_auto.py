@@ -13,6 +13,7 @@ from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
 from edp.evaluation.scores_file import ScoresFile
+from edp.jobs import Workers
 from edp.report import build_report
 from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
@@ -187,7 +188,7 @@ def test_candidates_side_by_side_give_the_same_bits(tmp_path, monkeypatch):
     for workers in (1, 2):
         folder = tmp_path / f"run{workers}"
         told.append(NotedProgress())
-        train_auto(source, settings, folder, told[-1], workers)
+        train_auto(source, settings, folder, told[-1], Workers(count=workers))
         runs.append(folder)
         left = sorted(path.name for path in (folder / "candidates").iterdir())
         assert left == ["recurrent"]  # whose checkpoint a stopped run goes on from

@@ -12,7 +12,7 @@ from edp.data.task import TargetMode, Task
 from edp.evaluation.by_situation import NEAR_STOP, SITUATIONS, Situations
 from edp.evaluation.judge import score_predictions
 from edp.evaluation.scores_file import ModelScores, ScoredTarget, ScoredTask, ScoresFile
-from edp.report.run.sheets import situation_sheet
+from edp.report.run.sheets import situation_table
 from edp.settings.results import plain_value
 from edp.signals import Channel, Kind
 
@@ -139,8 +139,8 @@ def test_table_shows_most_of_the_error_first_and_the_best_baseline(scores):
         targets=(ScoredTarget(name="v", unit="mm/s"),),
         models={"network": replace(better, label="network"), "persistence": replace(held, label="Persistence")},
     )
-    sheet = situation_sheet(content, 1)
+    sheet = situation_table(content, 1)
     assert [c.heading for c in sheet.columns] == ["Situation", "Of the time", "Of the error", "v", "Relative to"]
     shown = [float(text[2].split()[0]) for text in sheet.texts()]
     assert shown == sorted(shown, reverse=True)
-    assert situation_sheet(replace(content, models={"network": ModelScores(label="n", overall={})}), 1) is None
+    assert situation_table(replace(content, models={"network": ModelScores(label="n", overall={})}), 1) is None

@@ -41,7 +41,8 @@ def test_rooms_are_few_and_imports_go_down(house):
     # 156 before numbers in messages of all rooms came from `edp.wording`, which stands below them.
     # 185 before workflows, and rooms with long computations below them, reported to `edp.progress`.
     # 190 before `edp.table`, which cli, workflows and report import.
-    assert house.arrows <= 194
+    # 190 before logs, simulator and training divided their loops among workers of `edp.jobs`.
+    assert house.arrows <= 198
     assert house.circles == []
 
 

@@ -4,8 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from noted_progress import NotedProgress
 
 from edp.errors import ConfigError
+from edp.jobs import IN_PROCESS, Workers
 from edp.sim import DataSetSpec, load_machine
 from edp.sim.data_set import SimulationOrder, find_data_set_limit, simulate_data_set
 from edp.sim.predictability import LimitSpec, find_limit, least_mae, plan_limit
@@ -59,7 +61,7 @@ def test_the_limit_rises_and_lies_below_persistence(found):
 
 
 def test_the_same_for_any_number_of_workers_and_none_without_noise(found):
-    assert find_limit(spec_of().scenarios(), SMALL, workers=2) == found
+    assert find_limit(spec_of().scenarios(), SMALL, workers=Workers(count=2)) == found
     quiet = find_limit(spec_of(sensor_noise=False, recordings=2, minutes=0.4).scenarios(), SMALL)
     assert np.abs(quiet["commands_known"]["mae"]).max() < 1e-9
 
@@ -72,13 +74,14 @@ def test_soil_is_not_known_beforehand():
 
 def test_it_is_kept_beside_the_logs_until_something_changes(tmp_path):
     order = SimulationOrder(minutes=0.4, recordings=2, seed=1)
-    simulate_data_set(tmp_path, order, workers=1)
-    seen = []
-    first = find_data_set_limit(tmp_path, order, SMALL, 1, lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 2), (2, 2)]
-    assert find_data_set_limit(tmp_path, order, SMALL, 1, lambda done, total: seen.append((done, total))) == first
-    assert len(seen) == 2
-    other = find_data_set_limit(tmp_path, order, dataclasses.replace(SMALL, seed=5), 1)
+    simulate_data_set(tmp_path, order, workers=IN_PROCESS)
+    told = NotedProgress()
+    first = find_data_set_limit(tmp_path, order, SMALL, IN_PROCESS, told)
+    assert told.steps == [1, 2]
+    assert find_data_set_limit(tmp_path, order, SMALL, IN_PROCESS, told) == first
+    assert len(told.steps) == 2
+    assert not (tmp_path / "units").exists()
+    other = find_data_set_limit(tmp_path, order, dataclasses.replace(SMALL, seed=5), IN_PROCESS)
     assert other["commands_unknown"] != first["commands_unknown"]
 
 

@@ -1,7 +1,4 @@
 import dataclasses
-import functools
-import operator
-import os
 
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from edp.signals import EXTRA_CHANNELS, MOTOR_CHANNELS, TABLE_A1
 from edp.sim import (
     EXCITATIONS,
     Scenario,
-    SimulationError,
     load_machine,
     machine_names,
     plan,
@@ -191,15 +187,6 @@ def test_the_same_seed_gives_the_same_bits_for_any_number_of_workers():
     assert [r.name for r in together] == [s.name for s in scenarios] == [r.name for r in done]
     assert [r.digest for r in alone] == [r.digest for r in together]
     assert len({r.digest for r in alone}) == 3
-
-
-def test_a_dead_worker_is_reported(monkeypatch):
-    victims = [functools.partial(os._exit, 3) for _ in range(2)]
-    for victim in victims:
-        victim.label = "victim"
-    monkeypatch.setattr(plan, "simulate", operator.call)
-    with pytest.raises(SimulationError, match="worker process died while 'victim'"):
-        list(plan.simulate_many(victims, 2))
 
 
 def test_mean_strokes_stay_near_the_middle():

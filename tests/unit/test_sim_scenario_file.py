@@ -7,6 +7,7 @@ import pytest
 
 import edp.sim.data_set
 from edp.errors import ConfigError, StorageError
+from edp.jobs import IN_PROCESS
 from edp.sim import DEFAULT_MIX, DataSetSpec, Scenario, plan_data_set, read_scenario_file, simulate_many
 from edp.sim.data_set import SimulationOrder, bytes_needed, simulate_data_set
 from edp.sim.predictability import LimitSpec
@@ -199,7 +200,7 @@ def test_a_data_set_longer_than_the_disk_is_refused_before_the_first_step(tmp_pa
 
 def test_room_is_estimated_from_above(tmp_path):
     order = SimulationOrder.of(minutes=0.5, recordings=1, suffix=".csv")
-    (path,) = simulate_data_set(tmp_path, order, workers=1)
+    (path,) = simulate_data_set(tmp_path, order, workers=IN_PROCESS)
     assert 0.5 < path.stat().st_size / bytes_needed(order.scenarios(), ".csv") < 1.0
 
 

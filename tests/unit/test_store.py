@@ -13,6 +13,7 @@ from edp.data.prepared import prepare
 from edp.data.splits import SPLITS
 from edp.data.task import TargetMode, Task
 from edp.errors import BusyError, ConfigError, DataError
+from edp.jobs import Workers
 from edp.logs import Repair, read_data_set, write_recording
 from edp.logs.source import DataSource
 from edp.logs.store import build_store, check_store, is_store, read_index, read_store
@@ -108,7 +109,7 @@ def test_long_logs_are_stored_in_parts(tmp_path, monkeypatch):
 def test_two_processes_build_the_same_store(logs, tmp_path, monkeypatch):
     monkeypatch.setattr("edp.logs.store.building.BATCH_LOG_BYTES", 1)
     build(logs, tmp_path / "one")
-    build(logs, tmp_path / "two", workers=2)
+    build(logs, tmp_path / "two", workers=Workers(count=2))
     assert_same(read_store(tmp_path / "two"), read_store(tmp_path / "one"))
 
 

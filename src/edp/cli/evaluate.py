@@ -21,7 +21,7 @@ from edp.cli.options import (
     check_effects,
     source_if_given,
     within,
-    workforce_of,
+    workers_of,
 )
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
@@ -31,7 +31,7 @@ from edp.wording import figure, number, percent, setting_text
 if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
     from edp.evaluation.scores_file import ScoresFile
-    from edp.jobs import Workforce
+    from edp.jobs import Workers
     from edp.logs.source import DataSource
 
 
@@ -79,11 +79,11 @@ def evaluate(
     from edp.training.twin_bundle import holds_twin
 
     source = source_if_given(data, signal_map, repair)
-    workforce = workforce_of(workers, cluster, open_cluster)
+    divided = workers_of(workers, cluster, open_cluster)
     names = None if baselines is None else baseline_names(baselines)
     is_twin = holds_twin(run)
     of_networks = ("baselines", "at_most", "channel_importance", "workers", "cluster")
-    effects = {"predictor": is_twin, "minutes": not is_twin and names != [] and workforce.alone}
+    effects = {"predictor": is_twin, "minutes": not is_twin and names != [] and divided.are_alone}
     check_effects(context, effects | dict.fromkeys(of_networks, not is_twin))
     if is_twin:
         evaluate_twin_run(run, source, predictor, as_json)
@@ -93,7 +93,7 @@ def evaluate(
     from edp.report.run.outputs import judged_line, losses_line, minutes_of, situation_line
     from edp.settings.provenance import read_provenance
 
-    folder, scores = run_evaluation(run, source, names, as_json, minutes, workforce, at_most)
+    folder, scores = run_evaluation(run, source, names, as_json, minutes, divided, at_most)
     verdict = network_verdict(scores, minutes_of(run))
     lost, judged = losses_line(scores), judged_line(scores, read_provenance(run))
     choice = read_choice(run) if source is None else None
@@ -176,20 +176,16 @@ def run_evaluation(
     names: list[str] | None = None,
     quiet: bool = False,
     minutes: float | None = None,
-    workforce: Workforce | None = None,
+    workers: Workers | None = None,
     at_most_h: float | None = None,
 ) -> tuple[Path, ScoresFile]:
     """Judge with a progress display; returns the folder of the scores and the scores."""
     from edp.evaluation.scores_file import ScoresFile
+    from edp.jobs import IN_PROCESS
     from edp.workflows.train_evaluate import evaluate as judge_run
 
     with shown_progress("evaluate", quiet, timed=True) as progress:
-        if workforce is None or workforce.alone:
-            folder = judge_run(run, source, names, progress, minutes, at_most_h=at_most_h)
-        else:
-            from edp.workflows.fleet.judging import evaluate_with
-
-            folder = evaluate_with(workforce, run, source, names, progress, at_most_h)
+        folder = judge_run(run, source, names, progress, minutes, workers or IN_PROCESS, at_most_h)
     return folder, ScoresFile.read(folder)
 
 
@@ -259,10 +255,10 @@ def _ahead(scores: ScoresFile, horizon: int) -> str:
 
 def by_situation_table(scores: ScoresFile) -> None:
     """Print the network's error by motion of the axes, at the longest horizon, if the scores contain it."""
-    from edp.report.run.sheets import situation_sheet
+    from edp.report.run.sheets import situation_table
 
     horizon = max(scores.task.horizons)
-    sheet = situation_sheet(scores, horizon)
+    sheet = situation_table(scores, horizon)
     if sheet is not None:
         heads = [f"{column.heading}{f', {column.unit}' if column.unit else ''}" for column in sheet.columns]
         table(f"{sheet.caption}, k = {horizon}", heads, [list(row) for row in sheet.texts()])

@@ -16,7 +16,7 @@ from edp.cli.options import (
     SettingsOption,
     WorkersOption,
     source_of,
-    workforce_of,
+    workers_of,
 )
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
@@ -24,7 +24,7 @@ from edp.errors import ConfigError
 from edp.wording import figure
 
 if TYPE_CHECKING:
-    from edp.jobs import Workforce
+    from edp.jobs import Workers
     from edp.report.transfer.facts import Transfer
     from edp.workflows.fleet.personal import PersonalOrder
 
@@ -81,7 +81,7 @@ def finetune(
     from edp.workflows.transfer import finetune as make
 
     spec, others = command_settings("finetune", FinetuneSpec, config, changes, TRAINING_TABLES)
-    workforce = workforce_of(workers, cluster, open_cluster)
+    divided = workers_of(workers, cluster, open_cluster)
     if fleet is not None:
         if logs or signal_map is not None or repair:
             raise ConfigError("LOGS, --map and --repair do not go with --fleet, whose store holds mapped logs already")
@@ -89,19 +89,14 @@ def finetune(
 
         size = {} if delta_kb is None else {"most_bytes": 1024 * delta_kb}
         personal = PersonalOrder(method=method, spec=spec, changes=others, **size)
-        _finetune_fleet(bundle, fleet, folder, personal, workforce, as_json)
+        _finetune_fleet(bundle, fleet, folder, personal, divided, as_json)
         return
     if not logs or delta_kb is not None:
         raise ConfigError("give LOGS of one machine, or --fleet with a store of many, to which --delta-kb belongs")
     order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
     source = source_of(logs, signal_map, repair)
     with shown_progress("finetune", as_json) as progress:
-        if workforce.alone:
-            result = make(bundle, source, order, folder, progress)
-        else:
-            from edp.workflows.fleet.training import finetune_with
-
-            result = finetune_with(workforce, bundle, source, order, folder, progress)
+        result = make(bundle, source, order, folder, progress, divided)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 
@@ -118,13 +113,13 @@ def finetune(
 
 
 def _finetune_fleet(
-    bundle: Path, store: Path, folder: Path, order: PersonalOrder, workforce: Workforce, as_json: bool
+    bundle: Path, store: Path, folder: Path, order: PersonalOrder, workers: Workers, as_json: bool
 ) -> None:
     """Fine-tune for every machine of a store with a progress display, and print the results."""
     from edp.workflows.fleet.personal import errors_by_machine, finetune_fleet
 
     with shown_progress("finetune", as_json) as progress:
-        content = finetune_fleet(workforce, bundle, store, order, folder, progress)
+        content = finetune_fleet(workers, bundle, store, order, folder, progress)
 
     def show() -> None:
         rows = [(name, *(figure(error) for error in errors)) for name, *errors in errors_by_machine(content)]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, table
-from edp.cli.options import ClusterOption, OpenOption, WorkersOption, workforce_of
+from edp.cli.options import ClusterOption, OpenOption, WorkersOption, workers_of
 from edp.cli.progress import shown_progress
 from edp.storage.paths import full_path
 
@@ -43,7 +43,7 @@ def report(
 
     question = FleetQuestion(network=network, store=store, deltas=deltas, monitor=monitor)
     with shown_progress("judge", as_json) as progress:
-        facts = report_fleet(workforce_of(workers, cluster, open_cluster), question, folder, progress)
+        facts = report_fleet(workers_of(workers, cluster, open_cluster), question, folder, progress)
     page = full_path(folder / PAGE)
 
     def show() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, emit, err, out, table
-from edp.cli.options import ClusterOption, LogsArgument, MapOption, OpenOption, WorkersOption, workforce_of
+from edp.cli.options import ClusterOption, LogsArgument, MapOption, OpenOption, WorkersOption, workers_of
 from edp.cli.progress import shown_progress
 from edp.cli.quality import AtMostOption, show_between, show_lines, show_report, verdict_text
 from edp.errors import DataError, EdpError, count_of
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from edp.data.coverage import Coverage
     from edp.logs import DataQuality
     from edp.logs.source import DataSource
-    from edp.workflows.fleet.inspecting import Inspection
 
 SETTINGS = "settings.toml"
 """What `edp init` writes beside a map."""
@@ -70,17 +69,9 @@ def inspect(
 
     source = replace(DataSource.of(data, signal_map), at_most_h=at_most)
     asked = page is not None or bool(split or inputs)
-    names, inspection = tuple(filter(None, inputs.split(","))), None
-    workforce = workforce_of(workers, cluster, open_cluster)
+    names = tuple(filter(None, inputs.split(",")))
     with shown_progress("read", as_json) as progress:
-        if workforce.alone:
-            quality = source.inspect(progress)
-        else:
-            from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
-
-            order = CoverageOrder(names, split) if covered or asked else None
-            inspection = inspect_with(workforce, source, order, progress)
-            quality = inspection.quality
+        quality = source.inspect(progress, workers_of(workers, cluster, open_cluster))
     errors = quality.errors
     coverage_facts, why = None, "" if covered or asked else "not asked for"
     # Recordings with errors have no coverage: training would refuse them.
@@ -89,7 +80,7 @@ def inspect(
         if asked:
             raise DataError(f"'{source.label}': {why}")
     elif not errors and (covered or asked):
-        coverage_facts, why = _coverage(source, split, names, asked, inspection)
+        coverage_facts, why = _coverage(source, split, names, asked)
     if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
 
@@ -146,17 +137,9 @@ def _training(data: Sequence[Path], signal_map: Path | None) -> str:
     return f"{command} --config {settings} --out {settings.parent / 'runs' / 'first'}"
 
 
-def _coverage(
-    source: DataSource, split: str, inputs: tuple[str, ...], asked: bool, inspection: Inspection | None
-) -> tuple[Coverage | None, str]:
-    """Return the coverage of a source, or the reason for its absence.
-
-    An explicitly requested coverage raises the error.
-    """
+def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bool) -> tuple[Coverage | None, str]:
+    """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
     from edp.workflows.covering import coverage
-
-    if inspection is not None and (inspection.coverage is not None or not asked):
-        return inspection.coverage, inspection.why
 
     try:
         return coverage(source, inputs, split), ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, duration, emit, out, table
-from edp.cli.options import LogsArgument, MapOption, RepairOption, WorkersOption, check_effects, source_of
+from edp.cli.options import (
+    ClusterOption,
+    LogsArgument,
+    MapOption,
+    OpenOption,
+    RepairOption,
+    WorkersOption,
+    check_effects,
+    source_of,
+    workers_of,
+)
 from edp.cli.progress import shown_progress
 from edp.errors import ConfigError, count_of
 from edp.storage.paths import full_path
@@ -60,6 +69,8 @@ def fit(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Fit a monitor to healthy logs: expected readings of each channel and alarm limits.
@@ -87,15 +98,16 @@ def fit(
     if not logs:
         raise ConfigError("edp monitor fit: got run folders alone, expected healthy logs; name them after the runs")
     source = source_of(logs, signal_map, repair)
+    divided = workers_of(workers, cluster, open_cluster)
     began = time.monotonic()
     with shown_progress("monitor", as_json) as progress:
-        fitted = fit_monitor(runs, source, experiment, folder, progress, workers)
+        fitted = fit_monitor(runs, source, experiment, folder, progress, divided)
     monitor = fitted.monitor
     facts: dict[str, Any] = {
         "monitor": str(folder),
         "seconds": fitted.seconds,
         "wall_s": time.monotonic() - began,
-        "workers": workers or os.cpu_count() or 1,
+        "workers": divided.processes,
         "residuals": list(monitor.residual_names),
         "doubtful": list(fitted.doubtful),
         "one_machine": fitted.one_machine,
@@ -107,7 +119,9 @@ def fit(
     def show() -> None:
         show_fitted(fitted)
         spent = f"{duration(fitted.seconds)} of processor time"
-        if workers != 1:
+        if cluster:
+            spent = f"{duration(facts['wall_s'])} on the cluster at {cluster}"
+        elif not divided.are_alone:
             spent = f"{duration(facts['wall_s'])} by {facts['workers']} processes"
         fitted_text = "was fitted before, nothing to do" if fitted.is_read else f"fitted in {spent}"
         out.print(f"{fitted_text}; monitor in {folder}")
@@ -144,6 +158,9 @@ def run(
     mdf: Annotated[
         Path | None, typer.Option("--mdf", help="Folder for the logs as MDF 4, with the alarms as events.")
     ] = None,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Watch logs: every alarm with when, since when, and what deviates; exit code 5 where there was one.
@@ -155,8 +172,9 @@ def run(
     """
     from edp.workflows.monitor import run_monitor
 
+    divided = workers_of(workers, cluster, open_cluster)
     with shown_progress("monitor", as_json, "recordings watched") as progress:
-        watched = run_monitor(folder, source_of(logs, signal_map, repair), target, progress)
+        watched = run_monitor(folder, source_of(logs, signal_map, repair), target, progress, divided)
 
     if mdf is not None:
         from edp.workflows.monitor.event_files import write_event_files

@@ -13,7 +13,7 @@ from edp.errors import ConfigError
 from edp.settings.bounds import Bound, shown
 
 if TYPE_CHECKING:
-    from edp.jobs import Workforce
+    from edp.jobs import Workers
     from edp.logs.source import DataSource
 
 MOST_WORKERS = 256
@@ -107,8 +107,12 @@ DEPENDENT: Mapping[tuple[str, str], str] = {
     ("simulate", "changes.limit"): "--limit",
     ("train", "minutes"): "the preset auto",
     ("train", "workers"): "the preset auto",
+    ("train", "cluster"): "the preset auto",
     ("twin", "minutes"): "a choice among formulations (without twin.kind, --start and ground)",
-    ("twin", "workers"): "several trainings (a choice among formulations, twin.members above 1, or --start)",
+    **{
+        ("twin", option): "several trainings (a choice among formulations, twin.members above 1, or --start)"
+        for option in ("workers", "cluster")
+    },
 }
 """Parameters by command whose effect depends on settings or files that the command reads, each with what it needs.
 
@@ -191,19 +195,19 @@ def source_if_given(data: Sequence[Path], signal_map: Path | None, repair: list[
     return source_of(data, signal_map, repair) if data else None
 
 
-def workforce_of(workers: int, cluster: str, open_cluster: bool, usual: int = 1) -> Workforce:
-    """Return the workforce for the options of workers and cluster.
+def workers_of(count: int, cluster: str, open_cluster: bool, usual: int = 1) -> Workers:
+    """Return the workers for the options ``--workers``, ``--cluster`` and ``--open-cluster``.
 
     Args:
-        workers: as given.
-        cluster: as given.
-        open_cluster: as given.
-        usual: number of workers where the option is left out; not refused beside a cluster.
+        count: value of ``--workers``.
+        cluster: value of ``--cluster``.
+        open_cluster: value of ``--open-cluster``.
+        usual: number of workers where the option is left out; not refused together with a cluster.
     """
-    from edp.jobs import Workforce
+    from edp.jobs import Workers
 
-    chosen = 1 if cluster and workers == usual else workers
-    return Workforce(workers=chosen, cluster=cluster, open_cluster=open_cluster)
+    chosen = 1 if cluster and count == usual else count
+    return Workers(count=chosen, cluster=cluster, open_cluster=open_cluster)
 
 
 def setting_of(command: str, option: str) -> str | None:

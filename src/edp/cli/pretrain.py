@@ -17,7 +17,7 @@ from edp.cli.options import (
     SettingsOption,
     check_effects,
     source_of,
-    workforce_of,
+    workers_of,
 )
 from edp.cli.progress import shown_progress
 
@@ -62,12 +62,9 @@ def pretrain(
     with shown_progress("pretrain", as_json) as progress:
         source = source_of(data, signal_map, repair)
         if cluster:
-            from edp.workflows.fleet.training import pretrain_with
-
             progress.note(f"on a node of the cluster at {cluster}")
-            result = pretrain_with(workforce_of(1, cluster, open_cluster), source, experiment, order, folder)
-        else:
-            result = make(source, experiment, order, folder, progress)
+        workers = workers_of(1, cluster, open_cluster)
+        result = make(source, experiment, order, folder, progress, workers)
 
     def show() -> None:
         _tables(result)
@@ -78,8 +75,8 @@ def pretrain(
 
 def _tables(result: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
-    from edp.report.run.sheets import contexts_sheet, parts_sheet
+    from edp.report.run.sheets import contexts_table, parts_table
 
-    for sheet in (parts_sheet(result), contexts_sheet(result)):
+    for sheet in (parts_table(result), contexts_table(result)):
         table(sheet.caption, sheet.heads(), sheet.texts())
         out.print()

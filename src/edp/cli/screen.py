@@ -22,7 +22,7 @@ from edp.cli.options import (
     WorkersOption,
     check_effects,
     source_of,
-    workforce_of,
+    workers_of,
 )
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.quality import AtMostOption, show_between, verdict_text
@@ -33,10 +33,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bars
 
     from edp.config.experiment import FeatureSettings
-    from edp.jobs import Workforce
-    from edp.logs import DataQuality
-    from edp.logs.source import DataSource
-    from edp.progress import Progress
+    from edp.jobs import Workers
     from edp.settings.tree import Change
     from edp.training import TrainingProgress
     from edp.workflows.feature_selection.select import Selection, SelectionOrder
@@ -111,7 +108,7 @@ def screen(
             sets=_own_sets(own),
         )
     source = replace(source_of(data, signal_map, repair), at_most_h=at_most)
-    selection = run_screening(source, folder, order, as_json, workforce_of(workers, cluster, open_cluster))
+    selection = run_screening(source, folder, order, as_json, workers_of(workers, cluster, open_cluster))
     command = next_command(data, signal_map, repair, selection)
 
     def show() -> None:
@@ -125,23 +122,17 @@ def screen(
 
 
 def run_screening(
-    source: Any, folder: Path, order: SelectionOrder, quiet: bool = False, workforce: Workforce | None = None
+    source: Any, folder: Path, order: SelectionOrder, quiet: bool = False, workers: Workers | None = None
 ) -> Selection:
-    """Screen with a progress display; a workforce inspects the recordings."""
+    """Screen with a progress display."""
+    from edp.jobs import IN_PROCESS
     from edp.workflows.feature_selection.select import Listeners, select_features
-
-    inspected = None
-    if workforce is not None and not workforce.alone:
-        from edp.workflows.fleet.inspecting import inspect_with
-
-        def inspected(source: DataSource, progress: Progress) -> DataQuality:
-            return inspect_with(workforce, source, None, progress).quality
 
     with progress(quiet) as shown:
         display = ScreeningDisplay(shown, Steps(quiet))
         logs = StageDisplay(Display(shown, Steps(quiet), "read"))
         listeners = Listeners(logs=logs, on_progress=display.on_progress, on_trial=display.on_trial)
-        return select_features(source, folder, order, listeners, inspected)
+        return select_features(source, folder, order, listeners, workers or IN_PROCESS)
 
 
 class ScreeningDisplay:

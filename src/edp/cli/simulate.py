@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, count_text, emit, err, left_text, out, progress, table
-from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, workforce_of
+from edp.cli.options import ClusterOption, OpenOption, WorkersOption, check_effects, workers_of
+from edp.cli.progress import shown_progress
 from edp.errors import count_of
 from edp.wording import figure, number
 
 if TYPE_CHECKING:
-    from edp.jobs import Workforce
-    from edp.sim.data_set import Simulated, SimulationOrder
+    from edp.jobs import Workers
+    from edp.sim.data_set import SimulationOrder
     from edp.sim.predictability import LimitSpec
+    from edp.sim.scenario import Scenario
 
 
 def simulate(
@@ -105,9 +107,9 @@ def simulate(
     )
     # Settings of the limit are checked even where it is not asked for.
     spec = limit_settings(scenario, changes)
-    elsewhere = workforce_of(workers, cluster, open_cluster, usual=0) if cluster else None
-    paths = run(folder, order, workers, as_json, elsewhere)
-    limit_facts = run_limit(folder, order, spec, workers, as_json) if limit else None
+    divided = workers_of(workers, cluster, open_cluster, usual=0)
+    paths = run(folder, order, divided, as_json)
+    limit_facts = run_limit(folder, order, spec, divided, as_json) if limit else None
     what_simulated = f"{order.family} machines" if order.family else order.machine
     facts: dict[str, Any] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
     if order.faults:
@@ -125,23 +127,17 @@ def simulate(
     emit(as_json, facts, show)
 
 
-def run(
-    folder: Path,
-    order: SimulationOrder,
-    workers: int = 0,
-    quiet: bool = False,
-    workforce: Workforce | None = None,
-) -> list[Path]:
-    """Simulate with a progress display, by the workers of this machine or a workforce."""
-    from edp.sim.data_set import simulate_data_set
+def run(folder: Path, order: SimulationOrder, workers: Workers | None = None, quiet: bool = False) -> list[Path]:
+    """Simulate with a progress display."""
+    from edp.sim.data_set import ONE_PER_CORE, simulate_data_set
 
     began, steps, counts = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
     with progress(quiet) as shown:
         bar = shown.add_task("simulate", total=order.recordings, note="")
 
-        def on_done(recording: Simulated, existed: bool) -> None:
+        def on_done(scenario: Scenario, existed: bool) -> None:
             counts["kept" if existed else "new"] += 1
-            counts["seconds"] += 0.0 if existed else recording.duration_s
+            counts["seconds"] += 0.0 if existed else scenario.duration_s
             elapsed = time.monotonic() - began
             done = counts["kept"] + counts["new"]
             # Recordings that were there before took no time, and say nothing about the others.
@@ -150,27 +146,15 @@ def run(
             shown.update(bar, advance=1, note=note)
             steps.say(f"simulate: recordings {count_text(round(done), order.recordings)}, {note}{left_text(left)}")
 
-        if workforce is not None:
-            from edp.workflows.fleet.simulating import simulate_with
-
-            return simulate_with(workforce, folder, order, on_done)
-        return simulate_data_set(folder, order, workers, on_done)
+        return simulate_data_set(folder, order, workers or ONE_PER_CORE, on_done)
 
 
-def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: int, quiet: bool) -> dict[str, Any]:
+def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: Workers, quiet: bool) -> dict[str, Any]:
     """Find the limit of predictability with a progress display."""
     from edp.sim.data_set import find_data_set_limit
 
-    began, steps = time.monotonic(), Steps(quiet)
-    with progress(quiet) as shown:
-        bar = shown.add_task("limit", total=None, note="")
-
-        def on_done(done: int, total: int) -> None:
-            left = (time.monotonic() - began) / done * (total - done)
-            shown.update(bar, completed=done, total=total)
-            steps.say(f"limit: recordings branched {count_text(done, total)}{left_text(left)}")
-
-        return find_data_set_limit(folder, order, spec, workers, on_done)
+    with shown_progress("limit", quiet, "branched", timed=True) as progress:
+        return find_data_set_limit(folder, order, spec, workers, progress)
 
 
 def limit_table(limit: dict[str, Any]) -> None:

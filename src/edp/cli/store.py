@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +9,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, err, listing, out, table
 from edp.cli.inspect import FAULTY
-from edp.cli.options import ClusterOption, MapOption, OpenOption, RepairOption, source_of, workforce_of
+from edp.cli.options import ClusterOption, MapOption, OpenOption, RepairOption, source_of, workers_of
 from edp.cli.progress import shown_progress
 from edp.errors import count_of
 from edp.wording import number
@@ -59,12 +58,7 @@ def build(
     """
     source = source_of(data, signal_map, repair)
     with shown_progress("store", as_json) as progress:
-        if cluster:
-            from edp.workflows.fleet.storing import store_with
-
-            index = store_with(workforce_of(workers, cluster, open_cluster, usual=0), source, folder, progress)
-        else:
-            index = source.store(folder, workers or os.cpu_count() or 1, progress)
+        index = source.store(folder, workers_of(workers, cluster, open_cluster, usual=0), progress)
     _show(index, folder, as_json)
     if index.refused:
         err.print(

@@ -10,11 +10,22 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from edp.cli.console import JsonFlag, duration, emit, err, out, table
-from edp.cli.options import MOST_WORKERS, LogsArgument, MapOption, RepairOption, check_effects, source_of
+from edp.cli.options import (
+    MOST_WORKERS,
+    ClusterOption,
+    LogsArgument,
+    MapOption,
+    OpenOption,
+    RepairOption,
+    check_effects,
+    source_of,
+    workers_of,
+)
 from edp.cli.progress import shown_progress
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
+    from edp.jobs import Workers
     from edp.logs.source import DataSource
     from edp.report.run.choice import AutoChoice
     from edp.training import Bundle
@@ -47,6 +58,8 @@ def train(
     workers: Annotated[
         int, typer.Option(min=0, max=MOST_WORKERS, help="Of the preset auto: parallel trainings; 0: one for each core.")
     ] = 0,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Train a causal network on recordings and write a bundle.
@@ -61,10 +74,11 @@ def train(
 
     source = source_of(data, signal_map, repair)
     preset = preset or usual_preset(config, changes)
-    check_effects(context, {"minutes": preset == AUTO, "workers": preset == AUTO})
+    check_effects(context, dict.fromkeys(("minutes", "workers", "cluster"), preset == AUTO))
     if preset == AUTO:
         own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
-        _train_auto(source, folder, config, [*changes, *own], workers, as_json)
+        divided = workers_of(workers, cluster, open_cluster, usual=0)
+        _train_auto(source, folder, config, [*changes, *own], divided, as_json)
         return
     bundle, best = run(data, folder, config, preset, changes, source, as_json)
     seconds = bundle.provenance.seconds or 0.0
@@ -85,7 +99,7 @@ def train(
 
 
 def _train_auto(
-    source: DataSource, folder: Path, config: Path | None, changes: Sequence[str], workers: int, quiet: bool
+    source: DataSource, folder: Path, config: Path | None, changes: Sequence[str], workers: Workers, quiet: bool
 ) -> None:
     """Train the portfolio with a progress display, and print the chosen candidate."""
     from edp.workflows.auto import load_auto, train_auto

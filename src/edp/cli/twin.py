@@ -13,12 +13,15 @@ from edp.cli.options import (
     MOST_MINUTES,
     MOST_SECONDS,
     MOST_WORKERS,
+    ClusterOption,
     LogsArgument,
     MapOption,
+    OpenOption,
     RepairOption,
     check_effects,
     source_of,
     within,
+    workers_of,
 )
 from edp.cli.progress import shown_progress
 from edp.cli.verdicts import end_with, show_verdict, verdict_facts
@@ -45,6 +48,8 @@ def twin(
     workers: Annotated[
         int, typer.Option(min=0, max=MOST_WORKERS, help="Parallel trainings; 0: one for each core.")
     ] = 0,
+    cluster: ClusterOption = "",
+    open_cluster: OpenOption = False,
     minutes: Annotated[
         float | None,
         typer.Option(
@@ -74,14 +79,15 @@ def twin(
     experiment = load_twin_experiment(config, changes)
     effects = {
         "minutes": has_choice(experiment) and start is None,
-        "workers": trains_several(experiment) or start is not None,
+        **dict.fromkeys(("workers", "cluster"), trains_several(experiment) or start is not None),
     }
     check_effects(context, {name: effect and not experiment.ground for name, effect in effects.items()})
     if minutes is not None:
         experiment = with_budget(experiment, minutes)
+    divided = workers_of(workers, cluster, open_cluster, usual=0)
     with shown_progress("twin", as_json) as progress:
         source = source_of(data, signal_map, repair)
-        trained = train_twin(source, experiment, folder, progress, workers, start)
+        trained = train_twin(source, experiment, folder, progress, divided, start)
     seconds = trained.bundle.provenance.seconds or 0.0
     verdict = twin_verdict(trained.scores)
     facts = {

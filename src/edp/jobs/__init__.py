@@ -1,11 +1,10 @@
-"""Executors of jobs, one per file: this process, a pool of local processes, or a Ray cluster.
+"""Work divided among processes of this machine or the nodes of a Ray cluster.
 
-`edp search` submits trainings, commands over a fleet submit units of work (`edp.jobs.units`).
+Commands map a function over units of work (`edp.jobs.workers`); `edp search` submits trainings to an executor.
 """
 
-from edp.jobs.base import EXECUTORS as EXECUTORS
 from edp.jobs.base import Executor as Executor
-from edp.jobs.base import Workforce as Workforce
 from edp.jobs.cluster import RayPool as RayPool
-from edp.jobs.in_process import InProcess as InProcess
 from edp.jobs.processes import LocalPool as LocalPool
+from edp.jobs.workers import IN_PROCESS as IN_PROCESS
+from edp.jobs.workers import Workers as Workers

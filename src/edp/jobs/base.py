@@ -1,20 +1,14 @@
-"""What runs jobs: jobs in, typed ends out. This process, a pool and a cluster answer to the same three calls.
-
-An executor is one file and one registration in `EXECUTORS`; a `Workforce` says which one is asked for.
-"""
+"""Jobs and executors: a pool of this machine and a cluster answer to the same calls, and every job ends in a record."""
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self
 
 from edp.errors import ConfigError, count_of
-from edp.registry import Registry
-from edp.settings.bounds import MOST_THREADS, check_bounds, integer
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus
-from edp.storage.portable import cores
 
 START = "start"
 # Two restarts tell bad luck from a fault of the training itself.
@@ -91,60 +85,6 @@ class Executor(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class Workforce:
-    """Who does the work of a command.
-
-    Attributes:
-        workers: processes of this machine, 1 for this process alone, 0 for one to each core over `threads`.
-        threads: of each job; another number may give other bits.
-        cluster: address of a Ray cluster that does the work instead; empty for this machine.
-        open_cluster: take a cluster without a token at an address that other computers may reach.
-
-    Raises:
-        ConfigError: a number out of range, or workers of this machine and a cluster.
-    """
-
-    workers: int = 1
-    threads: int = 1
-    cluster: str = ""
-    open_cluster: bool = False
-
-    def __post_init__(self) -> None:
-        check_bounds("workers", self, workers=integer(0, MOST_THREADS), threads=integer(1, MOST_THREADS))
-        if self.cluster and self.workers > 1:
-            raise ConfigError(
-                f"workers = {self.workers} and the cluster '{self.cluster}' came; a cluster has its own number of "
-                "workers, as many as its cores hold: give one of the two"
-            )
-
-    @property
-    def count(self) -> int:
-        """Processes of this machine."""
-        return self.workers or max(1, cores() // self.threads)
-
-    @property
-    def kind(self) -> str:
-        """Name of the executor."""
-        return "ray" if self.cluster else "processes" if self.count > 1 else "local"
-
-    @property
-    def alone(self) -> bool:
-        """Whether this process does everything."""
-        return self.kind == "local"
-
-    def open(self) -> Executor:
-        """The executor; to be closed, best by a ``with`` block.
-
-        Raises:
-            ConfigError: it cannot be had, such as a cluster that does not answer, is open, or has other versions.
-        """
-        return EXECUTORS[self.kind](self)
-
-
-EXECUTORS: Registry[Callable[[Workforce], Executor]] = Registry("executor")
-
-
 class ClosedAtExit:
     """What all executors do at the end of a ``with`` block: they stop everything."""
 
@@ -172,46 +112,75 @@ def refuse_twice(job: Job, under_way: Mapping[str, Any]) -> None:
         raise ConfigError(f"training {job.key} was submitted twice; wait for it, equal trainings give equal results")
 
 
-def complete(
-    ledger: Ledger, executor: Executor, jobs: Iterable[Job], on_record: Callable[[Record, bool], None] | None = None
-) -> dict[str, Record]:
-    """The records of all jobs by key, in the order of the jobs: what the ledger holds is not done again.
+@dataclass(frozen=True)
+class JobEnd:
+    """End of a job, and whether the job was done now or by an earlier command."""
+
+    record: Record
+    is_new: bool
+
+
+def iterate_ends(
+    ledger: Ledger, executor: Executor, jobs: Iterable[Job], wake_s: float | None = None
+) -> Iterator[JobEnd | None]:
+    """Yield the end of every job: of what the ledger holds first, of the others as soon as they end.
 
     Args:
-        ledger: of the study; each training is on disk before `on_record` hears of it.
+        ledger: of the study; each record is on disk before it is yielded.
         executor: does what the ledger does not hold; jobs of others that it runs must not come back meanwhile.
         jobs: equal ones are done once.
-        on_record: called with each record and whether it was trained now.
+        wake_s: interval after which None is yielded while jobs are under way; None: never.
 
     Raises:
         StorageError: a record could not be written; what ran is stopped, and what was entered stays.
     """
-    tell = on_record or (lambda record, trained: None)
     # Equal jobs share a key and are trained once.
     jobs_by_key = {job.key: job for job in jobs}
-    records: dict[str, Record] = {}
     waiting: set[str] = set()
     try:
         for key, job in jobs_by_key.items():
             finished_record = ledger.finished(key)
-            if finished_record is not None:
-                records[key] = finished_record
-                tell(finished_record, False)
-            else:
+            if finished_record is None:
                 executor.submit(replace(job, folder=str(ledger.path)))
                 waiting.add(key)
+            else:
+                yield JobEnd(finished_record, False)
         while waiting:
             # Everything is submitted before the first wait, so that no worker is idle while others train.
-            record = executor.wait_any()
+            record = executor.wait_any(wake_s)
             if record is None:
-                raise RuntimeError(f"the executor gave up {count_of(len(waiting), 'training')} without a word")
+                if wake_s is None or not executor.running():
+                    raise RuntimeError(f"the executor gave up {count_of(len(waiting), 'training')} without a word")
+                yield None
+                continue
             waiting.discard(record.key)
             # Into the ledger before anybody hears of it: what was told must survive a kill.
             ledger.put(record)
-            records[record.key] = record
-            tell(record, True)
+            yield JobEnd(record, True)
     finally:
         # An exception or an interrupt must not leave trainings running that nobody waits for.
         for key in waiting:
             executor.cancel(key)
-    return {key: records[key] for key in jobs_by_key}
+
+
+def complete(
+    ledger: Ledger, executor: Executor, jobs: Sequence[Job], on_record: Callable[[Record, bool], None] | None = None
+) -> dict[str, Record]:
+    """Return the records of all jobs by key, in the order of the jobs.
+
+    Args:
+        ledger: see `iterate_ends`.
+        executor: see `iterate_ends`.
+        jobs: see `iterate_ends`.
+        on_record: called with each record and whether it was trained now.
+
+    Raises:
+        StorageError: see `iterate_ends`.
+    """
+    records: dict[str, Record] = {}
+    for end in iterate_ends(ledger, executor, jobs):
+        if end is not None:
+            records[end.record.key] = end.record
+            if on_record is not None:
+                on_record(end.record, end.is_new)
+    return {job.key: records[job.key] for job in jobs}

@@ -17,13 +17,10 @@ from typing import Any
 
 from edp.errors import ConfigError, LostError
 from edp.jobs.base import (
-    EXECUTORS,
     RETRIES,
     START,
     ClosedAtExit,
-    Executor,
     Job,
-    Workforce,
     ended,
     refuse_twice,
 )
@@ -178,12 +175,6 @@ class RayPool(ClosedAtExit):
                 raise ConfigError(f"node {name} has other code or versions: {differences}; install the same there")
         if not answered:
             raise ConfigError("no node of the cluster answers; start one, then give the same command again")
-
-
-@EXECUTORS.register("ray")
-def on_a_cluster(workforce: Workforce) -> Executor:
-    """The nodes of a Ray cluster."""
-    return RayPool(workforce.cluster, workforce.threads, open_cluster=workforce.open_cluster)
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ make nothing else.
 
 from __future__ import annotations
 
+import enum
 import functools
 import json
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -28,8 +29,8 @@ TREE, KIND, VALUE = "tree", "of", "is"
 MOST_DEPTH = 40
 
 
-def packed(value: Any) -> bytes:
-    """A value as bytes: plain values, tuples, arrays of numbers, and frozen dataclasses of these.
+def pack(value: Any) -> bytes:
+    """Return a value as bytes: plain values, tuples, enums, arrays of numbers, and frozen dataclasses of these.
 
     Raises:
         TypeError: anything else.
@@ -42,13 +43,17 @@ def packed(value: Any) -> bytes:
 def _apart(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
+    if isinstance(value, enum.Enum):
+        return {KIND: type(value).__name__, VALUE: value.value}
     if value is None or isinstance(value, bool | int | str):
         return str(value) if isinstance(value, str) else value
     if isinstance(value, float):
         return value if np.isfinite(value) else {KIND: "float", VALUE: str(value)}
     if isinstance(value, np.ndarray):
-        arrays[str(len(arrays))] = np.array(value, order="C")
-        return {KIND: "array", VALUE: len(arrays) - 1}
+        # Sums over an array follow its order in memory, so that the order is a part of the value.
+        is_fortran = value.flags.f_contiguous and not value.flags.c_contiguous
+        arrays[str(len(arrays))] = np.array(value.T if is_fortran else value, order="C")
+        return {KIND: "fortran array" if is_fortran else "array", VALUE: len(arrays) - 1}
     if isinstance(value, Path):
         return {KIND: "path", VALUE: str(value)}
     if isinstance(value, list):
@@ -63,12 +68,13 @@ def _apart(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be packed")
 
 
-def unpacked(data: bytes, kind: type[T]) -> T:
-    """The value of a class that `packed` made bytes of.
+def unpack(data: bytes, kind: type[T], also: Iterable[type] = ()) -> T:
+    """Return the value of a class that `pack` made bytes of.
 
     Args:
         data: the bytes.
         kind: class of the value; only it and the dataclasses that its fields name are built.
+        also: further dataclasses that are built, such as those of a registry.
 
     Raises:
         DataError: damaged, or of another class.
@@ -76,7 +82,8 @@ def unpacked(data: bytes, kind: type[T]) -> T:
     try:
         tensors = load(data)
         tree = json.loads(tensors.pop(TREE).tobytes())
-        value = _together(tree, tensors, classes_in(cast(type, kind)), 0)
+        classes = {**classes_in(cast(type, kind)), **{one.__name__: one for one in also}}
+        value = _together(tree, tensors, classes, 0)
     except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError) as error:
         raise DataError(f"the result of a unit of work is damaged: {error}; give the same command again") from error
     if not isinstance(value, kind):
@@ -98,6 +105,8 @@ def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str,
         return Path(value)
     if kind == "array":
         return tensors[str(value)]
+    if kind == "fortran array":
+        return tensors[str(value)].T
     if kind == "tuple":
         return tuple(
             _together(part, tensors, classes, depth + 1) if isinstance(part, _NESTED) else part for part in value
@@ -106,6 +115,8 @@ def _together(tree: Any, tensors: dict[str, NDArray[Any]], classes: Mapping[str,
         # Two levels: a pair, and what is in it.
         pairs = [[_together(part, tensors, classes, depth + 2) for part in pair] for pair in value]
         return dict(pairs)
+    if issubclass(classes[kind], enum.Enum):
+        return classes[kind](value)
     # Plain values, most of all, are not handed down.
     return classes[kind](
         **{
@@ -123,7 +134,9 @@ def classes_in(kind: type) -> Mapping[str, type]:
     waiting: list[Any] = [kind]
     while waiting:
         one = waiting.pop()
-        if isinstance(one, type) and is_dataclass(one) and one.__name__ not in classes:
+        if isinstance(one, type) and issubclass(one, enum.Enum):
+            classes[one.__name__] = one
+        elif isinstance(one, type) and is_dataclass(one) and one.__name__ not in classes:
             classes[one.__name__] = one
             waiting += list(typing.get_type_hints(one).values())
         elif isinstance(one, types.UnionType) or typing.get_origin(one) is not None:

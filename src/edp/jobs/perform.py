@@ -52,7 +52,7 @@ def perform(
             before = known(folder, identity.key)
             if before is not None:
                 return before
-        record, state = _end_of(identity, where, begun)
+        record, state = call(identity, where, begun)
         if folder is not None:
             try:
                 if state is not None:  # first: a record without it would have its successor begin anew
@@ -76,11 +76,23 @@ def _claimed(folder: str, key: str) -> Any:
             time.sleep(0.05)
 
 
-def _end_of(
-    identity: TrainingIdentity, where: Mapping[str, Any], begun: Callable[[], None]
+def call(
+    identity: TrainingIdentity, where: Mapping[str, Any], begun: Callable[[], None], is_raising: bool = False
 ) -> tuple[Record, bytes | None]:
+    """Call the function of a job.
+
+    Args:
+        identity: see `perform`.
+        where: see `perform`.
+        begun: see `perform`.
+        is_raising: raise what the function raises, in place of a record of it.
+
+    Returns:
+        The record, and the state that the function returned.
+    """
     started = time.monotonic()
-    status, result, message, trace, state = TrainingStatus.DONE, None, "", "", None
+    status, result, state = TrainingStatus.DONE, None, None
+    message = trace = error_type = ""
     try:
         function = resolve(identity.job)
         begun()
@@ -93,21 +105,26 @@ def _end_of(
         # A result that is no plain JSON fails here, by name, and not in the ledger.
         canonical(result)
         state = returned.state if isinstance(returned, WithState) else None
-    except NotFiniteError as error:
-        status, result, message = TrainingStatus.DIVERGED, None, str(error)
-    except EdpError as error:
-        status, result, message = TrainingStatus.FAILED, None, str(error)
     # `SystemExit` too: a library that ends the process would look like a lost training.
     except (Exception, SystemExit) as error:
-        status = TrainingStatus.OOM if _out_of_memory(error) else TrainingStatus.FAILED
-        result, message, trace = None, f"{type(error).__name__}: {error}", traceback.format_exc()[-SHOWN_TRACE:]
+        if is_raising:
+            raise
+        result, message, error_type = None, str(error), f"{type(error).__module__}:{type(error).__qualname__}"
+        if isinstance(error, NotFiniteError):
+            status = TrainingStatus.DIVERGED
+        elif isinstance(error, EdpError):
+            status = TrainingStatus.FAILED
+        else:
+            status = TrainingStatus.OOM if _out_of_memory(error) else TrainingStatus.FAILED
+            message, trace = f"{type(error).__name__}: {error}", traceback.format_exc()[-SHOWN_TRACE:]
     measured: dict[str, Any] = {
         "seconds": time.monotonic() - started,
         "peak_mb": peak_mb(),
         "host": platform.node(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
-    record = Record(identity, status, result, message, measured | ({"trace": trace} if trace else {}))
+    measured |= {name: text for name, text in (("trace", trace), ("error", error_type)) if text}
+    record = Record(identity, status, result, message, measured)
     return record, state
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -23,12 +24,9 @@ from typing import IO, Any
 
 from edp.errors import ConfigError
 from edp.jobs.base import (
-    EXECUTORS,
     RETRIES,
     ClosedAtExit,
-    Executor,
     Job,
-    Workforce,
     ended,
     refuse_twice,
 )
@@ -85,7 +83,8 @@ class _Worker:
         self.deadline = float("inf")
 
     def give(self, turn: _Turn) -> None:
-        self.connection.send((turn.job.identity, dict(turn.job.where), turn.job.folder))
+        # As bytes: `Connection.send` hands out tensors through sockets, which other processes cannot open.
+        self.connection.send_bytes(pickle.dumps((turn.job.identity, dict(turn.job.where), turn.job.folder)))
         self.turn, self.begun, self.deadline = turn, False, time.monotonic() + START_S
 
     def now(self) -> _Turn:
@@ -285,9 +284,3 @@ class LocalPool(ClosedAtExit):
         """End a busy worker; another one takes its place when there is something to do."""
         del self._busy[worker.now().job.key]
         worker.end()
-
-
-@EXECUTORS.register("processes")
-def in_processes(workforce: Workforce) -> Executor:
-    """Processes of this machine."""
-    return LocalPool(workforce.count, workforce.threads)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import queue
 import sys
 import threading
@@ -25,7 +26,7 @@ def serve(connection: Connection) -> None:
     def listen() -> None:
         with contextlib.suppress(EOFError, OSError):
             while True:
-                jobs.put(connection.recv())
+                jobs.put(pickle.loads(connection.recv_bytes()))
         os._exit(1)  # in the middle of a training, too: nobody waits for it
 
     threading.Thread(target=listen, daemon=True).start()

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from edp.errors import ConfigError, DataError
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import WorkUnit
 from edp.logs.buckets import BucketReader, RemoteFile, bucket_address
 from edp.logs.detect import known_suffixes
 from edp.logs.drawn import checked_hours, drawn_recordings, findings_of_part
 from edp.logs.quality.checks import Finding
 from edp.logs.quality.cross_recording import DataQuality, compare
 from edp.logs.quality.inspection import look_into, unreadable
-from edp.logs.quality.quality import inspect
-from edp.logs.quality.sketches import Sketches, sketch
+from edp.logs.quality.quality import QualityReport, inspect
+from edp.logs.quality.sketches import Sketch, Sketches, sketch
 from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair
 from edp.logs.store.building import StoredLog, build_store
@@ -31,7 +36,8 @@ from edp.recording import MACHINE, Recording
 from edp.settings.provenance import DataOrigin
 from edp.settings.tree import Table, build, plain_tree, read_toml
 from edp.signals import SignalMap
-from edp.storage.paths import full_path, is_file_at
+from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path, is_file_at, is_there, status_of
 from edp.wording import setting_text, typed
 
 
@@ -65,6 +71,10 @@ class DataSetSettings:
     repair: Repair = field(default_factory=Repair)
 
 
+STORED_UNITS = 64
+"""Units that the recordings of a store are divided into, about: opening a store takes longer the more it holds."""
+UNIT_BYTES = 4 * 2**20
+"""Of the logs of a unit, about a second of work: a unit takes hundredths of one to hand out and to take back."""
 _LONGEST_STEM = 120
 """Characters of a log's name in the name of a folder; file systems allow 255 bytes."""
 
@@ -209,42 +219,39 @@ class DataSource:
         _check_listed(recordings, self.path)
         return recordings
 
-    def inspect(self, progress: Progress = SILENT) -> DataQuality:
-        """Inspect each log and find repeated sessions. Nothing is repaired or refused.
+    def inspect(self, progress: Progress = SILENT, workers: Workers = IN_PROCESS) -> DataQuality:
+        """Report what is in each log, what is wrong with it, and which logs repeat each other; nothing is repaired.
 
         Args:
-            progress: receiver of the progress; its units are logs.
+            progress: receiver of the progress; its units are logs, or recordings of a store.
+            workers: who looks into the logs; nodes see logs or store under the same paths.
 
         Raises:
             DataError: none of the files can be read at all; where some can, each of the others has an error.
         """
         if self.stored:
-            return self._inspect_store(progress)
+            return self._inspect_store(progress, workers)
         self._refuse_bucket_and_sample()
         logs = self.logs()
-        reports, sketches, sketched = [], Sketches(), []
-        broken: list[DataError] = []
-        reading = progress.stage("log", len(logs))
-        for i, log in enumerate(logs):
-            reading.step(i)
-            reading.note(log.path.name)
-            try:
-                report, one = look_into(log.path, log.signal_map, log.name, log.rows, log.repair)
-            except DataError as error:
-                broken.append(error)
-                report, one = unreadable(log.path, error), None
-            reports.append(report)
-            if one is not None:
-                sketches.add(one)
-                sketched.append(i)
+        reports, sketches, sketched, broken = list[QualityReport](), Sketches(), list[int](), list[str]()
+        looking = progress.stage("log", len(logs))
+        looking.step(0)
+        for result in workers.map_in_order(_units_of_logs(logs), looking):
+            part = unpack(result.content or b"", LogInspections)
+            broken += [why for why in part.broken if why]
+            for report, one in zip(part.reports, part.sketches, strict=True):
+                if one is not None:
+                    sketches.add(one)
+                    sketched.append(len(reports))
+                reports.append(report)
         if broken and len(broken) == len(logs):
-            raise broken[0]
+            raise DataError(broken[0])
         # Before they are compared: a finding on two recordings must tell which is which.
         names = unique_names([report.name for report in reports], [log.path for log in logs])
         sketches.all = [replace(one, name=names[i]) for one, i in zip(sketches.all, sketched, strict=True)]
         return compare([replace(report, name=name) for report, name in zip(reports, names)], sketches)
 
-    def store(self, folder: str | Path, workers: int = 1, progress: Progress = SILENT) -> StoreIndex:
+    def store(self, folder: str | Path, workers: Workers = IN_PROCESS, progress: Progress = SILENT) -> StoreIndex:
         """Read the logs into a store; see `edp.logs.store.build_store`."""
         if self.stored:
             raise ConfigError(f"'{self.path}' is a store already; give the logs that it is to be built from")
@@ -253,33 +260,63 @@ class DataSource:
                 f"--out {bucket_address(folder)}: a store is built on this machine; build it in a folder, then copy "
                 "that with the tool of your service"
             )
-        stored = [
-            StoredLog(
-                log.path,
-                log.signal_map or SignalMap(),
-                log.repair or Repair(),
-                log.name,
-                log.rows,
-                log.machine,
-                log.remote,
-            )
-            for log in self.logs()
-        ]
+        stored = [log.stored for log in self.logs()]
+        if workers.cluster:
+            self.check_local()
+            # Nodes work in another folder than this command.
+            stored = [replace(log, path=full_path(log.path)) for log in stored]
         return build_store(stored, folder, workers, progress)
 
-    def _inspect_store(self, progress: Progress) -> DataQuality:
-        recordings = self.read()
-        reports, sketches = [], Sketches()
-        reading = progress.stage("recording", len(recordings))
-        for i, recording in enumerate(recordings):
-            reading.step(i)
-            reading.note(recording.name)
-            reports.append(inspect(recording))
-            sketches.add(sketch(recording))
-        return compare(reports, sketches, self.drawn_findings(recordings))
+    def check_local(self) -> None:
+        """Refuse logs in a bucket, which the nodes of a cluster do not read.
 
-    def drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
-        """Return the inspection finding that states which part of the store was used."""
+        Raises:
+            ConfigError: a log is not on this machine.
+        """
+        for log in self.logs():
+            if log.remote is not None:
+                raise ConfigError(f"'{log.path}' lies in a bucket, whose logs one computer reads; leave --cluster out")
+
+    def visible_to(self, workers: Workers) -> DataSource:
+        """Return the source for units of these workers: nodes of a cluster work in another folder than this command."""
+        if not workers.cluster or self.address:
+            return self
+        return replace(self, path=full_path(self.path), more=tuple(map(full_path, self.more)))
+
+    def content_key(self) -> str:
+        """Return what identifies the data without reading them: hashes of a store, sizes and times of logs."""
+        keys = [entry.digest for entry in read_index(self.store_folder()).recordings] if self.stored else []
+        return " ".join([*keys, *(log.stored.key for log in self.logs())])
+
+    def _inspect_store(self, progress: Progress, workers: Workers) -> DataQuality:
+        recordings = self.read()
+        reports, sketches = list[QualityReport](), Sketches()
+        looking = progress.stage("recording", len(recordings))
+        for result in workers.map_in_order(self._units_of_store(recordings, workers.are_alone), looking):
+            part = unpack(result.content or b"", LogInspections)
+            reports += part.reports
+            for one in part.sketches:
+                if one is not None:
+                    sketches.add(one)
+        return compare(reports, sketches, self._drawn_findings(recordings))
+
+    def _units_of_store(self, recordings: Sequence[Recording], are_at_hand: bool) -> list[WorkUnit]:
+        """Parts of the recordings of a store; recordings at hand are not read again."""
+        folder = self.store_folder()
+        # What decides all of them: a stretch is drawn by how many recordings there are, and how long.
+        digests = "\n".join(entry.digest for entry in read_index(folder).recordings)
+        digest = hashlib.blake2b(digests.encode(), digest_size=16).hexdigest()
+        each = 1 if are_at_hand else max(1, -(-len(recordings) // STORED_UNITS))
+        units = []
+        for first in range(0, len(recordings), each):
+            part = recordings[first : first + each]
+            arguments = {"first": first, "count": len(part), "at_most_h": self.at_most_h}
+            where = {"recordings": part} if are_at_hand else {"store": str(full_path(folder))}
+            units.append(WorkUnit(f"{__name__}:inspect_stored", part[0].name, arguments, digest, where, len(part)))
+        return units
+
+    def _drawn_findings(self, recordings: Sequence[Recording]) -> tuple[Finding, ...]:
+        """What an inspection says where these recordings are only a part of the store."""
         whole = self.at_most_h is None
         return () if whole else findings_of_part(recordings, read_index(self.store_folder()).hours())
 
@@ -322,6 +359,12 @@ class Log:
     rows: tuple[int, int] | None = None
     machine: str = ""
     remote: RemoteFile | None = None
+
+    @property
+    def stored(self) -> StoredLog:
+        """The log as a store takes it."""
+        signal_map, repair = self.signal_map or SignalMap(), self.repair or Repair()
+        return StoredLog(self.path, signal_map, repair, self.name, self.rows, self.machine, self.remote)
 
     def read(self) -> Recording:
         """Read and return the recording."""
@@ -455,3 +498,63 @@ def read_with_truth(source: DataSource) -> Recording:
     rows = min(recording.samples, truth.samples)
     values = np.concatenate((recording.values[:rows], truth.select([c.name for c in new])[:rows]), axis=1)
     return replace(recording, channels=(*recording.channels, *new), values=values)
+
+
+@dataclass(frozen=True)
+class LogInspections:
+    """Result of the inspection of some logs or recordings: reports, sketches, and why a log cannot be read at all."""
+
+    reports: tuple[QualityReport, ...]
+    sketches: tuple[Sketch | None, ...]
+    broken: tuple[str, ...] = ()
+
+
+def _units_of_logs(logs: Sequence[Log]) -> list[WorkUnit]:
+    """Logs in parts of like size."""
+    parts: list[list[Log]] = []
+    room = 0
+    for log in logs:
+        if room <= 0:
+            parts.append([])
+            room = UNIT_BYTES
+        parts[-1].append(log)
+        room -= status_of(log.path).st_size if is_file_at(log.path) else 0
+    units = []
+    for part in parts:
+        stored = [log.stored for log in part]
+        arguments = {"logs": [log.key for log in stored], "unmapped": [log.signal_map is None for log in part]}
+        where = {"logs": tuple(part), "paths": [str(full_path(log.path)) for log in part]}
+        units.append(WorkUnit(f"{__name__}:inspect_logs", part[0].path.name, arguments, "", where, len(part)))
+    return units
+
+
+def inspect_logs(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Inspect the logs of a unit."""
+    reports, sketches, broken = [], [], []
+    for log, full in zip(where["logs"], where["paths"], strict=True):
+        # The path as it was given stands in messages; where it leads nowhere on this node, the resolved one is read.
+        path = log.path if is_there(log.path) else Path(full)
+        try:
+            report, one = look_into(path, log.signal_map, log.name, log.rows, log.repair)
+            broken.append("")
+        except DataError as error:
+            report, one = unreadable(log.path, error), None
+            broken.append(str(error))
+        reports.append(report)
+        sketches.append(one)
+    return WithState({}, pack(LogInspections(tuple(reports), tuple(sketches), tuple(broken))))
+
+
+def inspect_stored(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Inspect the recordings of a unit, a part of a store."""
+    config, part = identity.config, where.get("recordings")
+    if part is None:
+        opened = _open_store(where["store"], identity.data, config["at_most_h"])
+        part = opened[config["first"] :][: config["count"]]
+    return WithState({}, pack(LogInspections(tuple(map(inspect, part)), tuple(map(sketch, part)))))
+
+
+@lru_cache(maxsize=1)
+def _open_store(store: str, digest: str, at_most_h: float | None) -> list[Recording]:
+    """Return the recordings of a store, opened once for all units of a process; `digest` is that of its content."""
+    return DataSource(Path(store), at_most_h=at_most_h).read()

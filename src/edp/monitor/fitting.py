@@ -15,7 +15,7 @@ from edp.monitor.chain import MonitorChain
 from edp.monitor.conditioning import Conditioning, check_blocks, fit_conditioning
 from edp.monitor.detectors.cusum import CusumSpec
 from edp.monitor.detectors.separate_cusums import SeparateCusumsSpec
-from edp.monitor.residuals.base import ResidualSource, SideBySide, sisters_of
+from edp.monitor.residuals.base import ONE_BY_ONE, ResidualSource, SideBySide, sisters_of
 from edp.monitor.session_blocks import (
     BlocksJob,
     SessionBlocks,
@@ -120,7 +120,7 @@ def fit_chain(
     sessions: Sequence[Recording],
     promised_hours: float,
     progress: Progress = SILENT,
-    side_by_side: SideBySide = map,
+    side_by_side: SideBySide = ONE_BY_ONE,
 ) -> FittedChain:
     """Fit all behind the residuals.
 
@@ -212,7 +212,7 @@ def fit_from_blocks(
     settle: int,
     promised_hours: float,
     progress: Progress = SILENT,
-    side_by_side: SideBySide = map,
+    side_by_side: SideBySide = ONE_BY_ONE,
 ) -> FittedChain:
     """Fit a chain like `fit_chain`, given the blocks of the sessions."""
     progress.note("conditioning, views and limit")
@@ -222,10 +222,10 @@ def fit_from_blocks(
     folds = min(spec.folds, len(remaining))
     jobs = [_Part(spec, remaining, drift, blocks_per_s, settle, fold, folds) for fold in (NO_FOLD, *range(folds))]
     white: list[Array] = [np.zeros(0)] * len(remaining)
-    for job, (own_conditioning, own, rows) in zip(jobs, side_by_side(_fit_part, jobs), strict=True):
+    for job, fitted in zip(jobs, side_by_side(fit_part, jobs), strict=True):
         if job.fold == NO_FOLD:
-            conditioning, watches = own_conditioning, own
-        for index, part in zip(job.left_out, rows, strict=True):
+            conditioning, watches = fitted.conditioning, fitted.watches
+        for index, part in zip(job.left_out, fitted.rows, strict=True):
             white[index] = _as_wide(part, [watch.directions for watch in watches])
     # On sessions that a view was not fitted to: on its own ones one of many directions looks far too calm.
     bank = BankSpec(scaled_alike(spec.watches, watches, white))
@@ -275,8 +275,17 @@ class _Part:
         return _left_out(self.fold, len(self.sessions), self.folds)
 
 
-def _fit_part(job: _Part) -> tuple[Conditioning, list[Watch], list[list[Array]]]:
-    """Fit conditioning and views, and return the rows of each view for the left-out sessions."""
+@dataclass(frozen=True, eq=False)
+class FittedPart:
+    """Conditioning, views, and the rows of each view for each session that they were not fitted to."""
+
+    conditioning: Conditioning
+    watches: tuple[Watch, ...]
+    rows: tuple[tuple[Array, ...], ...]
+
+
+def fit_part(job: _Part) -> FittedPart:
+    """Fit conditioning and views."""
     out = set(job.left_out)
     others = [session for index, session in enumerate(job.sessions) if index not in out]
     conditioning = _conditioning(job.spec, others, job.settle)
@@ -286,8 +295,8 @@ def _fit_part(job: _Part) -> tuple[Conditioning, list[Watch], list[list[Array]]]
     for index in job.left_out:
         # The start of a session is operating time: its rows are missing, and count as healthy.
         clipped, gross = _conditioned(conditioning, job.drift, job.sessions[index], job.settle)
-        rows.append([watch(gross if watch.own else clipped) for watch in watches])
-    return conditioning, watches, rows
+        rows.append(tuple(watch(gross if watch.own else clipped) for watch in watches))
+    return FittedPart(conditioning, tuple(watches), tuple(rows))
 
 
 def _quiet(bank: BankSpec, sessions: Sequence[Array]) -> float:
@@ -328,7 +337,7 @@ def doubtful_sessions(
     sources: Sequence[ResidualSource],
     channels: Sequence[Channel],
     sessions: Sequence[Recording],
-    side_by_side: SideBySide = map,
+    side_by_side: SideBySide = ONE_BY_ONE,
 ) -> tuple[str, ...]:
     """Return names of other sessions, such as training sessions, whose means are far from the fitted sessions."""
     chain = fitted.chain

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Mapping
@@ -64,9 +65,9 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
     for index, source in enumerate(monitor.sources):
         parts = source.parts()
         arrays |= {f"source.{index}.{name}": values for name, values in parts.arrays.items()}
-        networks = {name: _write_network(path, bundle) for name, bundle in parts.bundles.items()}
+        networks = {name: write_network(path, bundle) for name, bundle in parts.bundles.items()}
         written |= {entry["folder"] for entry in networks.values()}
-        sources.append({"kind": _kind_of(source), "plain": dict(parts.plain), "networks": networks})
+        sources.append({"kind": kind_of(source), "plain": dict(parts.plain), "networks": networks})
     entry = write_arrays(path, "monitor", save_arrays({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
     facts = asdict(monitor.limit)
     # JSON has no infinity; null says that no false alarm was counted.
@@ -94,14 +95,16 @@ def save_monitor(monitor: Monitor, folder: str | Path) -> Path:
     return path
 
 
-def _kind_of(source: ResidualSource) -> str:
+def kind_of(source: ResidualSource) -> str:
+    """Return the name of a source in the registry of residuals."""
     return next(name for name, spec in RESIDUALS.items() if spec.source is type(source))
 
 
-def _write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
-    """Write a network next to the header, into a folder named by its own header."""
+def write_network(path: Path, bundle: Bundle | TwinBundle) -> dict[str, str]:
+    """Write a network into a folder that its own header names, and return the entry that finds it."""
     kind = "twin" if isinstance(bundle, TwinBundle) else "bundle"
-    draft = make_folder(path / NETWORKS / f"{kind}-draft")
+    # Several processes may write networks of one monitor.
+    draft = make_folder(path / NETWORKS / f"{kind}-draft{os.getpid()}")
     shutil.rmtree(draft)
     if isinstance(bundle, TwinBundle):
         save_twin(bundle, draft)
@@ -208,13 +211,19 @@ def _sources(entries: Any, arrays: Mapping[str, Any], path: Path) -> tuple[Resid
         networks = object_with(entry["networks"], (), "its networks")
         if len(networks) > MOST_NETWORKS:
             raise ValueError(f"a source has {len(networks)} networks; at most {MOST_NETWORKS} must hold")
-        bundles = {name: _network(path, value) for name, value in networks.items()}
+        bundles = {name: read_network(path, value) for name, value in networks.items()}
         plain = object_with(entry["plain"], (), "a source")
         sources.append(spec.source.of_parts(SourceParts(plain, own, bundles)))
     return tuple(sources)
 
 
-def _network(path: Path, entry: Mapping[str, Any]) -> Bundle | TwinBundle:
+def read_network(path: Path, entry: Mapping[str, Any]) -> Bundle | TwinBundle:
+    """Return the network of an entry.
+
+    Raises:
+        BundleError: the network is missing or damaged.
+        ValueError: an entry that names no network of the monitor.
+    """
     folder = _text(entry["folder"])
     # Never a path out of the monitor.
     if not _FOLDER.fullmatch(folder):

@@ -5,22 +5,25 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from edp import __version__
 from edp.errors import BusyError, ConfigError, EdpError, StorageError, closest
+from edp.jobs import Workers
+from edp.jobs.workers import UNITS, WorkUnit, forget_units
 from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
+from edp.progress import SILENT, Progress
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, MOTOR_CHANNELS, TABLE_A1
 from edp.sim.excitation import EXCITATIONS
-from edp.sim.plan import DataSetSpec, simulate_many
-from edp.sim.predictability import LimitJob, LimitSpec, find_limit, plan_limit
+from edp.sim.plan import DataSetSpec, machine_hash, scenario_of_unit
+from edp.sim.predictability import LimitSpec, find_limit
 from edp.sim.scenario import Scenario, plain
 from edp.sim.scenario_file import read_scenario_file, scenario_changes
+from edp.sim.simulate import simulate
 from edp.storage import (
     check_held,
     check_writable,
@@ -31,12 +34,14 @@ from edp.storage import (
     remove_unfinished,
     write_json,
 )
-from edp.storage.paths import is_entry_at, is_there
+from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import full_path, is_entry_at, is_folder_at, is_there
 from edp.wording import typed
 
 MANIFEST = "data_set.json"
 LIMIT = "limit.json"
 LOCK = ".lock"
+ONE_PER_CORE = Workers(count=0)
 BYTES_PER_VALUE = {".parquet": 3.0, ".csv": 10.0, ".mat": 3.0}
 """Room a logged value takes, rounded up; measured on M22: 1.7, 8.0 and 2.1."""
 
@@ -135,43 +140,26 @@ def suffix_of(form: str) -> str:
     return f".{form.lstrip('.')}"
 
 
-class Simulated(Protocol):
-    """Description of a finished recording, or of the scenario of a skipped one."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def duration_s(self) -> float:
-        """Its length."""
-        ...
-
-
-Elsewhere = Callable[[Sequence[Scenario], Path, Callable[[Simulated], None]], None]
-"""Writes the logs of scenarios into a folder and tells of each that is there."""
-
-
 def simulate_data_set(
     out: str | Path,
     order: SimulationOrder | None = None,
-    workers: int = 0,
-    on_done: Callable[[Simulated, bool], None] | None = None,
-    elsewhere: Elsewhere | None = None,
+    workers: Workers = ONE_PER_CORE,
+    on_done: Callable[[Scenario, bool], None] | None = None,
 ) -> list[Path]:
     """Simulate a data set into a folder, one log per recording. Existing logs of the same order are kept.
+
+    Logs do not depend on who writes them: each scenario carries its own seed.
 
     Args:
         out: folder; it may hold nothing but an earlier part of the same data set.
         order: what to simulate; an hour of machine M22 by default.
-        workers: processes; 0 for one a core.
-        on_done: called with each recording and whether it was there already.
-        elsewhere: writes the logs that are missing, in place of processes of this machine.
+        workers: who simulates; nodes see the folder under the same path.
+        on_done: called with the scenario of each log and whether the log was there already.
 
     Raises:
         BusyError: another process simulates into the folder.
-        StorageError: the folder holds another data set, cannot be written, or its disk has not room enough.
+        StorageError: the folder holds another data set, cannot be written, its disk has not room enough, or nodes do
+            not see it.
         ConfigError: an ending without a format, or a number out of range.
     """
     order = order or SimulationOrder()
@@ -188,28 +176,43 @@ def simulate_data_set(
         if not bound:
             write_json(folder / MANIFEST, identity)
         absent = {scenario.name for scenario in missing}
-        for scenario in plan:
+        for scenario, path in zip(plan, paths, strict=True):
             if on_done is not None and scenario.name not in absent:
-                # Read, so that a damaged one is told; a coordinator of others' work stays light.
-                on_done(
-                    scenario if elsewhere is not None else read_recording(folder / f"{scenario.name}{suffix}"), True
+                # Read, so that a damaged log is reported; the coordinator of a cluster stays light.
+                if not workers.cluster:
+                    read_recording(path)
+                on_done(scenario, True)
+        for index, _ in workers.map([_unit(scenario, folder, order) for scenario in missing]):
+            scenario = missing[index]
+            if not is_there(folder / f"{scenario.name}{suffix}"):
+                raise StorageError(
+                    f"'{scenario.name}' was written on another node, and is not in '{full_path(folder)}' here; give a "
+                    "folder that all nodes see under the same path"
                 )
-
-        def wrote(simulated: Simulated) -> None:
-            check()
             if on_done is not None:
-                on_done(simulated, False)
-
-        if elsewhere is not None:
-            elsewhere(missing, folder, wrote)
-            return paths
-        count = workers or os.cpu_count() or 1
-        for recording in simulate_many(missing, min(count, max(1, len(missing)))):
-            # Before each log: a lock that was taken over means that another process writes here.
+                on_done(scenario, False)
+            # Before the next log: a lock that was taken over means that another process writes here.
             check()
-            write_recording(recording, folder / f"{recording.name}{suffix}", files)
-            wrote(recording)
     return paths
+
+
+def _unit(scenario: Scenario, folder: Path, order: SimulationOrder) -> WorkUnit:
+    arguments = {"scenario": plain(scenario), "suffix": order.suffix, "files": asdict(order.files())}
+    where = {"folder": str(full_path(folder))}
+    label = f"recording '{scenario.name}'"
+    return WorkUnit(f"{__name__}:write_log", label, arguments, machine_hash(scenario), where)
+
+
+def write_log(identity: TrainingIdentity, where: Mapping[str, str]) -> dict[str, str]:
+    """Simulate a recording and write its log, unless the log is there: the folder is bound to one order."""
+    scenario = scenario_of_unit(identity.config["scenario"], identity.data)
+    folder = Path(where["folder"])
+    if not is_folder_at(folder):
+        raise StorageError(f"'{folder}' is not on this node; give a folder that all nodes see under the same path")
+    path = folder / f"{scenario.name}{identity.config['suffix']}"
+    if not is_there(path):
+        write_recording(simulate(scenario), path, WriteOptions(**identity.config["files"]))
+    return {"name": scenario.name}
 
 
 def _bound(folder: Path, identity: dict[str, Any]) -> bool:
@@ -246,8 +249,8 @@ def find_data_set_limit(
     folder: str | Path,
     order: SimulationOrder,
     spec: LimitSpec | None = None,
-    workers: int = 0,
-    on_done: Callable[[int, int], None] | None = None,
+    workers: Workers = ONE_PER_CORE,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Estimate the predictability limit of a simulated data set, and write it to ``limit.json`` next to its logs.
 
@@ -257,8 +260,8 @@ def find_data_set_limit(
         folder: the folder of the data set.
         order: what was simulated into it.
         spec: moments, branches and horizons.
-        workers: processes; 0 for one a core.
-        on_done: called with how many recordings are done, and of how many.
+        workers: who simulates; recordings that are done are not done again after a stop.
+        progress: receiver of the progress; its units are recordings.
 
     Raises:
         ConfigError: the recordings are too short.
@@ -273,16 +276,10 @@ def find_data_set_limit(
         if isinstance(stored_limit, dict) and stored_limit.get("key") == key:
             return stored_limit
     check_writable(target.parent)
-    jobs, done = len(plan_limit(plan, spec)), 0
-
-    def count(job: LimitJob) -> None:
-        nonlocal done
-        done += 1
-        if on_done is not None:
-            on_done(done, jobs)
-
-    limit = find_limit(plan, spec, min(workers or os.cpu_count() or 1, jobs), count) | {"key": key}
+    units = target.parent / UNITS
+    limit = find_limit(plan, spec, workers, progress, units) | {"key": key}
     write_json(target, limit)
+    forget_units(units)
     return limit
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,16 +12,19 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError
+from edp.jobs import Workers
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import WorkUnit
 from edp.recording import Recording
-from edp.sandbox.helpers import Helpers, Job, Result
 from edp.settings.bounds import MIN_MINUTES, above, check_bounds, integer, span
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.faults import FaultSpec, faults_of
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics import soil
-from edp.sim.scenario import LARGEST_STEP_S, START_STROKES, Scenario, SimulationError
+from edp.sim.scenario import LARGEST_STEP_S, START_STROKES, Scenario, plain
 from edp.sim.simulate import simulate
+from edp.storage.ledger import TrainingIdentity, WithState
 
 DEFAULT_MIX: Mapping[str, float] = {
     "isolated": 0.23,
@@ -233,26 +237,45 @@ def simulate_many(
     The recordings do not depend on the number of workers: each scenario carries its own seed.
 
     Raises:
-        SimulationError: a simulation diverged, or a worker process died.
+        SimulationError: a simulation diverged.
+        LostError: a worker process was killed again and again.
     """
-    for recording in ordered(simulate, scenarios, workers):
+    for recording in map(simulate, scenarios) if workers == 1 else _simulate_together(scenarios, workers):
         if on_done is not None:
             on_done(recording)
         yield recording
 
 
-def ordered(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """Yield the result of `function` for each job, computed in `workers` processes, in the order of the jobs.
+def _simulate_together(scenarios: Sequence[Scenario], workers: int) -> Iterator[Recording]:
+    units = [
+        WorkUnit(
+            f"{__name__}:simulate_unit", f"simulation of '{scenario.label}'", plain(scenario), machine_hash(scenario)
+        )
+        for scenario in scenarios
+    ]
+    for result in Workers(count=workers).map_in_order(units):
+        yield unpack(result.content or b"", Recording)
+
+
+def simulate_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Simulate the scenario of a unit and return its recording."""
+    return WithState({}, pack(simulate(scenario_of_unit(identity.config, identity.data))))
+
+
+def scenario_of_unit(values: Mapping[str, Any], expected_hash: str) -> Scenario:
+    """Return the scenario of a unit.
 
     Raises:
-        SimulationError: a worker process died.
+        ConfigError: the machine file differs on this node.
     """
-    with Helpers(min(workers, len(jobs)), _died) as helpers:
-        yield from helpers.ordered(function, jobs)
+    scenario = Scenario(**values)
+    if machine_hash(scenario) != expected_hash:
+        raise ConfigError(
+            f"machine '{scenario.machine}' has other numbers on this node; all nodes must see the same file there"
+        )
+    return scenario
 
 
-def _died(label: str) -> SimulationError:
-    return SimulationError(
-        f"a worker process died while '{label}' was being simulated (out of memory, or stopped from outside; a "
-        "calling script needs `if __name__ == '__main__':`); run again with fewer workers"
-    )
+def machine_hash(scenario: Scenario) -> str:
+    """Return the hash of the parameters of a scenario's machine, which may come from a file."""
+    return hashlib.blake2b(repr(scenario.load()).encode(), digest_size=16).hexdigest()

@@ -10,22 +10,28 @@ given the commands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import WorkUnit
+from edp.progress import SILENT, Progress
 from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, SEED, check_bounds, check_count, integer, shown
 from edp.signals import TABLE_A1
 from edp.sim.machine import layout as at
-from edp.sim.plan import ordered
-from edp.sim.scenario import Scenario
+from edp.sim.plan import machine_hash, scenario_of_unit
+from edp.sim.scenario import Scenario, plain
 from edp.sim.sensors import sensors
 from edp.sim.simulate import Simulation
+from edp.storage.ledger import TrainingIdentity, WithState
 
 Array = NDArray[np.float64]
 TARGETS = tuple(TABLE_A1)[:3]
@@ -195,10 +201,18 @@ def plan_limit(scenarios: Sequence[Scenario], spec: LimitSpec) -> list[LimitJob]
 def find_limit(
     scenarios: Sequence[Scenario],
     spec: LimitSpec | None = None,
-    workers: int = 1,
-    on_done: Callable[[LimitJob], None] | None = None,
+    workers: Workers = IN_PROCESS,
+    progress: Progress = SILENT,
+    folder: Path | None = None,
 ) -> dict[str, Any]:
     """Return the predictability limit of a data set as plain data in mm/s, equal for any number of workers.
+
+    Args:
+        scenarios: of the recordings.
+        spec: moments, branches and horizons.
+        workers: who simulates the branches.
+        progress: receiver of the progress; its units are recordings.
+        folder: of the errors of each recording, so that a stopped call continues; None keeps none.
 
     Returns:
         ``commands_unknown``, ``commands_known`` and ``persistence`` (the present value as the guess, at the same
@@ -212,11 +226,10 @@ def find_limit(
     spec = spec or LimitSpec()
     jobs = plan_limit(scenarios, spec)
     parts = []
-    for job, part in zip(jobs, ordered(branch_recording, jobs, workers), strict=True):
+    for result in workers.map_in_order(list(map(_unit, jobs)), progress.stage("recording", len(jobs)), folder):
+        part = unpack(result.content or b"", np.ndarray)
         # mm/s, as results are stated.
         parts.append(1e3 * np.concatenate((part, part.mean(axis=-1, keepdims=True)), axis=-1))
-        if on_done is not None:
-            on_done(job)
     low, high = _confidence(parts, np.random.default_rng([spec.seed, 2]))
     mean = np.concatenate(parts).mean(axis=0)
     tables = {
@@ -236,6 +249,21 @@ def find_limit(
         "seed": spec.seed,
         **tables,
     }
+
+
+def _unit(job: LimitJob) -> WorkUnit:
+    arguments = {
+        "scenario": plain(job.scenario), "moments": list(job.moments), "spec": asdict(job.spec), "seed": job.seed
+    }  # fmt: skip
+    return WorkUnit(f"{__name__}:branch_unit", f"'{job.label}'", arguments, machine_hash(job.scenario))
+
+
+def branch_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Branch the moments of the recording of a unit."""
+    config = identity.config
+    scenario = scenario_of_unit(config["scenario"], identity.data)
+    spec = LimitSpec(**(config["spec"] | {"horizons": tuple(config["spec"]["horizons"])}))
+    return WithState({}, pack(branch_recording(LimitJob(scenario, tuple(config["moments"]), spec, config["seed"]))))
 
 
 def _confidence(parts: Sequence[Array], rng: np.random.Generator) -> tuple[Array, Array]:

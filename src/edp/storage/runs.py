@@ -14,10 +14,10 @@ from types import TracebackType
 from typing import Any
 
 from edp import __version__
-from edp.errors import BusyError, EdpError, StorageError
+from edp.errors import BusyError, ConfigError, EdpError, StorageError
 from edp.storage.folders import check_kind
 from edp.storage.locks import check_held, held_by, hold
-from edp.storage.paths import entries_of, is_file_at, is_folder_at, is_there
+from edp.storage.paths import entries_of, full_path, is_file_at, is_folder_at, is_there
 from edp.storage.reading import read_object
 from edp.storage.run_kinds import RUN_KINDS, RunKind
 from edp.storage.seals import sealed_line
@@ -269,6 +269,19 @@ def check_claimable(path: str | Path | Run, kind: str) -> None:
     holder = held_by(Path(path) / ".lock")
     if holder is not None:
         raise _busy(Path(path), holder)
+
+
+def check_visible(path: str | Path) -> None:
+    """Refuse a run folder that only the node of a cluster sees that wrote it.
+
+    Raises:
+        ConfigError: the run is not here.
+    """
+    if not is_file_at(Path(path, "config.toml")):
+        raise ConfigError(
+            f"the run was written on another node, and is not in '{full_path(Path(path))}' here; give a folder that "
+            "all nodes see under the same path"
+        )
 
 
 def _busy(path: Path, holder: str) -> BusyError:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.errors import EdpError
+from edp.errors import ConfigError, EdpError
+from edp.jobs.workers import WorkUnit
 from edp.networks.twin import TwinScales
 from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, member_seed
 from edp.networks.twin.static_map import StaticTwin
 from edp.storage import read_object, write_json
-from edp.storage.paths import is_file_at
+from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import PARTS, KeyedRun, Run
 from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
 
@@ -57,16 +59,26 @@ def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], No
         return fit_free_runs(*what, KeyedRun(folder, job.folder[1]), job.trained)
 
 
-def noting_member(job: MemberTraining) -> FittedTwin:
-    """`trained_member` in another process, which notes in the folder of the job how far it is.
+def member_unit(job: MemberTraining) -> WorkUnit:
+    """Return the training of a member, which has a folder, as a unit of work."""
+    path, key = job.folder or (Path(), "")
+    placed = replace(job, folder=(full_path(path), key))
+    arguments = {"folder": str(full_path(path)), "key": key}
+    return WorkUnit(f"{__name__}:train_unit", job.label, arguments, "", {"job": placed})
+
+
+def train_unit(identity: TrainingIdentity, where: Mapping[str, MemberTraining]) -> dict[str, str]:
+    """Train a member into its folder, and note there how far the training is.
 
     Raises:
         EdpError: see `fit_free_runs`.
     """
+    job = where["job"]
     if job.folder is None:
-        return trained_member(job)
+        raise ConfigError(f"{job.label} has no folder to be trained in")
     note = job.folder[0] / NOTE
-    return trained_member(job, lambda event: write_json(note, dict(vars(event))))
+    trained_member(job, lambda event: write_json(note, dict(vars(event))))
+    return {"trained": job.label}
 
 
 def noted_progress(jobs: Sequence[MemberTraining]) -> FreeRunProgress | None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from safetensors.numpy import save
 
-from edp.config.experiment import Experiment, experiment_toml, load_experiment, plain_tree
+from edp.config.experiment import Experiment, build, experiment_toml, load_experiment, plain_tree
 from edp.data.frozen import frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
 from edp.errors import DataError
@@ -20,14 +23,20 @@ from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import (
     Evaluation,
     JudgedModel,
+    JudgedPart,
     JudgeSpec,
     ModelBench,
+    by_effort,
     check_scored,
     first_scored,
     judge,
+    network_parts,
     score_network,
 )
 from edp.evaluation.scores_file import PREDICTIONS, DrawnSample, ModelScores, ScoresFile, earlier_scores
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import UNITS, WorkUnit, forget_units
 from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
@@ -39,7 +48,8 @@ from edp.settings.provenance import Provenance, read_provenance
 from edp.settings.tree import Table
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.headers import digests_of
-from edp.storage.paths import is_folder_at, is_there
+from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path, is_folder_at, is_there
 from edp.storage.provenance import PROVENANCE
 from edp.storage.runs import KeyedRun, Run, check_claimable, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
@@ -53,6 +63,9 @@ from edp.workflows.judged_data import judged_data
 
 if TYPE_CHECKING:
     from edp.sim.data_set import SimulationOrder, simulate_data_set
+
+
+NETWORK = "network"
 
 
 class RecordingSource(Protocol):
@@ -205,10 +218,6 @@ def _provenance(
     return provenance.with_entries(regime=training.chunks.regime, device=training.device)
 
 
-JudgedBy = Callable[[ModelBench, str], Mapping[str, JudgedModel]]
-"""Measures all models on a bench, with the digest of what is judged."""
-
-
 @one_blas_thread()
 def evaluate(
     run: str | Path,
@@ -216,7 +225,7 @@ def evaluate(
     baselines: Sequence[str] | None = None,
     progress: Progress = SILENT,
     minutes: float | None = None,
-    judged_by: JudgedBy | None = None,
+    workers: Workers = IN_PROCESS,
     at_most_h: float | None = None,
 ) -> Path:
     """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
@@ -227,9 +236,10 @@ def evaluate(
         run: run folder.
         source: other recordings. Logs without a map are read with that of the run.
         baselines: names; None takes those of the settings.
-        progress: receiver of the name of each model before it runs.
-        minutes: after which no further baseline is begun; a later call judges it.
-        judged_by: measures all models in place of this process; `minutes` is then not looked at.
+        progress: receiver of the name of each model.
+        minutes: after which no further baseline is begun; a later call judges it. Not for several processes.
+        workers: who runs the models; nodes see run and recordings under the same paths. What a stopped call measured is
+            not measured again.
         at_most_h: judge on evenly spread stretches of so many hours, about, where there are more; None judges on all.
 
     Returns:
@@ -252,12 +262,10 @@ def evaluate(
     key = run_key(how | {"weights": weights_digest(bundle.predictor)}, " ".join(judged))
     scores = earlier_scores(target, key)
     if scores is None:
-        label, seconds = describe(bundle.predictor.spec), provenance.seconds or 0.0
-        if judged_by is None:
-            evaluation = judge(bundle.predictor, data, chosen, label, seconds, progress, minutes)
-        else:
-            bench = ModelBench(bundle.predictor, data, chosen)
-            evaluation = bench.together(judged_by(bench, " ".join(judged)))
+        bench = ModelBench(bundle.predictor, data, chosen)
+        other = json.dumps(None if source is None else source.to_plain(), sort_keys=True)
+        at = EvaluatedRun(str(full_path(folder)), other, at_most_h)
+        evaluation = _evaluate_models(bench, at, " ".join(judged), workers, progress, minutes)
         # Scores that lack a baseline are not kept for a call that asks for all.
         write_bytes(target / PREDICTIONS, save(evaluation.tensors))
         scores = replace(
@@ -267,10 +275,79 @@ def evaluate(
             files=digests_of(target, PREDICTIONS),
         )
         scores.write(target)
+    forget_units(folder / UNITS)
     if source is None:
         note_test_result(folder, scores, _floor_scores(folder, data, scores))
         save_bundle(replace(bundle, scores=dict(scores.models["network"].overall)), folder / "bundle")
     return target
+
+
+@dataclass(frozen=True)
+class EvaluatedRun:
+    """Where a process finds what it evaluates: run folder, other recordings as JSON, and most hours of them."""
+
+    run: str
+    source: str
+    at_most_h: float | None
+
+
+def _evaluate_models(
+    bench: ModelBench, at: EvaluatedRun, digest: str, workers: Workers, progress: Progress, minutes: float | None
+) -> Evaluation:
+    """Evaluate the network in parts, and every baseline, as units of work."""
+    parts = network_parts(bench.data)
+    names = by_effort(bench.spec.baselines)
+    where = {"run": at} | ({"bench": bench} if workers.are_alone else {})
+    folder = Path(at.run)
+    units = [
+        _unit(NETWORK if parts == 1 else f"network, part {part + 1}", {"part": part}, bench.spec, digest, where)
+        for part in range(parts)
+    ] + [_unit(name, {"model": name}, bench.spec, digest, where) for name in names]
+    if not workers.are_alone:
+        # Costly ones first, so that none of them begins last; parts of the network, all alike, fill what is left.
+        units.reverse()
+    measured: dict[int, JudgedPart] = {}
+    judged: dict[str, JudgedModel] = {}
+    began = time.perf_counter()
+    for number, result in workers.map(units, progress.stage("model", len(units)), folder / UNITS):
+        arguments, content = units[number].arguments, result.content or b""
+        if "part" in arguments:
+            measured[arguments["part"]] = unpack(content, JudgedPart)
+        else:
+            judged[arguments["model"]] = unpack(content, JudgedModel)
+        if minutes is not None and len(measured) == parts and time.perf_counter() - began > 60 * minutes:
+            break
+    label, seconds = describe(bench.predictor.spec), read_provenance(folder).seconds or 0.0
+    network = bench.network_of((measured[part] for part in range(parts)), label, seconds)
+    models = {NETWORK: network} | {name: judged[name] for name in names if name in judged}
+    return bench.together(models, [name for name in names if name not in judged])
+
+
+def _unit(
+    label: str, does: Mapping[str, str | int], spec: JudgeSpec, digest: str, where: Mapping[str, Any]
+) -> WorkUnit:
+    return WorkUnit(f"{__name__}:evaluate_unit", label, {**does, "judge": plain_tree(spec)}, digest, where)
+
+
+@one_blas_thread()
+def evaluate_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState:
+    """Evaluate one baseline, or the network of a run on one part."""
+    bench = where.get("bench")
+    if bench is None:
+        bench = _open_bench(where["run"], identity.data, build(JudgeSpec, identity.config["judge"], "of the unit"))
+    if "part" in identity.config:
+        return WithState({}, pack(bench.network_part(identity.config["part"])))
+    return WithState({}, pack(bench.baseline(identity.config["model"])))
+
+
+@lru_cache(maxsize=1)
+def _open_bench(evaluated_run: EvaluatedRun, digest: str, spec: JudgeSpec) -> ModelBench:
+    """Return a run with its data, read once for all units of a process; `digest` is that of the data."""
+    bundle, _, provenance, data = trained_run(Path(evaluated_run.run))
+    other = json.loads(evaluated_run.source)
+    others = other_recordings(None if other is None else DataSource.from_plain(other), provenance)
+    data, _ = judged_data(bundle, data, others, evaluated_run.at_most_h)
+    return ModelBench(bundle.predictor, data, spec)
 
 
 def other_recordings(source: DataSource | None, provenance: Provenance) -> list[Recording] | None:

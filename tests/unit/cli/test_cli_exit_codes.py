@@ -88,10 +88,10 @@ class Methods:
     """Scores of a fine-tuned network with error 1 beside one other method."""
 
     horizons, content = (1,), SimpleNamespace(method="tuned")
-    methods = {"tuned": SimpleNamespace(label="Tuned"), "direct": SimpleNamespace(label="Direct")}
 
     def __init__(self, ratios):
         self.ratios = ratios
+        self.methods = {"tuned": SimpleNamespace(label="Tuned"), "direct": SimpleNamespace(label="Direct")}
 
     def mae(self, name, horizon):
         return 1.0 if name == "tuned" else sum(self.ratios) / len(self.ratios)

@@ -11,6 +11,7 @@ import pytest
 import edp.workflows.identify  # noqa: F401  so that its module is there to be changed
 from edp.config.twin import load_twin_experiment
 from edp.errors import ConfigError
+from edp.jobs import IN_PROCESS
 from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
 from edp.sim.data_set import SimulationOrder, simulate_data_set
@@ -39,7 +40,7 @@ LINKED = [word for change in SMALL if "degree" not in change for word in ("--set
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fronts")
-    simulate_data_set(folder, SimulationOrder(minutes=5.0, recordings=10, seed=1), workers=1)
+    simulate_data_set(folder, SimulationOrder(minutes=5.0, recordings=10, seed=1), workers=IN_PROCESS)
     return folder
 
 

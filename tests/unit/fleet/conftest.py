@@ -2,7 +2,7 @@
 
 import pytest
 
-from edp.jobs import Workforce
+from edp.jobs import IN_PROCESS, Workers
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 
 
@@ -14,11 +14,11 @@ def small_order():
 @pytest.fixture(scope="session")
 def small_logs(small_order, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fleet") / "logs"
-    simulate_data_set(folder, small_order, workers=1)
+    simulate_data_set(folder, small_order, workers=IN_PROCESS)
     return folder
 
 
 @pytest.fixture
 def here():
     """Units in this process: the same path as on a cluster, without its processes."""
-    return Workforce()
+    return Workers()

@@ -10,22 +10,17 @@ from ray_nodes import needs_ray, three_nodes
 
 from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
-from edp.jobs import Workforce, cluster
+from edp.jobs import IN_PROCESS, Workers, cluster
 from edp.logs.source import DataSource
 from edp.logs.store import read_store
 from edp.progress import SilentProgress
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.feature_selection.select import SelectionOrder, select_features
-from edp.workflows.fleet.inspecting import inspect_with
-from edp.workflows.fleet.judging import evaluate_with
-from edp.workflows.fleet.simulating import simulate_with
-from edp.workflows.fleet.storing import store_with
-from edp.workflows.fleet.training import finetune_with, pretrain_with
-from edp.workflows.pretraining import Pretrain
+from edp.workflows.feature_selection.select import Listeners, SelectionOrder, select_features
+from edp.workflows.pretraining import Pretrain, pretrain
 from edp.workflows.train_evaluate import evaluate
-from edp.workflows.transfer import FinetuneRequest, FinetuneSpec
+from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
 SETTINGS = (
     'split.kind="machines"',
@@ -92,48 +87,41 @@ def nodes():
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_every_command_survives_a_killed_node_with_the_results_of_one_process(nodes, tmp_path):
-    there, plug = Workforce(cluster=nodes.address), Plug(nodes)
+    there, plug = Workers(cluster=nodes.address), Plug(nodes)
     one = tmp_path / "one"
-    paths = simulate_data_set(one / "logs", ORDER, workers=1)
-    made = simulate_with(there, tmp_path / "logs", ORDER, plug.pull)
+    paths = simulate_data_set(one / "logs", ORDER, workers=IN_PROCESS)
+    made = simulate_data_set(tmp_path / "logs", ORDER, there, plug.pull)
     assert [path.read_bytes() for path in made] == [path.read_bytes() for path in paths]
     plug.mend()
 
     source = DataSource.of(one / "logs")
-    store_with(there, source, tmp_path / "store", PullingProgress(plug))
-    source.store(one / "store", 1)
+    source.store(tmp_path / "store", there, PullingProgress(plug))
+    source.store(one / "store")
     digests = [[entry.digest for entry in read_store(folder / "store")] for folder in (tmp_path, one)]
     assert digests[0] == digests[1]
     plug.mend()
 
     stored = DataSource.of(one / "store")
-    assert inspect_with(there, stored, None, PullingProgress(plug)).quality == stored.inspect()
+    assert stored.inspect(PullingProgress(plug), there) == stored.inspect()
     plug.mend()
 
-    looked = []
-
-    def inspected(data, progress):
-        looked.append(data)
-        return inspect_with(there, data, None, PullingProgress(plug)).quality
-
     order = SelectionOrder(pictures=False)
-    apart = select_features(stored, tmp_path / "screen", order, inspected=inspected)
+    apart = select_features(stored, tmp_path / "screen", order, Listeners(logs=PullingProgress(plug)), there)
     together = select_features(stored, one / "screen", order)
     assert apart.screening.proposal.kept == together.screening.proposal.kept
-    assert len(looked) == 1
     plug.mend()
 
     experiment = load_experiment(preset="quick", overrides=SETTINGS)
     started = threading.Thread(target=_pull_when, args=(tmp_path / "run" / "config.toml", plug))
     started.start()
-    found = pretrain_with(there, stored, experiment, Pretrain(), tmp_path / "run")
+    found = pretrain(stored, experiment, Pretrain(), tmp_path / "run", workers=there)
     started.join()
-    usual = pretrain_with(Workforce(), stored, experiment, Pretrain(), one / "run")
+    usual = pretrain(stored, experiment, Pretrain(), one / "run")
     assert found == usual
     assert _digest(tmp_path / "run") == _digest(one / "run")
     plug.mend()
 
-    scored = evaluate_with(there, tmp_path / "run", progress=PullingProgress(plug))
+    scored = evaluate(tmp_path / "run", progress=PullingProgress(plug), workers=there)
     evaluate(one / "run")
     assert _scores(scored) == _scores(one / "run")
     plug.mend()
@@ -142,9 +130,9 @@ def test_every_command_survives_a_killed_node_with_the_results_of_one_process(no
     logs = DataSource.of(paths[0])
     started = threading.Thread(target=_pull_when, args=(tmp_path / "tuned" / "config.toml", plug))
     started.start()
-    found = finetune_with(there, tmp_path / "run", logs, tuned, tmp_path / "tuned")
+    found = finetune(tmp_path / "run", logs, tuned, tmp_path / "tuned", workers=there)
     started.join()
-    usual = finetune_with(Workforce(), one / "run", logs, tuned, one / "tuned")
+    usual = finetune(one / "run", logs, tuned, one / "tuned")
     assert json.dumps(found["methods"]) == json.dumps(usual["methods"])
 
 
@@ -170,4 +158,4 @@ def _scores(folder):
 def test_a_node_with_another_version_is_refused_with_one_error(nodes, monkeypatch):
     monkeypatch.setattr(cluster, "code_version", lambda whole: "0.0.9+another")  # here; nodes have their own
     with pytest.raises(ConfigError, match=r"node .* has other code or versions: code .*install the same there"):
-        Workforce(cluster=nodes.address).open()
+        Workers(cluster=nodes.address).open()

@@ -1,26 +1,20 @@
 """Commands in units give what the commands give in one process, to the bit."""
 
 import errno
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from noted_progress import NotedProgress
 
-from edp.data.coverage import Coverage
 from edp.errors import ConfigError, DataError, StorageError
-from edp.jobs import Workforce
-from edp.jobs.units import UnitError
+from edp.jobs import Workers
 from edp.logs import read_data_set
 from edp.logs.source import DataSource
-from edp.logs.store import read_store
+from edp.logs.store import building, read_store
+from edp.sim import data_set, plan
+from edp.sim.data_set import simulate_data_set
 from edp.storage import replacing
-from edp.workflows.covering import coverage
-from edp.workflows.fleet import simulating, storing
-from edp.workflows.fleet.inspecting import CoverageOrder, inspect_with
-from edp.workflows.fleet.simulating import simulate_with
-from edp.workflows.fleet.storing import store_with
 
 
 def test_simulated_logs_are_the_same_and_a_stopped_set_goes_on(small_logs, small_order, here, tmp_path):
@@ -32,10 +26,10 @@ def test_simulated_logs_are_the_same_and_a_stopped_set_goes_on(small_logs, small
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate_with(here, tmp_path / "logs", small_order, on_done)
+        simulate_data_set(tmp_path / "logs", small_order, here, on_done)
     assert len(list((tmp_path / "logs").glob("*.parquet"))) == 2
     seen.clear()
-    paths = simulate_with(here, tmp_path / "logs", small_order, lambda recording, kept: seen.append(kept))
+    paths = simulate_data_set(tmp_path / "logs", small_order, here, lambda recording, kept: seen.append(kept))
     assert sorted(seen) == [False, False, True, True]
     for path in paths:
         assert path.read_bytes() == (small_logs / path.name).read_bytes()
@@ -43,28 +37,29 @@ def test_simulated_logs_are_the_same_and_a_stopped_set_goes_on(small_logs, small
 
 def test_a_machine_file_that_differs_on_a_node_is_refused(small_order, here, tmp_path, monkeypatch):
     seen = iter(["mine", "theirs"])
-    monkeypatch.setattr(simulating, "_machine", lambda scenario: next(seen))
-    with pytest.raises(UnitError, match=r"machine '.*' has other numbers on this node"):
-        simulate_with(here, tmp_path / "logs", replace(small_order, recordings=1, family=0))
+    for module in (data_set, plan):
+        monkeypatch.setattr(module, "machine_hash", lambda scenario: next(seen))
+    with pytest.raises(ConfigError, match=r"machine '.*' has other numbers on this node"):
+        simulate_data_set(tmp_path / "logs", replace(small_order, recordings=1, family=0), here)
     assert not list((tmp_path / "logs").glob("*.parquet"))
 
 
 def test_a_folder_that_only_the_node_sees_is_told(small_order, here, tmp_path, monkeypatch):
-    real = simulating.write_one
+    real = data_set.write_log
 
     def elsewhere(identity, where):
         (tmp_path / "node").mkdir(exist_ok=True)
         return real(identity, {"folder": str(tmp_path / "node")})
 
-    monkeypatch.setattr(simulating, "write_one", elsewhere)
+    monkeypatch.setattr(data_set, "write_log", elsewhere)
     with pytest.raises(StorageError, match="was written on another node"):
-        simulate_with(here, tmp_path / "logs", replace(small_order, recordings=1))
+        simulate_data_set(tmp_path / "logs", replace(small_order, recordings=1), here)
 
 
 def test_a_disk_that_fills_in_a_unit_is_named_and_what_was_written_stays(
     small_logs, small_order, here, tmp_path, monkeypatch
 ):
-    real, written = simulating.write_recording, []
+    real, written = data_set.write_recording, []
 
     def full(recording, path, options):
         if len(written) == 2:
@@ -72,20 +67,20 @@ def test_a_disk_that_fills_in_a_unit_is_named_and_what_was_written_stays(
                 raise OSError(errno.ENOSPC, "No space left on device")
         written.append(real(recording, path, options))
 
-    monkeypatch.setattr(simulating, "write_recording", full)
-    with pytest.raises(StorageError, match=r"recording '.*': .*No space left on device; free space"):
-        simulate_with(here, tmp_path / "logs", small_order)
+    monkeypatch.setattr(data_set, "write_recording", full)
+    with pytest.raises(StorageError, match="No space left on device; free space"):
+        simulate_data_set(tmp_path / "logs", small_order, here)
     assert len(list((tmp_path / "logs").glob("*.parquet"))) == 2
-    monkeypatch.setattr(simulating, "write_recording", real)
+    monkeypatch.setattr(data_set, "write_recording", real)
     kept = []
-    paths = simulate_with(here, tmp_path / "logs", small_order, lambda recording, there: kept.append(there))
+    paths = simulate_data_set(tmp_path / "logs", small_order, here, lambda recording, there: kept.append(there))
     assert sorted(kept) == [False, False, True, True]
     assert [path.read_bytes() for path in paths] == [(small_logs / path.name).read_bytes() for path in paths]
 
 
 def test_a_store_whose_disk_fills_in_a_unit_goes_on_where_it_was(small_logs, here, tmp_path, monkeypatch):
-    monkeypatch.setattr(storing, "BATCH_LOG_BYTES", 1)  # a batch a log
-    real, done = storing.store_batch, []
+    monkeypatch.setattr(building, "BATCH_LOG_BYTES", 1)  # a batch a log
+    real, done = building.store_batch, []
 
     def full(batch):
         if len(done) == 2:
@@ -95,13 +90,13 @@ def test_a_store_whose_disk_fills_in_a_unit_goes_on_where_it_was(small_logs, her
         return real(batch)
 
     source = DataSource.of(small_logs)
-    monkeypatch.setattr(storing, "store_batch", full)
+    monkeypatch.setattr(building, "store_batch", full)
     with pytest.raises(StorageError, match="No space left on device; free space"):
-        store_with(here, source, tmp_path / "store")
+        source.store(tmp_path / "store", here)
     with pytest.raises(DataError, match="is half built"):
         read_store(tmp_path / "store")
-    monkeypatch.setattr(storing, "store_batch", lambda batch: done.append(batch.key) or real(batch))
-    index = store_with(here, source, tmp_path / "store")
+    monkeypatch.setattr(building, "store_batch", lambda batch: done.append(batch.key) or real(batch))
+    index = source.store(tmp_path / "store", here)
     assert len(done) == len(set(done)) == 4  # none twice
     assert [one.digest for one in index.recordings] == [one.digest for one in read_data_set(small_logs)]
 
@@ -109,15 +104,15 @@ def test_a_store_whose_disk_fills_in_a_unit_goes_on_where_it_was(small_logs, her
 def test_a_store_built_in_units_holds_the_same_recordings_and_reads_nothing_twice(small_logs, here, tmp_path):
     source = DataSource.of(small_logs)
     told = NotedProgress()
-    index = store_with(here, source, tmp_path / "store", told)
+    index = source.store(tmp_path / "store", here, told)
     assert index.hours() == pytest.approx(0.01)
     assert told.steps[-1] == 4
-    DataSource.of(small_logs).store(tmp_path / "usual", 1)
+    DataSource.of(small_logs).store(tmp_path / "usual")
     for ours, usual in zip(read_store(tmp_path / "store"), read_store(tmp_path / "usual"), strict=True):
         assert (ours.name, ours.digest, dict(ours.meta)) == (usual.name, usual.digest, dict(usual.meta))
         np.testing.assert_array_equal(ours.values, usual.values)
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "store" / "rows").iterdir()}
-    store_with(here, source, tmp_path / "store")
+    source.store(tmp_path / "store", here)
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "store" / "rows").iterdir()} == before
 
 
@@ -127,14 +122,14 @@ def test_logs_that_cannot_be_read_are_refused_as_in_one_process(small_logs, here
     for log in sorted(small_logs.glob("*.parquet"))[:2]:
         (folder / log.name).write_bytes(log.read_bytes())
     (folder / "bad.parquet").write_bytes(b"PAR1 and nothing else")
-    index = store_with(here, DataSource.of(folder), tmp_path / "store")
-    usual = DataSource.of(folder).store(tmp_path / "usual", 1)
+    index = DataSource.of(folder).store(tmp_path / "store", here)
+    usual = DataSource.of(folder).store(tmp_path / "usual")
     assert index.refused == usual.refused
     assert len(index.recordings) == 2
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     with pytest.raises(ConfigError, match="is no store and not empty"):
-        store_with(here, DataSource.of(folder), tmp_path / "full")
+        DataSource.of(folder).store(tmp_path / "full", here)
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
 
 
@@ -142,31 +137,21 @@ def test_logs_that_cannot_be_read_are_refused_as_in_one_process(small_logs, here
 def test_an_inspection_in_units_is_that_of_one_process(small_logs, here, tmp_path, stored):
     source = DataSource.of(small_logs)
     if stored:
-        source.store(tmp_path / "store", 1)
+        source.store(tmp_path / "store")
         source = DataSource.of(tmp_path / "store")
     told = NotedProgress()
-    found = inspect_with(here, source, CoverageOrder(), told)
-    usual = source.inspect()
-    assert found.quality.reports == usual.reports
-    assert found.quality == usual
-    assert isinstance(found.coverage, Coverage)
-    assert json.dumps(found.coverage.to_json()) == json.dumps(coverage(source).to_json())
-    assert told.stages == [("part", told.steps[-1])]
-
-
-def test_a_coverage_that_cannot_be_told_says_why(small_logs, here):
-    found = inspect_with(here, DataSource.of(small_logs), CoverageOrder(("no_such_channel",)))
-    assert found.coverage is None
-    assert "no_such_channel" in found.why
+    assert source.inspect(told, here) == source.inspect()
+    assert told.stages == [("recording" if stored else "log", 4)]
+    assert told.steps[-1] == 4
 
 
 @pytest.mark.slow
 def test_two_processes_give_the_same_logs_store_and_inspection(small_logs, small_order, tmp_path):
-    two = Workforce(workers=2)
-    for path in simulate_with(two, tmp_path / "logs", small_order):
+    two = Workers(count=2)
+    for path in simulate_data_set(tmp_path / "logs", small_order, two):
         assert path.read_bytes() == (small_logs / path.name).read_bytes()
     source = DataSource.of(small_logs)
-    index = store_with(two, source, tmp_path / "store")
-    usual = source.store(tmp_path / "usual", 1)
+    index = source.store(tmp_path / "store", two)
+    usual = source.store(tmp_path / "usual")
     assert [entry.digest for entry in index.recordings] == [entry.digest for entry in usual.recordings]
-    assert inspect_with(two, source).quality == source.inspect()
+    assert source.inspect(workers=two) == source.inspect()

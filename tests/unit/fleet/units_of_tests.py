@@ -16,6 +16,10 @@ def square(identity, where):
     if number == identity.config.get("killed") and not Path(where["log"] + ".killed").exists():
         Path(where["log"] + ".killed").touch()
         os.kill(os.getpid(), signal.SIGKILL)
+    if number == identity.config.get("dies"):
+        os._exit(3)
+    if number == identity.config.get("broken"):
+        raise KeyError(number)
     if number == identity.config.get("refused"):
         raise DataError("a log of row 7 is no log")
     return WithState({"square": number**2}, b"%d" % number)

@@ -151,7 +151,7 @@ def test_what_no_monitor_can_be_made_from_is_refused_before_a_residual_is_fitted
     def called(job):
         pytest.fail("a residual is fitted before the refusal")
 
-    monkeypatch.setattr(sys.modules["edp.workflows.monitor.fit_monitor"], "_fit_source", called)
+    monkeypatch.setattr(sys.modules["edp.workflows.monitor.fit_monitor"], "fit_source", called)
     experiment = load_monitor_experiment(None, changes, {"hours_per_false_alarm": 0.02})
     sessions = healthy if any("M22" in change for change in changes) else healthy[:8]
     with pytest.raises(EdpError, match=message):

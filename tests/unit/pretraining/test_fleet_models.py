@@ -8,7 +8,7 @@ import pytest
 from noted_progress import NotedProgress
 
 from edp.errors import BundleError, ConfigError, DataError, EdpError, StorageError
-from edp.jobs import Workforce
+from edp.jobs import Workers
 from edp.logs.source import DataSource
 from edp.report.fleet.facts import fleet_facts, headline, machine_table, verdict, worst_table
 from edp.report.fleet.page import render
@@ -29,14 +29,14 @@ from edp.workflows.fleet.registry import (
 from edp.workflows.pretraining import Pretrain, pretrain
 from edp.workflows.transfer import FinetuneSpec
 
-HERE = Workforce()
+HERE = Workers()
 ORDER = PersonalOrder(spec=FinetuneSpec(rounds=3, batch=4, rate=2e-2, patience=0, check_signs=False))
 
 
 @pytest.fixture(scope="module")
 def store(machines, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fleet") / "store"
-    machines.store(folder, 1)
+    machines.store(folder)
     return folder
 
 

@@ -1,17 +1,17 @@
-"""A pretraining as a unit of work leaves the run that one process leaves."""
+"""A pretraining as a unit of work leaves the run that this process reads."""
 
-from edp.jobs import Workforce
+from edp.jobs.workers import IN_PROCESS, WorkUnit
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.fleet.training import pretrain_with
 from edp.workflows.pretraining import Pretrain, pretrain
 
 
 def test_a_pretraining_elsewhere_is_that_of_this_process(machines, experiment, tmp_path):
-    there = pretrain_with(Workforce(), machines, experiment, Pretrain(), tmp_path / "there")
-    here = pretrain(machines, experiment, Pretrain(), tmp_path / "here")
-    assert there == here
+    where = {"source": machines, "experiment": experiment, "order": Pretrain(), "out": str(tmp_path / "there")}
+    unit = WorkUnit("edp.workflows.pretraining.pretrain:pretrain_unit", "there", {}, where=where)
+    assert [result.values for _, result in IN_PROCESS.map([unit])] == [{}]
+    assert pretrain(machines, experiment, Pretrain(), tmp_path / "there") == pretrain(
+        machines, experiment, Pretrain(), tmp_path / "here"
+    )
     first, second = (load_bundle(tmp_path / name).predictor for name in ("there", "here"))
     assert weights_digest(first) == weights_digest(second)
-    again = pretrain_with(Workforce(), machines, experiment, Pretrain(), tmp_path / "there")
-    assert again == here

@@ -24,8 +24,8 @@ def content(chosen=1):
     ]
     opening = {"test_set": "test", "judged": ["teacher"], "why": "chosen", "time": "2026-03-04"}
     score = {"10": {"mae": 4.1, "composite": 5.8}}
-    chosen = {"10": {"mae": 4.4, "composite": 6.0}}
-    test = {"name": "test", "opened": "2026-03-04", "scores": {"teacher": score, "chosen": chosen},
+    chosen_score = {"10": {"mae": 4.4, "composite": 6.0}}
+    test = {"name": "test", "opened": "2026-03-04", "scores": {"teacher": score, "chosen": chosen_score},
             "error": 1.07, "seen_before": True, "openings": [opening, opening]}  # fmt: skip
     return {
         "schema": 2, "rows": rows, "teacher": rows[0], "front": [0, 1], "chosen": chosen, "unit": "mm/s",

@@ -12,7 +12,7 @@ from edp.report.common.interactive import plots
 from edp.report.run.charts import run_charts, signal_chart
 from edp.report.run.facts import read_facts
 from edp.report.run.figures import prediction_lines, residual_histograms
-from edp.report.run.page import render
+from edp.report.run.page import build_run_page
 from edp.report.run.residuals import correlations, correlogram, fit_table
 from edp.storage import write_json
 
@@ -129,7 +129,7 @@ def test_raw_signals_stand_first_in_their_units(run_folder):
     chart = signal_chart(facts)
     assert [panel.title for panel in chart.panels] == ["</script><b>lever", "[bar]"]
     assert chart.panels[1].marks[0].y.max() == pytest.approx(200, rel=1e-3)
-    page = render(facts)
+    page = build_run_page(facts).html()
     assert page.index("Raw signals</h2>") < page.index("Against the baselines</h2>")
     assert "<b>lever" not in page
     assert {item.model for item in residual_histograms(facts)} == {"network", "ridge_arx"}

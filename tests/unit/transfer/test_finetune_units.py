@@ -8,12 +8,11 @@ from noted_progress import NotedProgress
 
 from edp.errors import BundleError
 from edp.evaluation import judge
-from edp.jobs import Workforce
+from edp.jobs import Workers
+from edp.jobs.workers import UNITS
 from edp.networks import running
 from edp.storage import read_json
 from edp.workflows import train_evaluate
-from edp.workflows.fleet.judging import UNITS, evaluate_with
-from edp.workflows.fleet.training import finetune_with
 from edp.workflows.train_evaluate import evaluate, trained_run
 from edp.workflows.transfer import FinetuneRequest, finetune
 
@@ -25,34 +24,31 @@ def without_times(value):
     return [without_times(part) for part in value] if isinstance(value, list) else value
 
 
+@pytest.mark.processes
 def test_methods_trained_apart_are_judged_as_if_trained_here(run, target, small, tmp_path):
     order = FinetuneRequest(spec=small, method="full", baselines=("low_rank", "ridge_arx"))
-    noted = NotedProgress()
-    there = finetune_with(Workforce(), run, target, order, tmp_path / "there", noted).to_table()
+    there = finetune(run, target, order, tmp_path / "there", workers=Workers(count=2)).to_table()
     here = finetune(run, target, order, tmp_path / "here").to_table()
     assert json.dumps(without_times(there)) == json.dumps(without_times(here))
-    assert [note for note in noted.notes if note.startswith("trained:")] == [
-        "trained: full, 1 of 2",
-        "trained: low_rank, 2 of 2",
-    ]
     with pytest.raises(BundleError):
-        finetune_with(Workforce(), tmp_path / "nothing", target, order, tmp_path / "no")
+        finetune(tmp_path / "nothing", target, order, tmp_path / "no", workers=Workers(count=2))
     assert not (tmp_path / "no").exists()
 
 
+@pytest.mark.processes
 def test_models_run_apart_have_the_scores_of_one_process(run, target, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     names = ("persistence", "ridge_arx", "small_mlp")
     told = NotedProgress()
     for source in (None, target):
-        folder = evaluate_with(Workforce(), tmp_path / "run", source, names, told)
+        folder = evaluate(tmp_path / "run", source, names, told, workers=Workers(count=2))
         there = read_json(folder / "scores.json")
         (folder / "scores.json").unlink()
         here = read_json(evaluate(tmp_path / "run", source, names) / "scores.json")
         assert without_times(there) == without_times(here)
         assert list(there["models"]) == list(here["models"])
         assert there["key"] == here["key"]
-    assert told.notes[-1] == "network, 4 of 4"
+    assert told.stages[-1] == ("model", 4)
     assert not (tmp_path / "run" / UNITS).exists()
 
 
@@ -64,11 +60,8 @@ def test_a_network_run_in_parts_has_the_scores_of_one_process(run, target, tmp_p
     told = NotedProgress()
     folder = tmp_path / "run"
     (evaluate(folder, target, ()) / "scores.json").unlink()
-    there = read_json(evaluate_with(Workforce(), folder, target, (), told) / "scores.json")
+    here = read_json(evaluate(folder, target, (), told) / "scores.json")
     assert len(told.notes) > 1
-    (evaluate(folder, target, ()) / "scores.json").unlink()
-    here = read_json(evaluate(folder, target, ()) / "scores.json")
-    assert without_times(there) == without_times(here)
     # Streams side by side and sums in another order differ in their last bits alone.
     assert here["models"]["network"]["overall"] == approx_tree(whole["models"]["network"]["overall"])
 

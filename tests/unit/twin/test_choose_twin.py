@@ -11,6 +11,7 @@ from edp.data.splits import ByRecording
 from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError, DataError
 from edp.ir.memory import Gru
+from edp.jobs import IN_PROCESS
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.arx import Arx
 from edp.networks.twin.elements import ElementsBox
@@ -23,7 +24,7 @@ from edp.storage.runs import KeyedRun, Run
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
 from edp.training import free_run_members
 from edp.training.free_run import FreeRunDiverged, FreeRunProgress, FreeRunSpec
-from edp.training.free_run_members import MemberTraining, fit_members, noted_progress, noting_member
+from edp.training.free_run_members import MemberTraining, fit_members, member_unit, noted_progress
 from edp.training.optimizers import AdamW
 from edp.workflows.twin import choose_twin, fit_twin, training_cost
 from edp.workflows.twin.choose_twin import TwinChoice, shortened
@@ -368,7 +369,7 @@ def test_trainings_side_by_side_note_how_far_they_are(run):
         jobs.append(MemberTraining(f"member {which}", member, series, series, TINY, folder))
     assert noted_progress(jobs) is None
     for job in jobs[:2]:
-        noting_member(job)
+        list(IN_PROCESS.map([member_unit(job)]))
     (run.path / "member_2").mkdir()
     note = run.path / "member_2" / "progress.json"
     note.write_text("{ half a")  # as it may be read while it is written
@@ -379,21 +380,20 @@ def test_trainings_side_by_side_note_how_far_they_are(run):
     assert noted_progress(jobs).update == 40
 
 
-def test_a_choice_looks_at_helpers_while_it_waits(run, monkeypatch):
+def test_a_choice_looks_at_its_workers_while_it_waits(run, monkeypatch):
     looks = []
 
     class Waiting:
-        workers = 2
+        are_alone = False
 
-        def ordered(self, function, jobs, waiting):
-            assert function is noting_member
+        def map(self, units, waiting):
             waiting()
             waiting()
             return iter([])
 
     seen = iter([None, FreeRunProgress(3, 9, 0.1, 1.0, None, False)])
     monkeypatch.setattr(fit_twin, "noted_progress", lambda jobs: next(seen))
-    fit = replace(choice(run).fit, helpers=Waiting())
+    fit = replace(choice(run).fit, workers=Waiting())
     assert list(fit.train_members([], looks.append)) == []
     assert [event.update for event in looks] == [3]
 

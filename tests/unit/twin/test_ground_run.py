@@ -11,6 +11,7 @@ from edp.config.twin import load_twin_experiment
 from edp.control.plants import plant_of
 from edp.control.twin_environment import TwinEnvironment
 from edp.errors import ConfigError, ExportError
+from edp.jobs import IN_PROCESS
 from edp.logs.source import DataSource
 from edp.networks.twin.grey.ground_drag import DragLaw
 from edp.networks.twin.static_map import StaticMap
@@ -44,7 +45,7 @@ def start(tmp_path_factory):
 def loam(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loam")
     order = SimulationOrder(minutes=2.0, recordings=4, seed=3, mix={"dig": 1.0}, materials={"sandy_loam": 1.0})
-    simulate_data_set(folder, order, workers=1)
+    simulate_data_set(folder, order, workers=IN_PROCESS)
     return DataSource.of(folder)
 
 

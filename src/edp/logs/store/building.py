@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from edp.errors import ConfigError, DataError, EdpError, LostError
+from edp.errors import ConfigError, DataError, EdpError, StorageError
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.workers import WorkUnit
 from edp.logs.assemble import Assembly, parts, prepare
 from edp.logs.buckets import RemoteFile, copied
 from edp.logs.detect import open_log
@@ -41,7 +43,6 @@ from edp.logs.store.index import (
 )
 from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Digest
-from edp.sandbox.helpers import Helpers
 from edp.settings.tree import plain_tree
 from edp.signals import Channel, SignalMap
 from edp.storage import (
@@ -55,6 +56,7 @@ from edp.storage import (
     remove_unfinished,
     replacing,
 )
+from edp.storage.ledger import TrainingIdentity, WithState
 from edp.storage.paths import (
     entries_of,
     files_below,
@@ -72,7 +74,8 @@ PART_SAMPLES = 1 << 16
 """Of a log that are in memory at a time."""
 BATCH_LOG_BYTES = 128 * 2**20
 """Of the logs of a batch, about: what a process that is killed loses."""
-BATCHES_A_WORKER = 4
+BATCHES = 64
+"""About, of small data sets: some for each worker, so that none waits for the last one for long."""
 MOST_FILES = 400
 """Files of rows of one build, about: each is open while the store is, and systems allow some thousand."""
 
@@ -138,7 +141,7 @@ class LogBatch:
 def build_store(
     logs: Sequence[StoredLog],
     folder: str | Path,
-    workers: int = 1,
+    workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
 ) -> StoreIndex:
     """Read logs into a store. Unchanged logs are reused; changed logs are read again.
@@ -146,7 +149,7 @@ def build_store(
     Args:
         logs: in any order.
         folder: of the store; a new one, an unfinished one, or one to add logs to.
-        workers: processes that read side by side.
+        workers: who reads the logs; nodes see logs and store under the same paths.
         progress: receiver of the progress; its units are logs.
 
     Returns:
@@ -171,7 +174,7 @@ def build_store(
         release(top / LOCK, lock) if is_file_at(top / INDEX) else lock.close()
 
 
-def _built(logs: dict[str, StoredLog], top: Path, workers: int, progress: Progress) -> StoreIndex:
+def _built(logs: dict[str, StoredLog], top: Path, workers: Workers, progress: Progress) -> StoreIndex:
     before = read_index(top) if is_file_at(top / INDEX) else StoreIndex()
     index = _without_replaced(_without_lost(before, top), logs)
     for record in _records_beside(top, index):
@@ -179,22 +182,45 @@ def _built(logs: dict[str, StoredLog], top: Path, workers: int, progress: Progre
     stored = {entry.log_key for entry in index.recordings}
     index = replace(index, refused=())
     missing = {key: log for key, log in logs.items() if key not in stored}
-    batches = _batches(missing, top, workers)
+    batches = _batches(missing, full_path(top))
     done = len(logs) - len(missing)
     read = progress.stage("log", len(logs))
     read.step(done)
-    with Helpers(workers, _died) as helpers:
-        for batch, record in zip(batches, helpers.ordered(store_batch, batches)):
-            index = _with_record(index, record, logs)
-            done += len(batch.logs)
-            read.step(done, refused=len(index.refused))
+    refused = 0
+    records: dict[int, dict[str, Any]] = {}
+    for number, result in workers.map([_unit(batch) for batch in batches]):
+        batch = batches[number]
+        records[number] = parse_json((result.content or b"").decode(), f"record of {batch.label}", DataError)
+        if records[number]["recordings"] and not is_file_at(rows_path(top, batch.key)):
+            raise StorageError(
+                f"{batch.label} was stored on another node, and is not in '{full_path(top)}' here; give a folder that "
+                "all nodes see under the same path"
+            )
+        done += len(batch.logs)
+        refused += len(records[number]["refused"])
+        read.step(done, refused=refused)
+    for number in range(len(batches)):
+        index = _with_record(index, records[number], logs)
     order = {key: number for number, key in enumerate(logs)}
     # As the logs are in order; those of earlier builds first.
     recordings = sorted(index.recordings, key=lambda entry: order.get(entry.log_key, -1))
-    index = replace(index, recordings=tuple(recordings))
+    index = _in_order(replace(index, recordings=tuple(recordings)))
     write_plain(top / INDEX, plain_index(index))
     _remove_unused(top, index)
     return index
+
+
+def _in_order(index: StoreIndex) -> StoreIndex:
+    """Return the index with files and lists of channels in the order of the recordings, whoever read first."""
+    files = {file.key: file for file in index.files}
+    used = dict.fromkeys(entry.rows for entry in index.recordings)
+    lists: list[tuple[Channel, ...]] = []
+    recordings = []
+    for entry in index.recordings:
+        lists, number = listed(lists, index.lists[entry.channels])
+        recordings.append(replace(entry, channels=number))
+    rows = tuple(files[key] for key in used)
+    return replace(index, lists=tuple(lists), files=rows, recordings=tuple(recordings))
 
 
 def _distinct(logs: Sequence[StoredLog]) -> dict[str, StoredLog]:
@@ -222,12 +248,11 @@ def _size(path: Path) -> int:
     return status_of(path).st_size if is_file_at(path) and not is_link_at(path) else -1
 
 
-def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[LogBatch]:
-    """Divide the logs into batches of similar size."""
+def _batches(logs: dict[str, StoredLog], folder: Path) -> list[LogBatch]:
+    """Logs side by side, in batches of like size, the same for any number of workers."""
     sizes = {key: log.size for key, log in logs.items()}
     total = sum(sizes.values())
-    # Some for each worker, so that none waits for the last one for long.
-    bound = max(min(BATCH_LOG_BYTES, total // (BATCHES_A_WORKER * workers)), total // MOST_FILES)
+    bound = max(min(BATCH_LOG_BYTES, total // BATCHES), total // MOST_FILES)
     groups: list[list[tuple[str, StoredLog]]] = []
     left = 0
     for key, log in logs.items():
@@ -237,6 +262,28 @@ def _batches(logs: dict[str, StoredLog], folder: Path, workers: int) -> list[Log
         groups[-1].append((key, log))
         left -= sizes[key]
     return [LogBatch(folder, _batch_key([key for key, _ in group]), tuple(group)) for group in groups]
+
+
+def _unit(batch: LogBatch) -> WorkUnit:
+    arguments = {"logs": [key for key, _ in batch.logs]}
+    return WorkUnit(f"{__name__}:read_batch", batch.label, arguments, batch.key, {"batch": batch})
+
+
+def read_batch(identity: TrainingIdentity, where: Mapping[str, LogBatch]) -> WithState:
+    """Read the logs of a batch into the rows of a store, and leave their record next to them.
+
+    Raises:
+        ConfigError: a log is not the same file on this node, or the store is not on it.
+    """
+    batch = where["batch"]
+    if not is_folder_at(batch.folder / ROWS):
+        raise ConfigError(f"the store '{batch.folder}' is not on this node; give a folder that all nodes see")
+    for key, log in batch.logs:
+        if log.remote is None and is_there(log.path) and log.key != key:
+            raise ConfigError(
+                f"'{log.path}' has another size or time on this node; all nodes must see the same file under that path"
+            )
+    return WithState({}, json.dumps(store_batch(batch)).encode())
 
 
 def _batch_key(keys: Sequence[str]) -> str:
@@ -385,7 +432,3 @@ def _remove_unused(top: Path, index: StoreIndex) -> None:
     for path in entries_of(top / ROWS):
         if path.suffix == ".json" or (path.suffix == ".f32" and path.stem not in used):
             path.unlink(missing_ok=True)
-
-
-def _died(label: str) -> EdpError:
-    return LostError(f"the process that read {label} was killed; give the same command again to go on")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,8 +223,29 @@ class ResidualSpec(ABC):
         """
 
 
-SideBySide = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
-"""What calls a function for each of some jobs, and gives what comes of them in their order; `map` does."""
+class SideBySide(Protocol):
+    """Calls a function for each of some jobs, and yields the results in the order of the jobs."""
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether other processes do it, which cannot report progress."""
+        ...
+
+    def __call__(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
+        """Yield ``function(job)`` of each job."""
+
+
+class OneByOne:
+    """Calls a function in this process."""
+
+    is_elsewhere = False
+
+    def __call__(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
+        """Yield ``function(job)`` of each job."""
+        return map(function, jobs)
+
+
+ONE_BY_ONE = OneByOne()
 RESIDUALS: Registry[type[ResidualSpec]] = Registry("residual")
 
 

@@ -24,7 +24,7 @@ WORDS = {
 """How a table calls what `edp.evaluation.by_situation` tells apart."""
 
 
-def situation_sheet(scores: ScoresFile, horizon: int) -> Table | None:
+def situation_table(scores: ScoresFile, horizon: int) -> Table | None:
     """The network's error by situation beside the best baseline's, most of the error first; None without such scores.
 
     Args:
@@ -69,7 +69,7 @@ def _ratio(ours: list[float | None], theirs: list[float | None]) -> float | None
     return math.exp(sum(logs) / len(logs)) if logs else None
 
 
-def parts_sheet(foundation: Mapping[str, Any]) -> Table:
+def parts_table(foundation: Mapping[str, Any]) -> Table:
     """Machines, recordings and minutes of each part."""
     heads = ("machines", "recordings", "minutes")
     rows = tuple((part, *(facts[key] for key in heads)) for part, facts in foundation["data"].items())
@@ -77,7 +77,7 @@ def parts_sheet(foundation: Mapping[str, Any]) -> Table:
     return Table(f"{foundation['label']} over many machines", columns, rows, name="parts")
 
 
-def contexts_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
+def contexts_table(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
     """Error by the time since the state was reset, always on the same ticks."""
     unseen = foundation["unseen"]
     rows: list[tuple[Value, ...]] = []
@@ -102,7 +102,7 @@ def _short(value: Value) -> str:
     return figure(value) if isinstance(value, int | float) else plainly(value)
 
 
-def machines_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
+def machines_table(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
     """Each machine that tests, the hardest first."""
     each = sorted(foundation["unseen"]["machines"].items(), key=lambda entry: -entry[1])
     columns = (Column("Machine"), Column("MAE", unit, figures([mae for _, mae in each])))

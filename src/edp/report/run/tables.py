@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from markupsafe import Markup
 
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE_NAME
@@ -19,9 +20,10 @@ from edp.report.run.facts import (
     main_horizon,
 )
 from edp.report.run.figures import recording_errors
-from edp.table import Column, Table
+from edp.table import Column, Table, Value
 from edp.wording import MISSING, count_text, decimals_for, duration, number, percent, unit_text
 
+FITS, EXCEEDS = "✓ fits", "✗ exceeds"
 _TILES = 3
 """Outputs that have a tile of their own where they have no common unit."""
 
@@ -128,50 +130,45 @@ def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
     )
 
 
-@dataclass(frozen=True)
-class Check:
-    """One line of the budget: how much of it is used."""
-
-    what: str
-    value: str
-    limit: str
-    unit: str
-    share: float | None
-    fits: bool
-    note: str
-
-    @property
-    def share_text(self) -> str:
-        """The share used, as a percentage."""
-        return percent(self.share)
-
-
-def budget_checks(facts: Facts) -> list[Check]:
-    """The footprint against each limit of the budget."""
-    checks = []
+def budget_table(facts: Facts) -> Table:
+    """Return the footprint against each limit of the budget; a table without rows if there is no budget."""
+    rows = []
     for row in budget_rows(facts.footprint):
         value, limit = row.get("value"), row.get("limit")
         # No share of a limit that is zero or unknown.
         share = value / limit if value is not None and limit else None
-        checks.append(
-            Check(
-                str(row["what"]),
-                _amount(value),
-                _amount(limit),
-                str(row.get("unit") or ""),
-                share,
-                bool(row["fits"]),
-                str(row.get("note") or ""),
-            )
-        )
-    return checks
+        verdict, unit, note = FITS if row["fits"] else EXCEEDS, str(row.get("unit") or ""), str(row.get("note") or "")
+        rows.append((str(row["what"]), _amount(value), _amount(limit), unit, share, verdict, note))
+    columns = (
+        Column("Resource"),
+        Column("Needed"),
+        Column("Allowed"),
+        Column("Unit", is_text=True),
+        Column("Share used", show=_meter),
+        Column("Verdict", show=_coloured, is_text=True),
+        Column("Note", is_text=True),
+    )
+    return Table("Budget", columns, tuple(rows))
+
+
+def _meter(share: Value) -> Markup:
+    """Return a bar of the share of a limit that is used, and the share in percent."""
+    text = percent(share if isinstance(share, float) else None)
+    if not isinstance(share, float):
+        return Markup(text)
+    bar = Markup('<span class="meter{}"><i style="width: {}%"></i></span><span class="share">{}</span>')
+    return bar.format(" over" if share > 1.0 else "", round(min(100.0 * share, 100.0), 1), text)
+
+
+def _coloured(verdict: Value) -> Markup:
+    return Markup('<span class="fits{}">{}</span>').format(" over" if verdict == EXCEEDS else "", verdict)
 
 
 def _amount(value: float | None) -> str:
     return count_text(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
 
 
-def parts_table(facts: Facts) -> Table | None:
+def part_table(facts: Facts) -> Table | None:
     """Parameters and multiply-accumulates of each part of the network."""
     rows = (facts.footprint or {}).get("rows", [])
     if not rows:
@@ -224,9 +221,9 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
         tiles.append((percent(best.change, signed=True), "", f"error against {best.label}, the best baseline"))
     elif ours and ours.r2 is not None:
         tiles.append((number(ours.r2, 4), "", "R²"))
-    checks = budget_checks(facts)
+    checks = budget_rows(facts.footprint)
     if checks:
-        fitting = sum(check.fits for check in checks)
+        fitting = sum(bool(check["fits"]) for check in checks)
         tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
     elif facts.provenance is not None and facts.provenance.more.get("parameters") is not None:
         tiles.append((count_text(facts.provenance.more["parameters"]), "", "parameters"))

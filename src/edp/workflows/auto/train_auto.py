@@ -12,6 +12,7 @@ import tomli_w
 from edp.config.experiment import plain_tree
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError
+from edp.jobs import IN_PROCESS, Workers
 from edp.logs.source import DataSource
 from edp.networks.predictor import build_model
 from edp.progress import SILENT, Progress
@@ -45,6 +46,7 @@ from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.auto.train_candidates import (
     TrainedCandidate,
     TrainedPortfolio,
+    remove_trained_units,
     train_portfolio,
 )
 from edp.workflows.train_evaluate import keep_fitted
@@ -74,7 +76,7 @@ def train_auto(
     settings: AutoSettings,
     out: str | Path,
     progress: Progress = SILENT,
-    workers: int = 1,
+    workers: Workers = IN_PROCESS,
 ) -> AutoResult:
     """Train every candidate that suits the data, choose, and write the winner's run folder.
 
@@ -83,7 +85,7 @@ def train_auto(
         settings: task, split, budget, judge.
         out: run folder; a finished one of the same settings and data is read, not made again.
         progress: receiver of the progress; its units are models.
-        workers: processes that train candidates side by side; 0 for one a core. The run has the same bits with any
+        workers: who trains candidates; nodes see the run folder under the same path. The run has the same bits with any
             number.
 
     Raises:
@@ -108,7 +110,10 @@ def train_auto(
     check_size(data)
     with Run.create(out, "auto", key, tomli_w.dumps(plain_tree(settings))) as run:
         portfolio = train_portfolio(settings, data, amount, run.path, workers, progress)
-        return _write_choice(run, source, portfolio, data, settings, [*of_channels, *of_parts, *still_inputs(data)])
+        notes = [*of_channels, *of_parts, *still_inputs(data)]
+        result = _write_choice(run, source, portfolio, data, settings, notes)
+        remove_trained_units(run.path)
+        return result
 
 
 def _write_choice(

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from edp.config.experiment import Experiment, experiment_toml, plain_tree
 from edp.data.prepared import Prepared
-from edp.errors import ConfigError, EdpError, LostError
+from edp.errors import ConfigError, EdpError
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.packing import pack, unpack
+from edp.jobs.workers import UNITS, UnitResult, WorkUnit, forget_units
 from edp.progress import SILENT, Progress
-from edp.sandbox.helpers import Helpers
 from edp.storage import make_folder, read_object, write_json
-from edp.storage.paths import is_file_at
+from edp.storage.ledger import TrainingIdentity, WithState
+from edp.storage.paths import full_path, is_file_at
 from edp.storage.runs import KeyedRun, Run, run_key
-from edp.training import Diverged, Fitted, TrainingProgress
+from edp.training import Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.bagging.fit import fit_bagged
 from edp.training.blas import one_blas_thread
 from edp.training.fit import fit
@@ -36,7 +41,7 @@ from edp.workflows.auto.settings import AutoSettings
 NOTE = "progress.json"
 """How far a training in another process is, in its folder."""
 LINEAR, COMMITTEE, RECURRENT = "linear", "committee", "recurrent"
-TRIAL_FOLDER = "trial"
+TRIAL_FOLDER, FITTED, DIVERGED = "trial", "fitted", "diverged"
 MARGIN = 1.25
 """Error of a trial over that of the linear model up to which the long training is worth its time: see decision 99."""
 OnEvent = Callable[[TrainingProgress], None]
@@ -126,56 +131,105 @@ def _by_gradient(job: CandidateTraining, on_event: OnEvent | None) -> TrainedCan
 
 
 def train_all(
-    jobs: Sequence[CandidateTraining], workers: int, progress: Progress = SILENT, done: int = 0, total: int = 0
+    jobs: Sequence[CandidateTraining],
+    workers: Workers,
+    run: Path,
+    progress: Progress = SILENT,
+    done: int = 0,
+    total: int = 0,
 ) -> Iterator[TrainedCandidate | str]:
-    """What each training gives, in order; the same bits with any number of processes.
+    """Train candidates and yield them in order; the same bits with any number of processes.
 
     Args:
         jobs: the trainings, the shortest first.
-        workers: processes; 0 for one a core.
+        workers: who trains; nodes see the run folder under the same path.
+        run: run folder; what is trained in it is read.
         progress: receiver of the progress; its units are models.
         done: number of models trained before these.
         total: number of models with those before and after these; 0 for these alone.
 
     Raises:
-        EdpError: see `train_candidate`, or a process died.
+        EdpError: see `train_candidate`, or a process was killed again and again.
     """
-    count = min(workers or os.cpu_count() or 1, len(jobs))
     # Trainings on folds alone take seconds where a process takes as long to start.
-    if count <= 1 or all(job.on_folds for job in jobs):
-        models = progress.stage("model", total or len(jobs))
-        for number, job in enumerate(jobs, start=done):
-            models.step(number)
-            models.note(job.label)
-            yield train_candidate(job, training_steps(models))
-        return
-    display = _Display(jobs, progress)
-    with Helpers(count, _died) as helpers:
+    if not workers.are_alone and not all(job.on_folds for job in jobs):
+        display = _Display(jobs, progress)
         # The longest first, or it would wait for the others and end alone.
-        trained = list(helpers.ordered(_noting, jobs[::-1], display.look))
-    for job in jobs:
-        (job.folder / NOTE).unlink(missing_ok=True)
+        for _ in workers.map([_unit(job) for job in jobs[::-1]], folder=run / UNITS, waiting=display.look):
+            display.look()
+        for job in jobs:
+            (job.folder / NOTE).unlink(missing_ok=True)
+        progress = SILENT
+    models = progress.stage("model", total or len(jobs))
+    for number, job in enumerate(jobs, start=done):
+        models.step(number)
+        models.note(job.label)
         if job.on_folds:
-            job.folder.rmdir()
-    yield from trained[::-1]
+            result = next(IN_PROCESS.map_in_order([_unit(job)], folder=run / UNITS))
+            yield _read_trained(job, result)
+        else:
+            yield train_candidate(job, training_steps(models))
 
 
-def _noting(job: CandidateTraining) -> TrainedCandidate | str:
-    """`train_candidate` in another process, which notes in the folder of the job how far it is."""
+@dataclass(frozen=True)
+class _FoldResult:
+    """Result of a training on folds, next to the bundle in its folder."""
+
+    promise: Promise
+    history: list[dict[str, Any]]
+    seconds: float
+    targets_per_s: float
+
+
+def _unit(job: CandidateTraining) -> WorkUnit:
+    """Return a training as a unit of work."""
+    placed = replace(job, folder=full_path(job.folder))
+    blocks = hashlib.blake2b(repr((list(job.blocks), job.judged)).encode(), digest_size=16).hexdigest()
+    arguments = {
+        "experiment": plain_tree(job.experiment),
+        "trial": job.trial,
+        "blocks": blocks,
+        "foundation": None if job.foundation is None else dict(job.foundation.facts),
+        "folder": str(placed.folder),
+    }
+    return WorkUnit(f"{__name__}:train_unit", job.label, arguments, job.data.digest, {"job": placed})
+
+
+def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, str]:
+    """Train a candidate into its folder, and note there how far the training is."""
+    job: CandidateTraining = where["job"]
     note = make_folder(job.folder) / NOTE
 
     def tell(event: TrainingProgress) -> None:
         left = {"epoch", "epochs", "update", "updates", "targets_per_s", "seconds_left"}
         write_json(note, {name: value for name, value in vars(event).items() if name in left})
 
-    return train_candidate(job, tell)
+    trained = train_candidate(job, tell)
+    if isinstance(trained, str):
+        return {DIVERGED: trained}
+    if not job.on_folds:
+        return {}
+    note.unlink(missing_ok=True)
+    fitted = trained.fitted
+    save_bundle(make_bundle(fitted.predictor, job.data), job.folder / FITTED)
+    return WithState({}, pack(_FoldResult(trained.promise, fitted.history, fitted.seconds, fitted.targets_per_s)))
 
 
-def _died(label: str) -> LostError:
-    return LostError(
-        f"a worker process died during the training of {label} (out of memory, or stopped from outside; a calling "
-        "script needs `if __name__ == '__main__':`); run the same command again with --workers 1"
-    )
+def _read_trained(job: CandidateTraining, result: UnitResult) -> TrainedCandidate | str:
+    """Return a candidate that was trained on folds, or the message of a training that diverged."""
+    if DIVERGED in result.values:
+        return str(result.values[DIVERGED])
+    stored = unpack(result.content or b"", _FoldResult)
+    predictor = load_bundle(job.folder / FITTED).predictor
+    fitted = Fitted(predictor, stored.history, stored.seconds, stored.targets_per_s, 0)
+    return TrainedCandidate(job.experiment, fitted, stored.promise)
+
+
+def remove_trained_units(run: Path) -> None:
+    """Remove what trainings left for a continued run, once the choice is written."""
+    forget_units(run / UNITS)
+    for fitted in (run / "candidates").glob(f"*/{FITTED}"):
+        shutil.rmtree(fitted.parent, ignore_errors=True)
 
 
 class _Display:
@@ -226,7 +280,12 @@ class TrainedPortfolio:
 
 
 def train_portfolio(
-    settings: AutoSettings, data: Prepared, amount: Amount, folder: Path, workers: int = 1, progress: Progress = SILENT
+    settings: AutoSettings,
+    data: Prepared,
+    amount: Amount,
+    folder: Path,
+    workers: Workers = IN_PROCESS,
+    progress: Progress = SILENT,
 ) -> TrainedPortfolio:
     """Train every candidate that suits the data.
 
@@ -238,7 +297,7 @@ def train_portfolio(
         data: prepared series.
         amount: what there is to learn from.
         folder: of the run; checkpoints lie in it.
-        workers: processes that train in parallel; 0 for one a core.
+        workers: who trains; nodes see the run folder under the same path.
         progress: receiver of the progress; its units are models.
 
     Raises:
@@ -247,7 +306,7 @@ def train_portfolio(
     """
 
     def train(jobs: Sequence[CandidateTraining], done: int = 0, total: int = 0) -> dict[str, TrainedCandidate | str]:
-        trained = train_all(jobs, workers, progress, done, total)
+        trained = train_all(jobs, workers, folder, progress, done, total)
         return {job.name: one for job, one in zip(jobs, trained, strict=True)}
 
     experiments = _experiments(settings, amount)

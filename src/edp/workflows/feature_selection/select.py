@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from edp.data.feature_files import set_text
 from edp.data.features import FEATURE_SETS, FeatureSet
 from edp.data.screening import FlagKind, OnProgress, ScreeningResult, ScreeningSpec, screen
 from edp.errors import DataError, closest, count_of
+from edp.jobs import IN_PROCESS, Workers
 from edp.logs import DataQuality, Repair, common_channels, open_log
 from edp.logs.formats.base import is_truth
 from edp.logs.resolve import resolve
@@ -102,7 +103,7 @@ def select_features(
     out: str | Path,
     order: SelectionOrder | None = None,
     listeners: Listeners | None = None,
-    inspected: Callable[[DataSource, Progress], DataQuality] | None = None,
+    workers: Workers = IN_PROCESS,
 ) -> Selection:
     """Screen a data set and write what it proposes.
 
@@ -111,7 +112,7 @@ def select_features(
         out: folder of all that is written.
         order: what is asked.
         listeners: who hears of the progress.
-        inspected: inspects the recordings in place of this process.
+        workers: who inspects the recordings and trains the trials.
 
     Raises:
         EdpError: the recordings cannot be read as they are, or no conclusion can be drawn from them.
@@ -120,7 +121,7 @@ def select_features(
     folder = check_writable(out)
     # Without a map all channels are read under the names of the files: a screening may judge each of them.
     mapped = source if source.signal_map is not None or _lists_maps(source) else _taken_whole(source)
-    quality = (inspected or DataSource.inspect)(mapped, listeners.logs)
+    quality = mapped.inspect(listeners.logs, workers)
     recordings, notes = _read(mapped, quality)
     spec, more = _candidates(recordings[0], order)
     screening = screen(recordings, spec, listeners.on_progress)
@@ -131,7 +132,7 @@ def select_features(
     if needed is not None:
         files["map"] = folder / "map.toml"
         write_bytes(files["map"], needed.encode())
-    trials = _tried(mapped, folder, order, screening, sets, listeners.on_trial)
+    trials = _tried(mapped, folder, order, screening, sets, listeners.on_trial, workers)
     if trials is not None:
         files["trials"] = folder / "trials"
     if order.pictures:
@@ -308,6 +309,7 @@ def _tried(
     screening: ScreeningResult,
     sets: Mapping[str, FeatureSettings],
     on_trial: OnTrial | None,
+    workers: Workers,
 ) -> Trials | None:
     if order.experiment is None:
         return None
@@ -316,7 +318,7 @@ def _tried(
     leaks = {flag.channel for flag in screening.flags if flag.kind is FlagKind.LEAK}
     barred = tuple(sorted(leaks | set(order.trials.barred)))  # a random set with a leak would look best of all
     return try_feature_sets(
-        source, experiment, asked, folder / "trials", replace(order.trials, barred=barred), on_trial
+        source, experiment, asked, folder / "trials", replace(order.trials, barred=barred), on_trial, workers
     )
 
 

@@ -9,24 +9,29 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
 
-from edp.config.experiment import Experiment, FeatureSettings
+from edp.config.experiment import Experiment, FeatureSettings, plain_tree
 from edp.data.features import FEATURE_SETS, Derived
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, closest
 from edp.evaluation.scores_file import MEAN, ScoresFile, metric
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
 from edp.networks.streaming import parameters_of
 from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, check_count, integer
 from edp.signals import Kind
 from edp.storage import make_folder, write_json
-from edp.training import Bundle, TrainingProgress
+from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import full_path
+from edp.training import Bundle, Diverged, TrainingProgress
 from edp.workflows.train_evaluate import evaluate, train
 
 Sets = Mapping[str, str | FeatureSettings]
@@ -128,6 +133,7 @@ def try_feature_sets(
     out: str | Path,
     spec: TrialSpec | None = None,
     on_trial: OnTrial | None = None,
+    workers: Workers = IN_PROCESS,
 ) -> Trials:
     """Train the experiment's network on every set with its budget, and judge all on the held-out recordings.
 
@@ -140,6 +146,7 @@ def try_feature_sets(
         out: folder of the run folders and of ``trials.json``.
         spec: random sets and seeds.
         on_trial: called with the set, how many trainings are done and of how many, and each event of the training.
+        workers: who trains; nodes see recordings and `out` under the same paths.
 
     Raises:
         EdpError: nothing that can be tried, or a training failed; what was finished stays.
@@ -155,31 +162,67 @@ def try_feature_sets(
         notes.append(f"{len(drawn)} of {spec.random} random sets were drawn: there are no others of this size")
     chosen |= drawn
     folder = make_folder(out)
-    total, done = len(chosen) * len(spec.seeds), 0
+    planned = [
+        _PlannedTrial.from_set(name, features, seed, experiment, folder)
+        for name, features in chosen.items()
+        for seed in spec.seeds
+    ]
+    tell = on_trial or (lambda name, done, total, event: None)
+    if not workers.are_alone:
+        units = [_unit(trial, source.visible_to(workers)) for trial in planned]
+        for done, (number, _) in enumerate(workers.map(units), start=1):
+            tell(planned[number].name, done, len(planned), None)
     finished: dict[str, list[_Finished]] = {}
-    for name, features in chosen.items():
-        for seed in spec.seeds:
-            settings = replace(
-                experiment,
-                task=replace(experiment.task, features=features),
-                training=replace(experiment.training, seed=seed),
-            )
-
-            # Defaults bind the loop's values now; the function is called later.
-            def tell(event: TrainingProgress | None, name: str = name, done: int = done) -> None:
-                if on_trial is not None:
-                    on_trial(name, done, total, event)
-
-            tell(None)
-            run = folder / f"{_slug(name)}_seed{seed}"
-            bundle = train(source, settings, run, tell)
-            # Persistence alone: the sets are compared with each other, other baselines cost minutes each.
-            evaluate(run, baselines=["persistence"])
-            finished.setdefault(name, []).append(_Finished.of(bundle, run))
-            done += 1
+    for done, trial in enumerate(planned):
+        tell(trial.name, done, len(planned), None)
+        bundle = _train_trial(source, trial, partial(tell, trial.name, done, len(planned)))
+        finished.setdefault(trial.name, []).append(_Finished.of(bundle, trial.run))
     trials = _compared(finished, notes, experiment.task.horizons)
     write_json(folder / FILE, trials.to_json())
     return trials
+
+
+@dataclass(frozen=True)
+class _PlannedTrial:
+    """Training of one feature set with one seed: name of the set, settings, and run folder."""
+
+    name: str
+    settings: Experiment
+    run: Path
+
+    @staticmethod
+    def from_set(
+        name: str, features: str | FeatureSettings, seed: int, experiment: Experiment, folder: Path
+    ) -> _PlannedTrial:
+        task, training = replace(experiment.task, features=features), replace(experiment.training, seed=seed)
+        return _PlannedTrial(
+            name, replace(experiment, task=task, training=training), folder / f"{_slug(name)}_seed{seed}"
+        )
+
+
+def _train_trial(
+    source: DataSource, trial: _PlannedTrial, on_event: Callable[[TrainingProgress], None] | None = None
+) -> Bundle:
+    """Train the network of a trial and evaluate it, or read what is there."""
+    bundle = train(source, trial.settings, trial.run, on_event)
+    # Persistence alone: the sets are compared with each other, other baselines cost minutes each.
+    evaluate(trial.run, baselines=["persistence"])
+    return bundle
+
+
+def _unit(trial: _PlannedTrial, source: DataSource) -> WorkUnit:
+    arguments = {"experiment": plain_tree(trial.settings)}
+    where = {"source": source, "trial": replace(trial, run=full_path(trial.run))}
+    return WorkUnit(f"{__name__}:train_unit", f"feature set '{trial.name}'", arguments, source.content_key(), where)
+
+
+def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, str]:
+    """Train the network of a trial into its run folder."""
+    try:
+        _train_trial(where["source"], where["trial"])
+    except Diverged as end:
+        return {"diverged": str(end)}
+    return {}
 
 
 def with_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:

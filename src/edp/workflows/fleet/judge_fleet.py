@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from edp import __version__
 from edp.errors import EdpError
-from edp.jobs import Workforce
-from edp.jobs.units import UnitResult, WorkUnit, forget_units, run_units
+from edp.jobs import Workers
+from edp.jobs.workers import UNITS, WorkUnit, forget_units
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.networks.running import stream_errors
@@ -32,7 +32,7 @@ from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
 from edp.training.delta import MOST_BYTES, read_delta, with_delta
 from edp.workflows.fleet.machines import MachineSource, StoredMachine, machines_of
-from edp.workflows.fleet.personal import UNITS, read_fleet
+from edp.workflows.fleet.personal import read_fleet
 from edp.workflows.monitor import run_monitor
 
 RESULT, PAGE = "fleet_report.json", "report.html"
@@ -61,7 +61,7 @@ class FleetQuestion:
 
 
 def report_fleet(
-    workforce: Workforce,
+    workers: Workers,
     question: FleetQuestion,
     out: str | Path,
     progress: Progress = SILENT,
@@ -69,7 +69,7 @@ def report_fleet(
     """Judge every machine, and write ``fleet_report.json`` and a page.
 
     Args:
-        workforce: who judges; nodes see all folders under the same paths.
+        workers: who judges; nodes see all folders under the same paths.
         question: network, store, deltas, monitor.
         out: folder of the report.
         progress: receiver of the progress; its units are machines.
@@ -86,11 +86,7 @@ def report_fleet(
 
     machines_done = progress.stage("machine", len(units))
 
-    def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-        machines_done.note(str(unit.arguments["machine"]))
-        machines_done.step(done)
-
-    results = run_units(units, workforce, folder / UNITS, note)
+    results = list(workers.map_in_order(units, machines_done, folder / UNITS))
     pairs = zip(machines, results, strict=True)
     rows = [{"machine": machine.name, "minutes": machine.minutes, **result.values} for machine, result in pairs]
     task = bundle.task
@@ -136,8 +132,7 @@ def _unit(machine: StoredMachine, digest: str, question: FleetQuestion, delta: P
         "delta": None if delta is None else str(full_path(delta)),
         "monitor": None if monitor is None else str(full_path(monitor)),
     }
-    label = f"machine '{machine.name}'"
-    return WorkUnit(f"{__name__}:judge_machine", label, arguments, " ".join(machine.digests), where)
+    return WorkUnit(f"{__name__}:judge_machine", machine.name, arguments, " ".join(machine.digests), where)
 
 
 def _hash(content: bytes) -> str:

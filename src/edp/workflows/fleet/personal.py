@@ -16,8 +16,8 @@ from edp.data.prepared import Prepared
 from edp.errors import ConfigError, EdpError, StorageError, closest
 from edp.evaluation.judge import score_predictions
 from edp.evaluation.scores_file import MEAN, metric
-from edp.jobs import Workforce
-from edp.jobs.units import UnitResult, WorkUnit, run_units
+from edp.jobs import Workers
+from edp.jobs.workers import UNITS, WorkUnit
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.progress import SILENT, Progress
@@ -34,7 +34,7 @@ from edp.workflows.transfer.case import TransferCase
 from edp.workflows.transfer.finetune import target_data
 from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
 
-FLEET, DELTAS, UNITS = "fleet.json", "deltas", "units"
+FLEET, DELTAS = "fleet.json", "deltas"
 SCHEMA = 1
 
 
@@ -67,7 +67,7 @@ class PersonalOrder:
 
 
 def finetune_fleet(
-    workforce: Workforce,
+    workers: Workers,
     source: str | Path,
     store: str | Path,
     order: PersonalOrder,
@@ -80,7 +80,7 @@ def finetune_fleet(
     not done again when the command is given again, with more machines in the store, too.
 
     Args:
-        workforce: who trains; nodes see source and store under the same paths.
+        workers: who trains; nodes see source and store under the same paths.
         source: run folder or bundle of the fleet's network.
         store: recordings that say their machine.
         order: method, settings, bytes.
@@ -103,12 +103,8 @@ def finetune_fleet(
 
     machines_done = progress.stage("machine", len(units))
 
-    def note(unit: WorkUnit, result: UnitResult, done: int) -> None:
-        machines_done.note(str(unit.arguments["machine"]))
-        machines_done.step(done)
-
     with Run.create(out, "fleet", key) as run:
-        results = run_units(units, workforce, run.file(UNITS), note)
+        results = list(workers.map_in_order(units, machines_done, run.file(UNITS)))
         rows = []
         for machine, result in zip(machines, results, strict=True):
             row = {"machine": machine.name, "minutes": round(machine.minutes, 3), **result.values}
@@ -203,8 +199,7 @@ def _unit(machine: StoredMachine, digest: str, source: str | Path, store: str | 
         "most_bytes": order.most_bytes,
     }
     where = {"source": str(full_path(Path(source))), "store": str(full_path(Path(store)))}
-    label = f"machine '{machine.name}'"
-    return WorkUnit(f"{__name__}:tune_machine", label, arguments, " ".join(machine.digests), where)
+    return WorkUnit(f"{__name__}:tune_machine", machine.name, arguments, " ".join(machine.digests), where)
 
 
 def tune_machine(identity: TrainingIdentity, where: Mapping[str, Any]) -> WithState | dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from edp.monitor.diagnosis.learning import SimulatedFault, check_healthy_blocks,
 from edp.monitor.diagnosis.signatures import Dictionary
 from edp.monitor.fitting import watched_blocks
 from edp.monitor.monitor import Monitor
-from edp.monitor.residuals.base import SideBySide
+from edp.monitor.residuals.base import ONE_BY_ONE, SideBySide
 from edp.monitor.session_blocks import block_ticks
 from edp.progress import SILENT, Progress
 from edp.recording import MACHINE, Recording
@@ -120,7 +120,7 @@ def build_dictionary(
     spec: DictionarySpec,
     seed: int = 0,
     progress: Progress = SILENT,
-    side_by_side: SideBySide | None = None,
+    side_by_side: SideBySide = ONE_BY_ONE,
 ) -> Dictionary:
     """Simulate every fault at every site and size on a machine and learn what the monitor sees of it.
 
@@ -149,12 +149,19 @@ def build_dictionary(
     check_healthy_blocks([len(part) for part in rows])
     classes = fault_classes(spec.kinds or None)
     plan = _Plan(machine, (spec.before_s, spec.after_s), seed, _missing_noise(monitor, healthy, machine, seed))
-    jobs = [_DrawJob(monitor, classes, plan, draw) for draw in range(spec.draws)]
+    drawing = progress.stage("draw", spec.draws)
+    shown = SILENT if side_by_side.is_elsewhere else drawing
+    jobs = [DrawJob(monitor, classes, plan, draw, shown) for draw in range(spec.draws)]
     faults: list[SimulatedFault] = []
-    draws = 0
-    for part in side_by_side(_drawn, jobs) if side_by_side is not None else _in_time(jobs, spec, began, progress):
-        faults += part
-        draws += 1
+    draws, spent = 0, 0.0
+    drawing.note(f"faults on {machine}")
+    for part in side_by_side(draw_faults, jobs):
+        faults += part.faults
+        draws, spent = draws + 1, spent + part.seconds
+        drawing.step(draws)
+        # Two draws at least, then as many as the time allows.
+        if not side_by_side.is_elsewhere and draws >= 2 and spent * (draws + 1) / draws > 60.0 * spec.minutes:
+            break
     provenance: dict[str, Any] = {
         "machine": machine, "seed": seed, "draws": draws, "sessions": len(faults),
         "seconds_each": spec.before_s + spec.after_s, "processor_s": round(time.process_time() - began, 1),
@@ -173,11 +180,14 @@ class _Plan:
 
 
 @dataclass(frozen=True)
-class _DrawJob:
+class DrawJob:
+    """One draw of the dictionary."""
+
     monitor: Monitor
     classes: Sequence[FaultClass]
     plan: _Plan
     number: int
+    progress: Progress = SILENT
 
     @property
     def label(self) -> str:
@@ -185,22 +195,19 @@ class _DrawJob:
         return f"draw {self.number + 1} of the dictionary"
 
 
-def _drawn(job: _DrawJob, progress: Progress = SILENT) -> list[SimulatedFault]:
-    return _draw(job.monitor, job.classes, job.plan, job.number, progress)
+@dataclass(frozen=True, eq=False)
+class DrawnFaults:
+    """Faults of one draw, and the processor time that they took."""
+
+    faults: tuple[SimulatedFault, ...]
+    seconds: float
 
 
-def _in_time(
-    jobs: Sequence[_DrawJob], spec: DictionarySpec, began: float, progress: Progress
-) -> Iterator[list[SimulatedFault]]:
-    """One draw after the other, two at least, until the next would pass the time."""
-    draws = progress.stage("draw", len(jobs))
-    for draw, job in enumerate(jobs):
-        spent = time.process_time() - began
-        if draw >= 2 and spent * (draw + 1) / draw > 60.0 * spec.minutes:
-            return
-        draws.note(f"faults on {job.plan.machine}")
-        yield _drawn(job, draws)
-        draws.step(draw + 1)
+def draw_faults(job: DrawJob) -> DrawnFaults:
+    """Simulate the sessions of one draw."""
+    began = time.process_time()
+    faults = tuple(_draw(job.monitor, job.classes, job.plan, job.number, job.progress))
+    return DrawnFaults(faults, time.process_time() - began)
 
 
 def _draw(

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import itertools
-import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edp.config.monitor import MonitorExperiment, monitor_toml
-from edp.errors import ConfigError, DataError, LostError, closest
+from edp.errors import ConfigError, DataError, closest
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.workers import UNITS, forget_units
 from edp.logs.source import DataSource
 from edp.monitor.detectable import effort_line, found_sizes, healthy_range, measure_found_sizes, promise_lines
 from edp.monitor.fitting import FittedChain, check_healthy_sessions, doubtful_sessions, fit_chain
 from edp.monitor.machine_offsets import scatter_of
 from edp.monitor.monitor import Monitor
 from edp.monitor.monitor_file import load_monitor, save_monitor
-from edp.monitor.residuals.base import FitMaterial, ResidualSource, ResidualSpec, SideBySide
+from edp.monitor.residuals.base import ONE_BY_ONE, FitMaterial, ResidualSource, ResidualSpec, SideBySide
 from edp.monitor.residuals.flow_balances import FlowBalances
 from edp.monitor.residuals.groups import Group, sensed_channels
 from edp.monitor.residuals.virtual_sensors import VirtualSensorsSpec
 from edp.monitor.session_blocks import SessionBlocks, session_means
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
-from edp.sandbox.helpers import Helpers
 from edp.settings.provenance import new_provenance
 from edp.signals import Channel
 from edp.storage import write_json
@@ -42,6 +41,7 @@ from edp.training.bundle import Bundle, load_bundle
 from edp.training.twin_bundle import TwinBundle, holds_twin, load_twin
 from edp.wording import percent, typed
 from edp.workflows.monitor.dictionary import build_dictionary, check_dictionary, check_dictionary_inputs, machine_of
+from edp.workflows.monitor.fit_units import UnitMap
 
 LEAST_SESSIONS = 8
 """Of healthy sessions: two to train on, one to choose by, and some for the rest."""
@@ -87,7 +87,7 @@ def fit_monitor(
     experiment: MonitorExperiment,
     out: str | Path,
     progress: Progress = SILENT,
-    workers: int = 1,
+    workers: Workers = IN_PROCESS,
 ) -> FittedMonitor:
     """Fit a monitor to healthy logs and write its folder.
 
@@ -97,8 +97,8 @@ def fit_monitor(
         experiment: settings.
         out: folder of the monitor; that of a finished fit with the same settings and logs is read.
         progress: receiver of what begins.
-        workers: processes side by side, 0 for one a core; the monitor does not depend on it, unless the dictionary has
-            not the time for all of its draws: several processes make them all.
+        workers: who fits; nodes see the run folder under the same path. The monitor does not depend on it, unless the
+            dictionary has not the time for all of its draws: several processes make them all.
 
     Raises:
         EdpError: runs or logs that cannot be used, or too few hours for the promise, or a process died.
@@ -114,17 +114,15 @@ def fit_monitor(
     with Run.create(out, "monitor", key, settings) as opened:
         if opened.is_finished:
             return _read_fitted(opened.path, experiment)
-        with Helpers(workers or os.cpu_count() or 1, _died) as helpers:
-
-            def side_by_side(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterable[Any]:
-                return helpers.ordered(partial(_in_one_thread, function), jobs)
-
-            fitted = fit_to_recordings(
-                recordings, experiment, bundles, progress, side_by_side=map if helpers.workers == 1 else side_by_side
-            )
+        with workers.stay() as staying:
+            side_by_side = UnitMap(staying, opened.path, key)
+            fitted = fit_to_recordings(recordings, experiment, bundles, progress, side_by_side=side_by_side)
+        fitted = replace(fitted, seconds=fitted.seconds + side_by_side.seconds)
         provenance = replace(new_provenance(origin), seed=experiment.seed, seconds=round(fitted.seconds, 2))
         write_json(opened.file(PROVENANCE), provenance.to_table())
-        return replace(fitted, folder=save_monitor(fitted.monitor, opened.path))
+        fitted = replace(fitted, folder=save_monitor(fitted.monitor, opened.path))
+    forget_units(opened.path / UNITS)
+    return fitted
 
 
 def _read_fitted(folder: Path, experiment: MonitorExperiment) -> FittedMonitor:
@@ -145,19 +143,6 @@ def holds_model(path: str | Path) -> bool:
     return any(is_there(Path(path) / name) for name in ("bundle", "bundle.json", "run.json", "twin"))
 
 
-def _in_one_thread(function: Callable[[Any], Any], job: Any) -> Any:
-    """A job with the sums of a fit in one process."""
-    with one_blas_thread():
-        return function(job)
-
-
-def _died(label: str) -> LostError:
-    return LostError(
-        f"a worker process died at '{label}' (out of memory, or stopped from outside; a calling script needs "
-        "`if __name__ == '__main__':`); run the same command again with --workers 1"
-    )
-
-
 def _network_of(run: str | Path) -> Bundle | TwinBundle:
     """Return the network or twin of a run.
 
@@ -174,7 +159,7 @@ def fit_to_recordings(
     bundles: Sequence[Bundle | TwinBundle] = (),
     progress: Progress = SILENT,
     again: bool = False,
-    side_by_side: SideBySide = map,
+    side_by_side: SideBySide = ONE_BY_ONE,
 ) -> FittedMonitor:
     """`fit_monitor` without files.
 
@@ -220,7 +205,8 @@ def fit_to_recordings(
             return replace(better, doubtful=(*trained, *better.doubtful), seconds=seconds)
     monitor = _assembled(material, sources, fitted, sessions, rest)
     # Validation sessions set no limit.
-    minutes, fit_s = 60.0 * float(monitor.provenance["hours"]), time.process_time() - began
+    minutes = 60.0 * float(monitor.provenance["hours"])
+    fit_s = time.process_time() - began + (side_by_side.seconds if isinstance(side_by_side, UnitMap) else 0.0)
     trials = measure_found_sizes(monitor, validation, minutes, fit_s, progress)
     measured = {"found_sizes": [asdict(size) for size in trials.sizes], "found_effort": trials.effort()}
     measured["healthy_range"] = healthy_range(fitted)
@@ -268,12 +254,9 @@ def _with_dictionary(
     if not machine:
         return monitor
 
-    if side_by_side is not map:
-        progress.note(f"faults on {machine}")
     dictionary = build_dictionary(
-        monitor, healthy, machine, experiment.dictionary, experiment.seed, progress,
-        None if side_by_side is map else side_by_side,
-    )  # fmt: skip
+        monitor, healthy, machine, experiment.dictionary, experiment.seed, progress, side_by_side
+    )
     return replace(monitor, diagnosis=dictionary)
 
 
@@ -347,7 +330,8 @@ class _Fit:
         return type(self.spec).__name__ if self.group is None else f"virtual sensors of {self.group.name}"
 
 
-def _fit_source(job: _Fit) -> ResidualSource | Bundle | None:
+def fit_source(job: _Fit) -> ResidualSource | Bundle | None:
+    """Fit a source of residuals, or the network of one group."""
     if isinstance(job.spec, VirtualSensorsSpec) and job.group is not None:
         job.material.progress.note(job.label)
         return job.spec.network(job.group, job.material, job.groups)
@@ -355,7 +339,7 @@ def _fit_source(job: _Fit) -> ResidualSource | Bundle | None:
 
 
 def _sources(
-    experiment: MonitorExperiment, material: FitMaterial, side_by_side: SideBySide = map
+    experiment: MonitorExperiment, material: FitMaterial, side_by_side: SideBySide = ONE_BY_ONE
 ) -> tuple[ResidualSource, ...]:
     """The settings' residuals that find something to judge.
 
@@ -364,16 +348,15 @@ def _sources(
     """
     jobs = []
     # Other processes cannot call what shows progress here.
-    elsewhere = side_by_side is not map
-    if elsewhere:
+    if side_by_side.is_elsewhere:
         progress, material = material.progress, replace(material, progress=SILENT)
     for spec in experiment.residuals:
         groups = spec.groups(material) if isinstance(spec, VirtualSensorsSpec) else (None,)
         jobs += [_Fit(spec, material, group, len(groups)) for group in groups]
     fits: dict[ResidualSpec, ResidualSource | None] = {}
     networks: dict[ResidualSpec, dict[str, Bundle]] = {}
-    for job, result in zip(jobs, side_by_side(_fit_source, jobs), strict=True):
-        if elsewhere:
+    for job, result in zip(jobs, side_by_side(fit_source, jobs), strict=True):
+        if side_by_side.is_elsewhere:
             progress.note(f"{job.label}, done")
         if job.group is None:
             fits[job.spec] = result

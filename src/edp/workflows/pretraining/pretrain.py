@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from edp import __version__
-from edp.config.experiment import Experiment
+from edp.config.experiment import Experiment, plain_tree
 from edp.data.episodes import by_machine
 from edp.data.prepared import Prepared
 from edp.data.splits import ByMachine
 from edp.errors import BundleError, ConfigError
 from edp.evaluation.context import Contexts, context_errors
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.progress import SILENT, Progress
 from edp.storage import write_json
-from edp.storage.runs import Run, check_claimable
-from edp.training import load_bundle
+from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import full_path
+from edp.storage.runs import Run, check_claimable, check_visible
+from edp.training import Diverged, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.pretraining.methods import PRETRAININGS
 from edp.training.pretraining.methods.base import HasModel
@@ -59,6 +64,7 @@ def pretrain(
     order: Pretrain,
     out: str | Path,
     progress: Progress = SILENT,
+    workers: Workers = IN_PROCESS,
 ) -> dict[str, Any]:
     """Train one network over many machines and judge it on others; the same call goes on after a stop.
 
@@ -70,6 +76,7 @@ def pretrain(
         order: the method.
         out: run folder.
         progress: receiver of the progress; the units of the training are epochs.
+        workers: who trains; a node of a cluster sees recordings and run folder under the same paths.
 
     Returns:
         The content of ``foundation.json``: machines of each part and errors by context on those that test.
@@ -79,6 +86,8 @@ def pretrain(
         Diverged: the loss was not finite any more.
     """
     check_claimable(out, "pretraining")
+    if workers.cluster:
+        _pretrain_on_node(source, experiment, order, Path(out), workers)
     if not isinstance(experiment.split, ByMachine):
         # Other splits leave recordings of a machine on both sides, and the network would know the machines that judge
         # it.
@@ -107,6 +116,34 @@ def pretrain(
         write_json(run.file(RESULT), result)
         run.finish()
     return result
+
+
+def _pretrain_on_node(source: DataSource, experiment: Experiment, order: Pretrain, out: Path, workers: Workers) -> None:
+    """Train on a node of a cluster, into the run folder.
+
+    Raises:
+        ConfigError: the run folder is not there afterwards.
+    """
+    arguments = {"experiment": plain_tree(experiment), "method": order.method, "meta": asdict(order.meta)}
+    start = None if order.start is None else full_path(Path(order.start))
+    where = {
+        "source": source.visible_to(workers),
+        "experiment": experiment,
+        "order": replace(order, start=start),
+        "out": str(full_path(out)),
+    }
+    unit = WorkUnit(f"{__name__}:pretrain_unit", f"pretraining in '{out}'", arguments, source.content_key(), where)
+    for _ in workers.map([unit]):
+        check_visible(out)
+
+
+def pretrain_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, str]:
+    """Train one network over many machines, or continue with it; a diverged run says so in its folder."""
+    try:
+        pretrain(where["source"], where["experiment"], where["order"], where["out"])
+    except Diverged as end:
+        return {"diverged": str(end)}
+    return {}
 
 
 def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,17 @@ from edp.data.series import Series
 from edp.errors import ConfigError
 from edp.evaluation.scores_file import ScoredTarget
 from edp.evaluation.transfer_file import MethodScores, PartMinutes, TransferData, TransferFile, TransferTask
+from edp.jobs import IN_PROCESS, Workers
+from edp.jobs.workers import WorkUnit
 from edp.logs.source import DataSource
 from edp.networks.predictor import describe
 from edp.progress import SILENT, Progress
 from edp.signals import KINDS
 from edp.storage import write_bytes
 from edp.storage.headers import digests_of
-from edp.storage.runs import Run, check_claimable
+from edp.storage.ledger import TrainingIdentity
+from edp.storage.paths import full_path
+from edp.storage.runs import Run, check_claimable, check_visible
 from edp.training import Diverged
 from edp.training.bundle import weights_digest
 from edp.training.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
@@ -86,6 +91,7 @@ def finetune(
     order: FinetuneRequest,
     out: str | Path,
     progress: Progress = SILENT,
+    workers: Workers = IN_PROCESS,
 ) -> TransferFile:
     """Train a network of one machine on for another, judge it beside baselines, and write a run folder.
 
@@ -98,6 +104,7 @@ def finetune(
         order: methods and settings.
         out: run folder.
         progress: receiver of the progress; its units are methods.
+        workers: who trains; nodes see source, logs and run folder under the same paths.
 
     Returns:
         The content of ``transfer.json``.
@@ -114,6 +121,8 @@ def finetune(
     notes += repair_notes
     for note in notes:
         progress.note(note)
+    if not workers.are_alone:
+        _train_elsewhere(source, logs, order, Path(out), [name for name in names if METHODS[name].trains], workers)
     results: dict[str, Made] = {}
     with Run(out, KIND) as run:
         methods = progress.stage("method", len(names))
@@ -142,35 +151,33 @@ def _baseline_folder(out: Path, name: str) -> Path:
     return out / "baselines" / name
 
 
-def trained_methods(source: str | Path, order: FinetuneRequest) -> list[str]:
-    """The methods of an order that leave a run, and for which the source has what they need.
+def _train_elsewhere(
+    source: str | Path, logs: DataSource, order: FinetuneRequest, out: Path, names: Sequence[str], workers: Workers
+) -> None:
+    """Train methods into their run folders, where `finetune` finds them done."""
+    changes = [change if isinstance(change, str) else dict(change) for change in order.changes]
+    shared = {"source": str(full_path(Path(source))), "logs": logs.visible_to(workers), "out": str(full_path(out))}
+    units = []
+    for name in names:
+        arguments = {"name": name, "method": order.method, "spec": asdict(order.spec), "changes": changes}
+        where = {**shared, "order": order}
+        units.append(WorkUnit(f"{__name__}:train_unit", f"method '{name}'", arguments, logs.content_key(), where))
+    for _ in workers.map(units):
+        check_visible(out)
 
-    Raises:
-        EdpError: as `finetune`, of source and order.
-    """
-    return [name for name in _able(read_source(source), order)[0] if METHODS[name].trains]
 
-
-def train_method(source: str | Path, logs: DataSource, order: FinetuneRequest, out: str | Path, name: str) -> None:
-    """Train one method into its run folder, where `finetune` finds it done.
-
-    Args:
-        source: run folder or bundle.
-        logs: recordings of the target.
-        order: methods and settings.
-        out: run folder of the whole.
-        name: of the method.
-
-    Raises:
-        EdpError: as `finetune`.
-        Diverged: its training diverged; `finetune` then says so of a baseline, and goes on.
-    """
-    begun = read_source(source)
+def train_unit(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, str]:
+    """Train one method of a fine-tuning, or continue with it; `finetune` reports a diverged method."""
+    name, order, out = identity.config["name"], where["order"], where["out"]
+    begun = read_source(where["source"])
     experiment = target_experiment(begun, order.changes)
-    data, _ = target_data(begun, logs, experiment, order)
+    data, _ = target_data(begun, where["logs"], experiment, order)
     with Run(out, KIND) if name == order.method else nullcontext(_baseline_folder(Path(out), name)) as folder:
-        case = TransferCase(begun, logs, data, experiment, order.spec, folder)
-        METHODS[name]().make(case)
+        try:
+            METHODS[name]().make(TransferCase(begun, where["logs"], data, experiment, order.spec, folder))
+        except Diverged as end:
+            return {"diverged": str(end)}
+    return {}
 
 
 def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[str]]:

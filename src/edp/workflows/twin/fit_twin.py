@@ -11,7 +11,7 @@ from edp.config.twin import TwinExperiment
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.errors import LostError
+from edp.jobs import IN_PROCESS, Workers
 from edp.networks.twin import Twin, TwinScales, TwinSpec
 from edp.networks.twin.elements import ElementsTwin
 from edp.networks.twin.grey.datasheet import datasheet
@@ -19,11 +19,10 @@ from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.residual import Residual, ResidualTwin
 from edp.progress import SILENT, Progress
-from edp.sandbox.helpers import Helpers
 from edp.storage.runs import KeyedRun
 from edp.training.elements_fit import fit_elements
 from edp.training.free_run import FittedTwin, FreeRunProgress
-from edp.training.free_run_members import MemberTraining, fit_members, noted_progress, noting_member, one_by_one
+from edp.training.free_run_members import MemberTraining, fit_members, member_unit, noted_progress, one_by_one
 from edp.training.grey_fit import fit_grey_box
 from edp.training.progress_steps import free_run_steps
 from edp.training.residual_fit import fit_residual
@@ -59,7 +58,7 @@ class TwinFit:
         data: prepared series.
         experiment: the settings.
         progress: receiver of what begins; the units of a training are updates.
-        helpers: processes that train members of an average side by side; none: one after the other.
+        workers: who trains members of an average.
     """
 
     channels: TwinChannels
@@ -67,7 +66,7 @@ class TwinFit:
     data: Prepared
     experiment: TwinExperiment
     progress: Progress = SILENT
-    helpers: Helpers | None = None
+    workers: Workers = IN_PROCESS
 
     @property
     def on_event(self) -> Callable[[FreeRunProgress], None]:
@@ -116,9 +115,9 @@ class TwinFit:
         """Train networks side by side, or one by one; in order.
 
         Raises:
-            EdpError: see `fit_free_runs`, or a helper died.
+            EdpError: see `fit_free_runs`, or a process was killed again and again.
         """
-        if self.helpers is None or self.helpers.workers <= 1:
+        if self.workers.are_alone or any(job.folder is None for job in jobs):
             return one_by_one(jobs, on_event)
         shown: list[int] = []
 
@@ -128,7 +127,10 @@ class TwinFit:
                 shown[:] = [event.update]
                 on_event(event)
 
-        return self.helpers.ordered(noting_member, jobs, look)
+        for _ in self.workers.map([member_unit(job) for job in jobs], waiting=look):
+            look()
+        # What is trained is read from the folders.
+        return one_by_one(jobs, None)
 
     def refitted(self, first: FittedFormulation) -> FittedFormulation:
         """What needs no stretches to choose its weights, fitted anew to the validation part as well.
@@ -138,11 +140,3 @@ class TwinFit:
         data = replace(self.data, train=[*self.data.train, *self.data.validation])
         again = replace(self, data=data).fitted(first.spec, None)
         return replace(again, unseen=((first.fitted.twin, self.data.validation),))
-
-
-def member_died(label: str) -> LostError:
-    """Error for the label of a training whose process died."""
-    return LostError(
-        f"a worker process died during '{label}' (out of memory, or stopped from outside; a calling script needs "
-        "`if __name__ == '__main__':`); run the same command again with fewer workers: it goes on where it stopped"
-    )

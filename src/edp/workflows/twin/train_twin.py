@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,17 +17,16 @@ from edp.evaluation.beyond import RANGES, command_ranges
 from edp.evaluation.free_run import calibrated, check_runs
 from edp.evaluation.free_run_file import CandidatesFile, FreeRunScores, read_models
 from edp.evaluation.step_response import step_responses
+from edp.jobs import IN_PROCESS, Workers
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
 from edp.networks.twin.grey.wiring import FARTHEST_TURN
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.kinds import AutoTwin
-from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.networks.twin.recurrent_members import scales_for
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
-from edp.sandbox.helpers import Helpers
 from edp.settings.results import plain_value
 from edp.signals import Kind
 from edp.sim.machine.machine_files import load_machine
@@ -39,7 +37,7 @@ from edp.training.provenance import training_provenance
 from edp.training.twin_bundle import OIL_C, STROKES, TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.continue_twin import BaseTwin, ContinuedTwin
-from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
+from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.ground_twin import ground_twin
 from edp.workflows.twin.judge_twin import judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
@@ -70,7 +68,7 @@ def train_twin(
     experiment: TwinExperiment,
     out: str | Path,
     progress: Progress = SILENT,
-    workers: int = 1,
+    workers: Workers = IN_PROCESS,
     start: str | Path | None = None,
 ) -> TrainedTwin:
     """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``, and where there was a
@@ -81,8 +79,8 @@ def train_twin(
         experiment: the settings.
         out: run folder.
         progress: receiver of what begins; the units of a training are updates.
-        workers: processes that train the networks of an average side by side; 0 for one a core. The twin has the same
-            bits with any number.
+        workers: who trains the networks of an average; nodes see the run folder under the same path. The twin has the
+            same bits with any number.
         start: run folder of a recurrent twin that goes on with these recordings, or with a `ground` of a grey box
             that learns it from them; None: a new one.
 
@@ -108,11 +106,11 @@ def train_twin(
     settings = {name: value for name, value in TWIN_SETTINGS.plain(experiment).items() if name != "ground"}
     key = run_key({"twin": settings} | begun | _linkage(experiment), data.digest)
     create = Run.create(out, "twin", key, twin_toml(experiment))
-    with create as run, Helpers(_helpers(workers), member_died) as helpers:
+    with create as run, workers.stay() as staying:
         if run.is_finished:
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, read_models(bundle.scores, f"'{run.path}'"), True)
-        fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, progress, helpers)
+        fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, progress, staying)
         result = _chosen(fit, KeyedRun(run, key), base)
         fitted = result.fitted
         run.write_history(fitted.history)
@@ -167,11 +165,6 @@ def _linkage(experiment: TwinExperiment) -> dict[str, Any]:
     if not isinstance(spec, GreyBox) or not spec.linkage:
         return {}
     return {"linkage": asdict(load_machine(spec.linkage))}
-
-
-def _helpers(workers: int) -> int:
-    """Processes that have something to do: no average has more members."""
-    return min(workers or os.cpu_count() or 1, MOST_MEMBERS)
 
 
 def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormulation:
