@@ -169,8 +169,8 @@ class JudgedPart:
         tensors: by ``recording/name``.
     """
 
-    measured: Mapping[str, Any]
-    intervals: Mapping[str, Any] | None
+    measured: Mapping[str, object]
+    intervals: Mapping[str, object] | None
     tensors: Mapping[str, NDArray[np.float32]]
 
 

@@ -34,7 +34,7 @@ class Measured:
         self.integrals = {target: np.zeros(2) for target in integrate}
         self.recordings: dict[int, dict[str, ByTarget]] = {}
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """All that it holds, as plain values and arrays."""
         return {
             "tallies": [tally.state() for tally in self.tallies],
@@ -86,7 +86,7 @@ class SpeedTally:
         self.count += np.bincount(places, minlength=SPEED_BINS)
         self.total += np.bincount(places, weights=np.abs(predicted - truth).ravel(), minlength=SPEED_BINS)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """All that it holds, as arrays."""
         return {"count": self.count, "total": self.total}
 

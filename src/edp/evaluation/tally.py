@@ -39,7 +39,7 @@ class Tally:
         if self.count > MOST_EXACT or self._sums is not None:
             self._sum_all()
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """All that it holds, as plain values and arrays."""
         if self._sums is not None:
             return {"count": self.count, "sums": self._sums.state()}
@@ -89,7 +89,7 @@ class _Sums:
         for sketch, column in zip(self.sizes, size.T, strict=True):
             sketch.update(column)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         return {"truth": self.truth.state(), "errors": self.errors, "sizes": [sketch.state() for sketch in self.sizes]}
 
     def add(self, state: Mapping[str, Any]) -> None:

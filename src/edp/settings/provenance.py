@@ -84,7 +84,7 @@ class Provenance:
     more: Table = field(default_factory=dict)
 
     @classmethod
-    def from_table(cls, table: Mapping[str, Any], where: str) -> Self:
+    def from_table(cls, table: Mapping[str, object], where: str) -> Self:
         """Build a provenance from the content of a file, which messages call `where`.
 
         Raises:

@@ -57,7 +57,7 @@ class ResultFile:
         return cls.from_table(read_object(path), f"'{path}'")
 
     @classmethod
-    def from_table(cls, table: Mapping[str, Any], where: str) -> Self:
+    def from_table(cls, table: Mapping[str, object], where: str) -> Self:
         """Build the results from the content of a file, which messages call `where`.
 
         Raises:
@@ -80,7 +80,7 @@ class ResultFile:
         write_json(Path(folder) / self.NAME, self.to_table())
 
 
-def read_part(cls: type[T], table: Mapping[str, Any], where: str, what: str = "results", advice: str = AGAIN) -> T:
+def read_part(cls: type[T], table: Mapping[str, object], where: str, what: str = "results", advice: str = AGAIN) -> T:
     """Build a dataclass of results from a part of a file, which messages call `where`.
 
     Raises:
@@ -111,7 +111,7 @@ def plain_value(value: Any) -> Any:
 
 
 @cache
-def _empty_defaults(cls: type) -> Mapping[str, Any]:
+def _empty_defaults(cls: type) -> Mapping[str, object]:
     """Return the defaults that are empty, by name of the field."""
     defaults = {
         entry.name: entry.default_factory() if entry.default_factory is not MISSING else entry.default

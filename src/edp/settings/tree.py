@@ -23,7 +23,7 @@ from edp.registry import Registry
 from edp.settings.bounds import shown
 
 Table = dict[str, Any]
-Change = str | Mapping[str, Any]
+Change = str | Mapping[str, object]
 """A change of settings: ``key.path=value``, or a table."""
 Parts = Mapping[str, Registry[type]]
 """Registries by the name of the field that holds one of their parts."""
@@ -158,7 +158,7 @@ class SettingsTree:
         values = {entry.name: getattr(spec, entry.name) for entry in fields(spec)}
         return {name: self.plain(value, name) for name, value in values.items() if value is not None}
 
-    def build(self, cls: type[T], table: Mapping[str, Any], where: str, path: str = "") -> T:
+    def build(self, cls: type[T], table: Mapping[str, object], where: str, path: str = "") -> T:
         """Build a settings object from a table; missing keys take their defaults.
 
         Args:
@@ -373,7 +373,7 @@ def _scalar(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
     """Check and convert a value or a nested list with pydantic; refuse silent coercions first."""
     leaves = _leaves(hint)
     # pydantic takes true for 1 and "3" for 3: a typing error would become a setting.
-    if _truth_in(value) and not leaves & {bool, Any}:
+    if _truth_in(value) and not leaves & {bool, Any, object}:
         problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
         return None
     if leaves <= {bool, type(None)} and not isinstance(value, bool):

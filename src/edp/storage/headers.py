@@ -83,7 +83,7 @@ def is_whole(file: Path) -> bool:
     return True
 
 
-def _entries(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def _entries(header: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
     """Yield the entries that name a file of arrays: in the header, or in one of its parts."""
     parts = [value for value in header.values() if isinstance(value, dict)]
     within = [value for part in parts for value in part.values() if isinstance(value, dict)]

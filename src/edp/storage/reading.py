@@ -162,7 +162,7 @@ def parse_json(text: str, where: str, error: type[Exception] = StorageError, fin
 
 def read_toml(
     path: str | Path, where: str = "", error: type[Exception] = StorageError, advice: str = ""
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Read a TOML file; see `parse_toml`.
 
     Args:

@@ -18,7 +18,7 @@ MODES = ("sound", "thesis")
 """Whose tests and rules decide: those of docs/statistics.md, or those of the thesis."""
 
 
-def read_study(path: str | Path) -> Mapping[str, Any]:
+def read_study(path: str | Path) -> Mapping[str, object]:
     """The content of a study's file.
 
     Args:
@@ -34,7 +34,7 @@ def read_study(path: str | Path) -> Mapping[str, Any]:
             raise StorageError(f"'{path}' holds no study ({FILE} is missing); give the folder of edp search --study")
     study = read_json(file)
     check_study(study, str(file))
-    content: Mapping[str, Any] = study
+    content: Mapping[str, object] = study
     return content
 
 

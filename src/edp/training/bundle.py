@@ -126,7 +126,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     weights = f"weights-{digest[:12]}.safetensors"
     write_bytes(path / weights, data)
     task = bundle.task
-    header: dict[str, Any] = {
+    header: dict[str, object] = {
         "schema": INTEGER_SCHEMA if integer else SCHEMA,
         "edp": __version__,
         "task": task_to_plain(task),
@@ -192,13 +192,13 @@ def load_bundle(folder: str | Path) -> Bundle:
         return _assembled(header, path)
 
 
-def with_plugins(header: Mapping[str, Any]) -> dict[str, Any]:
+def with_plugins(header: Mapping[str, object]) -> dict[str, object]:
     """Return a header with the plug-ins whose parts it names."""
     plugins = origins_in(header)
     return {**header, PLUGINS: plugins} if plugins else dict(header)
 
 
-def check_hash(header: Mapping[str, Any], file: Path) -> None:
+def check_hash(header: Mapping[str, object], file: Path) -> None:
     """Raise BundleError if the hash does not match the header or a plug-in part is not registered.
 
     Raises:
@@ -235,7 +235,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
     return path
 
 
-def _reworded(header: Mapping[str, Any]) -> dict[str, Any]:
+def _reworded(header: Mapping[str, Any]) -> dict[str, object]:
     """Convert the keys of an earlier header to this version."""
     reworded = {**header, "provenance": _renamed(header["provenance"], "lesson", "strategy")}
     if "adaptation" in header:
@@ -244,7 +244,7 @@ def _reworded(header: Mapping[str, Any]) -> dict[str, Any]:
     return reworded
 
 
-def _renamed(table: Mapping[str, Any], old: str, new: str) -> dict[str, Any]:
+def _renamed(table: Mapping[str, object], old: str, new: str) -> dict[str, object]:
     return {new if key == old else key: value for key, value in table.items()}
 
 
@@ -277,7 +277,7 @@ def as_damage(path: Path) -> Iterator[None]:
         raise BundleError(f"bundle '{path}' is damaged: {cause}; restore it or train again") from error
 
 
-def _read_header(path: Path) -> dict[str, Any]:
+def _read_header(path: Path) -> dict[str, object]:
     header = read_header(path / HEADER)
     if not isinstance(header, dict) or "schema" not in header:
         header = {"schema": None}

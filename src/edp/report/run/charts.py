@@ -99,7 +99,7 @@ def _horizons(facts: Facts, horizons: Sequence[int], keeps_zoom: bool = False) -
     )
 
 
-def _network_last(models: Mapping[str, Any]) -> list[str]:
+def _network_last(models: Mapping[str, object]) -> list[str]:
     """Models in the order in which they are drawn: the network above all others."""
     return sorted(models, key=lambda name: name == NETWORK)
 

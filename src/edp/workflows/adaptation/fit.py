@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ Rows = NDArray[np.float64]
 HISTORY = "history.jsonl"
 
 
-def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> tuple[Adaptation, dict[str, Any]]:
+def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> tuple[Adaptation, dict[str, object]]:
     """Write a run whose network has an adaptation: it is exported with it and replayed with it.
 
     Args:

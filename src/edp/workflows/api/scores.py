@@ -52,7 +52,7 @@ class JudgedScores(OneFrame):
         """Folder that holds ``scores.json``, or the evaluated bundle."""
         return self._facts.folder
 
-    def to_dict(self) -> Mapping[str, Any]:
+    def to_dict(self) -> Mapping[str, object]:
         """Everything that was measured: the content of ``scores.json``."""
         return {} if self._facts.scores is None else self._facts.scores.to_table()
 

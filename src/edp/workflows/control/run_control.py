@@ -103,7 +103,7 @@ def control_loops(
 
 def _content(
     experiment: ControlExperiment, tasks: Sequence[ControlTask], results: Sequence[LoopResult]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     scores = [result.score for result in results]
     energies = [score.energy_kj for score in scores]
     times = np.concatenate([result.solve_s for result in results]) * 1e6
@@ -146,7 +146,7 @@ def sentence(content: Mapping[str, Any], controller: str) -> str:
     )
 
 
-def _loop(task: ControlTask, result: LoopResult) -> dict[str, Any]:
+def _loop(task: ControlTask, result: LoopResult) -> dict[str, object]:
     times = result.solve_s * 1e6
     return {
         "name": result.recording.name,
@@ -163,7 +163,7 @@ def _loop(task: ControlTask, result: LoopResult) -> dict[str, Any]:
     }
 
 
-def _plain(events: Sequence[ControlEvent]) -> list[dict[str, Any]]:
+def _plain(events: Sequence[ControlEvent]) -> list[dict[str, object]]:
     return [{"tick": event.tick, "ticks": event.ticks, "text": event.text} for event in events]
 
 
@@ -172,7 +172,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _facts(
-    title: str, content: Mapping[str, Any], results: Sequence[LoopResult], provenance: Provenance
+    title: str, content: Mapping[str, object], results: Sequence[LoopResult], provenance: Provenance
 ) -> ControlFacts:
     recordings = [result.recording for result in results]
     scene = scene_of(recordings[0], str(content["machine"]))

@@ -121,7 +121,7 @@ class Trials:
     held_out: tuple[str, ...]
     notes: tuple[str, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain values: the content of ``trials.json``."""
         return {"schema": 1, **asdict(self)}
 

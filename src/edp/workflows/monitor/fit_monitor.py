@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -226,7 +225,7 @@ def _assembled(
 ) -> Monitor:
     """The monitor without a dictionary; `rest` are the sessions that trained no residual."""
     doubtful = fitted.doubtful
-    provenance: dict[str, Any] = {
+    provenance: dict[str, object] = {
         "sessions": len(sessions),
         "hours": sum(session.duration_s for session in sessions) / 3600.0,
         "doubtful": list(doubtful),

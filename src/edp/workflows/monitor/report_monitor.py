@@ -83,12 +83,12 @@ def read_run(folder: Path, title: str | None = None) -> MonitorFacts:
     )
 
 
-def _provenance(folder: Path, content: Mapping[str, Any]) -> Provenance:
+def _provenance(folder: Path, content: Mapping[str, object]) -> Provenance:
     file = folder / PROVENANCE
     return Provenance.from_table({**content, **(read_object(file) if is_there(file) else {})}, f"'{file}'")
 
 
-def _remarks(content: Mapping[str, Any], where: str) -> dict[str, list[str]]:
+def _remarks(content: Mapping[str, object], where: str) -> dict[str, list[str]]:
     """What is to be said of recordings, with their names; runs of earlier versions have less of it.
 
     Raises:
@@ -138,7 +138,7 @@ def _alarm(value: Any, where: str) -> AlarmFacts:
 
 def _cause(value: Any, where: str) -> Cause:
     names = [entry.name for entry in fields(Cause)]
-    entry: Mapping[str, Any] = object_with(value, names, where)
+    entry: Mapping[str, object] = object_with(value, names, where)
     if entry["at_fault"] not in ("sensor", "machine", "none") or not isinstance(entry["grave"], bool):
         raise StorageError(f"{where}: a cause is damaged; run the monitor again")
     kind, site, component, unit, words = (

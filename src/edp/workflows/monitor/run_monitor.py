@@ -83,7 +83,7 @@ class MonitorRun:
         """Alarms that say the same, together; see `episodes`."""
         return episodes(self.alarms)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Plain JSON values."""
         return {
             "hours": self.hours,

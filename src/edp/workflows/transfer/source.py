@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.experiment import (
     Change,
@@ -63,7 +62,7 @@ class SourceModel:
         return dict(self.bundle.provenance.origin.frozen)
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """What identifies it."""
         digest = None if self.data is None else self.data.digest
         return {"weights": weights_digest(self.predictor), "recordings": digest}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.errors import ConfigError
@@ -103,7 +102,7 @@ def _base(start: str | Path | None) -> tuple[BaseTwin, str]:
     return BaseTwin(Path(start), bundle, twin_hash(start)), bundle.spec.linkage
 
 
-def _known_rows(run: Path) -> list[dict[str, Any]]:
+def _known_rows(run: Path) -> list[dict[str, object]]:
     """Rows of the datasheet of a run; none where it has none."""
     file = run / f"{DATASHEET}.json"
     if not is_file_at(file):

@@ -155,7 +155,7 @@ def _check_judged(channels: TwinChannels, data: Prepared, experiment: TwinExperi
         check_runs(channels, scales, prefix, data.validation, judge.seconds, judge.calibration_starts)
 
 
-def _linkage(experiment: TwinExperiment) -> dict[str, Any]:
+def _linkage(experiment: TwinExperiment) -> dict[str, object]:
     """All numbers of the machine that settings name for its linkage: an edited file asks for another twin.
 
     Raises:
@@ -182,13 +182,13 @@ def _chosen(fit: TwinFit, run: KeyedRun, base: BaseTwin | None) -> FittedFormula
     return result
 
 
-def _oil(recordings: Sequence[Recording]) -> dict[str, Any]:
+def _oil(recordings: Sequence[Recording]) -> dict[str, object]:
     """Temperature of the oil that all recordings tell; nothing where one does not."""
     celsius = np.concatenate([oil_celsius(recording) for recording in recordings])
     return {OIL_C: float(celsius.mean())} if np.isfinite(celsius).all() else {}
 
 
-def _full_strokes(recordings: Sequence[Recording]) -> dict[str, Any]:
+def _full_strokes(recordings: Sequence[Recording]) -> dict[str, object]:
     """Full strokes (m) of the machine, where simulated recordings say them and all say the same."""
     stated = [recording.meta[STROKES] for recording in recordings if STROKES in recording.meta]
     # A log may say anything; what is no list of numbers says nothing.
