@@ -21,8 +21,8 @@ from edp import storage
 from edp.errors import ConfigError, closest
 from edp.registry import Registry
 from edp.settings.bounds import shown
+from edp.storage.reading import Table as Table
 
-Table = dict[str, Any]
 Change = str | Mapping[str, object]
 """A change of settings: ``key.path=value``, or a table."""
 Parts = Mapping[str, Registry[type]]
@@ -65,7 +65,7 @@ def parse_toml(text: str, where: str) -> Table:
     return storage.parse_toml(text, where, ConfigError)
 
 
-def merged(base: Table, change: Mapping[str, Any]) -> Table:
+def merged(base: Table, change: Mapping[str, object]) -> Table:
     """Return `base` updated recursively with `change`. A table of another kind replaces the old table as a whole.
 
     A table that names no kind has options of whichever kind is named later.
