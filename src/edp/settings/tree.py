@@ -65,7 +65,7 @@ def parse_toml(text: str, where: str) -> Table:
     return storage.parse_toml(text, where, ConfigError)
 
 
-def merged(base: Table, change: Mapping[str, object]) -> Table:
+def merged(base: Table, change: Table) -> Table:
     """Return `base` updated recursively with `change`. A table of another kind replaces the old table as a whole.
 
     A table that names no kind has options of whichever kind is named later.
