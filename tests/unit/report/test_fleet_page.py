@@ -2,6 +2,7 @@
 
 import pytest
 from browser import check_page
+from fleet_reports import fleet_report
 
 from edp.report.fleet.facts import fleet_facts
 from edp.report.fleet.page import write_fleet_page
@@ -30,5 +31,5 @@ def content() -> dict[str, object]:
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, tmp_path):
-    page = write_fleet_page(fleet_facts(content(), "<b>rigs</b>"), tmp_path / "fleet.html")
+    page = write_fleet_page(fleet_facts(fleet_report(content()), "<b>rigs</b>"), tmp_path / "fleet.html")
     check_page(browser, page, "fleet")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edp import __version__
 from edp.report.common.chart import BLUE, MUTED, Bars, Chart, ChartAxis, DataSeries, GuideLine, Mark, Panel
 from edp.report.common.templates import template
 from edp.report.fleet.facts import FleetFacts, failed_sheet, headline, machine_sheet, tiles, verdict, worst_sheet
@@ -28,10 +29,10 @@ def write_fleet_page(facts: FleetFacts, target: str | Path) -> Path:
 
 def render(facts: FleetFacts) -> str:
     """The page's text."""
-    network = facts.content["network"]
+    report, network = facts.report, facts.report.network
     return template("fleet.html.jinja").render(
         title=facts.title,
-        network=network["label"],
+        network=network.label,
         headline=unbroken(headline(facts)),
         verdict=verdict(facts),
         tiles=tiles(facts),
@@ -39,11 +40,11 @@ def render(facts: FleetFacts) -> str:
         machines=machine_sheet(facts).table() if facts.rows else None,
         failed=failed_sheet(facts).table() if facts.failed else None,
         provenance=[
-            ("Network", f"{network['path']} ({network['weights']})"),
-            ("Store", facts.content["store"]),
-            ("Deltas", facts.content["deltas"] or "none"),
-            ("Monitor", facts.content["monitor"] or "none"),
-            ("EDP", facts.content["edp"]),
+            ("Network", f"{network.path} ({network.weights})"),
+            ("Store", report.store),
+            ("Deltas", report.deltas or "none"),
+            ("Monitor", report.monitor or "none"),
+            ("EDP", __version__),
         ],
         **shown(fleet_charts(facts) if facts.rows else []),
     )
