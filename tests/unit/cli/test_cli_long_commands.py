@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.training, pytest.mark.processes]
 LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2")
 RIG = ("BmUp", "CylVels_1", "CylStroke_1", "CylPressures_1", "CylPressures_5")
 TRIALS = (
-    *("trials.random=1", "training.epochs=1", "training.updates=2", "screen.max_lag=10", "screen.pieces=4"),
+    *("trials.random=1", "training.epochs=1", "training.updates=2", "screen.max_lag=20", "screen.pieces=4"),
     *("screen.information_samples=200", "screen.rank_samples=200", "screen.piece_samples=100"),
     *("screen.forest.trees=5", "screen.forest.samples=200", "screen.forest.tests=100", "screen.forest.repeats=2"),
 )
