@@ -16,7 +16,7 @@ from edp.wording import MISSING, figure, interval, number, setting_text
 
 SOURCE = Path(str(resources.files("edp")))
 REPORT = SOURCE / "report"
-ABOUT_EXCAVATORS = ("animation/", "control/", "assets/control.html.jinja", "assets/animation.html.jinja")
+ABOUT_EXCAVATORS = ("animation/", "control/", "assets/side_view.jinja", "assets/animation.html.jinja")
 """Pages of the geometry of an excavator's front; no other machine has them."""
 MODULES = sorted(str(path.relative_to(REPORT)) for path in REPORT.rglob("*.py"))
 TEMPLATES = sorted(str(path.relative_to(REPORT)) for path in REPORT.rglob("*.jinja"))

@@ -39,7 +39,7 @@ def fleet_report(content: dict[str, Any]) -> FleetReport:
             alarms,
         )
         machines.append(ReportedMachine(*head, errors))
-    names = ("store", "deltas", "monitor", "horizon", "rate_hz")
+    names = ("store", "deltas", "monitor", "horizon", "rate_hz", "edp")
     return FleetReport(
         network=ReportedNetwork(**content["network"]),
         targets=tuple(ReportedTarget(**target) for target in content["targets"]),

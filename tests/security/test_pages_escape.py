@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edp.report.common.picture import NOT_XML, write_drawings
-from edp.report.common.sheets import Column, Sheet
-from edp.report.common.templates import template
-from edp.report.run.page import script_json
+from edp.report.common.templates import json_text, template
+from edp.table import Column, Table
 from edp.wording import in_cell, in_markdown, printable
 
 HOSTILE = [
@@ -39,7 +38,7 @@ HOSTILE = [
 
 def sheet(name):
     columns = (Column(name), Column("value", "mm/s"))
-    return Sheet("table", name, columns, ((name, 1.5), (name, -2.5), (None, None)), frozenset({0}))
+    return Table(name, columns, ((name, 1.5), (name, -2.5), (None, None)), frozenset({0}), name="table")
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -99,7 +98,7 @@ def test_pictures_of_hostile_names_are_well_formed(name, tmp_path):
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_pages_hold_names_as_text(name):
-    held = str(script_json({"name": name}))
+    held = str(json_text({"name": name}))
     assert "<" not in held
     assert json.loads(held)["name"] == name
     environment = template("page.html.jinja").environment

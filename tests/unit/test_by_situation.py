@@ -9,7 +9,7 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.evaluation.by_situation import NEAR_STOP, SITUATIONS, Situations
 from edp.evaluation.judge import score_predictions
-from edp.report.run.sheets import situation_sheet
+from edp.report.run.sheets import situation_table
 from edp.signals import Channel, Kind
 
 RATE, STILL = 10.0, 0.0
@@ -135,8 +135,8 @@ def test_table_shows_most_of_the_error_first_and_the_best_baseline(scores):
         "persistence": {"label": "Persistence", **held},
     }
     content = {"targets": [{"name": "v", "unit": "mm/s"}], "task": {"horizons": [1]}, "models": models}
-    sheet = situation_sheet(content, 1)
+    sheet = situation_table(content, 1)
     assert [c.heading for c in sheet.columns] == ["Situation", "Of the time", "Of the error", "v", "Relative to"]
     shown = [float(text[2].split()[0]) for text in sheet.texts()]
     assert shown == sorted(shown, reverse=True)
-    assert situation_sheet({**content, "models": {"network": {"label": "n", "overall": {}}}}, 1) is None
+    assert situation_table({**content, "models": {"network": {"label": "n", "overall": {}}}}, 1) is None

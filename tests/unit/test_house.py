@@ -31,7 +31,8 @@ def test_rooms_are_few_and_imports_go_down(house):
     # 24 before `wording`, the one place of figures for readers: messages of every room need it, those of `storage` too.
     # 25 before the room of jobs, which stood within workflows.
     # 26 before `progress`, the protocol that computations of many rooms report to.
-    assert len(house.siblings) <= 27, house.siblings
+    # 27 before `table`, the one class of tables: the terminal shows them without the imports of `report`.
+    assert len(house.siblings) <= 28, house.siblings
     # 130 before the rooms of closed loops, which imports eight and is imported by three, and of monitoring, which
     # imports three.
     # 141 before the monitor read networks, twins and recordings (seven more rooms), and settings and testing read it.
@@ -39,8 +40,9 @@ def test_rooms_are_few_and_imports_go_down(house):
     # 155 before options of the command line took their bounds from settings.
     # 156 before numbers in messages of all rooms came from `edp.wording`, which stands below them.
     # 185 before workflows, and rooms with long computations below them, reported to `edp.progress`.
+    # 190 before `edp.table`, which cli, workflows and report import.
     # 190 before logs, simulator and training divided their loops among workers of `edp.jobs`.
-    assert house.arrows <= 193
+    assert house.arrows <= 198
     assert house.circles == []
 
 

@@ -9,7 +9,7 @@ from edp.data.integrals import contradiction, integral_fit
 from edp.errors import DataError
 from edp.networks.twin.static_map import StaticMap
 from edp.recording import Recording
-from edp.report.coverage.page import render_coverage
+from edp.report.coverage.page import build_coverage_page
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators
 from edp.workflows.twin.prepare_twin import prepared_twin
@@ -79,7 +79,7 @@ def test_coverage_says_so_and_asks_nothing_of_what_is_no_velocity():
     recordings = [rescaled(sample_actuators(seed=seed), "stroke_1", -1.0) for seed in range(3)]
     (told,) = cover(recordings).contradictions
     assert "'stroke_1' changes by -1 times" in told
-    assert "Stroke &#39;stroke_1&#39; changes by -1 times" in render_coverage(cover(recordings), "logs")
+    assert "Stroke &#39;stroke_1&#39; changes by -1 times" in build_coverage_page(cover(recordings), "logs").html()
     assert cover([sample_actuators(seed=1)]).contradictions == ()
     velocity, stroke = driven()
     channels = (Channel("lever", Kind.RATIO), Channel("force", Kind.FORCE), Channel("stroke", Kind.POSITION))

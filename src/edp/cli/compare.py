@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.storage.paths import full_path
 
 TABLES = 4
@@ -24,19 +24,18 @@ def compare(
 
     Example: `edp compare runs/first runs/second`
     """
-    from edp.report import compare_runs, write_compare_page
-    from edp.report.compare.page import error_sheet
+    from edp.report import build_compare_page, compare_runs
+    from edp.report.compare.page import error_table
 
     comparison = compare_runs(runs)
-    page = write_compare_page(comparison, output, title)
+    page = build_compare_page(comparison, title).write(output)
 
     def show() -> None:
         out.print(comparison.headline())
         for remark in comparison.remarks:
             out.print(remark)
         for measure in comparison.measures[:TABLES]:
-            sheet = error_sheet(comparison, measure)
-            table(sheet.caption, sheet.heads(), sheet.texts())
+            print_table(error_table(comparison, measure))
         if len(comparison.measures) > TABLES:
             out.print(f"and {len(comparison.measures) - TABLES} more errors on the page")
         out.print(f"page: {full_path(page)}")

@@ -248,10 +248,10 @@ def score_table(scores: dict[str, Any]) -> None:
 
 def by_situation_table(scores: dict[str, Any]) -> None:
     """Print the network's error by motion of the axes, at the longest horizon, if the scores contain it."""
-    from edp.report.run.sheets import situation_sheet
+    from edp.report.run.sheets import situation_table
 
     horizon = max(scores["task"]["horizons"])
-    sheet = situation_sheet(scores, horizon)
+    sheet = situation_table(scores, horizon)
     if sheet is not None:
         heads = [f"{column.heading}{f', {column.unit}' if column.unit else ''}" for column in sheet.columns]
         table(f"{sheet.caption}, k = {horizon}", heads, [list(row) for row in sheet.texts()])

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, out, table
+from edp.cli.console import JsonFlag, emit, out, print_table
 from edp.cli.options import ClusterOption, OpenOption, WorkersOption, workers_of
 from edp.cli.progress import shown_progress
 from edp.storage.paths import full_path
@@ -38,7 +38,7 @@ def report(
 
     Example: `edp fleet report runs/foundation stores/fleet --out fleet --deltas fleet/own --workers 4`
     """
-    from edp.report.fleet.facts import headline, machine_sheet, worst_sheet
+    from edp.report.fleet.facts import headline, machine_table, worst_table
     from edp.workflows.fleet.judge_fleet import PAGE, FleetQuestion, report_fleet
 
     question = FleetQuestion(network=network, store=store, deltas=deltas, monitor=monitor)
@@ -47,8 +47,8 @@ def report(
     page = full_path(folder / PAGE)
 
     def show() -> None:
-        for sheet in (worst_sheet(facts), machine_sheet(facts)) if facts.rows else ():
-            table(sheet.caption, sheet.heads(), sheet.texts())
+        for table in (worst_table(facts), machine_table(facts)) if facts.rows else ():
+            print_table(table)
             out.print()
         for name, why in facts.failed:
             out.print(f"'{name}' could not be judged: {why}")

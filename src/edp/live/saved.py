@@ -11,8 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from edp.live.session import LiveSession
-from edp.report.animation.page import script_text
-from edp.report.common.templates import asset, stylesheet, template
+from edp.report.common.templates import asset, json_text, stylesheet, template
 from edp.storage import write_bytes
 
 SAVED_BYTES = 24 << 20
@@ -83,7 +82,7 @@ def parts() -> tuple[str, str]:
 def _rendered(title: str, connect: str, content: dict[str, Any]) -> str:
     script, style = parts()
     return template("live.html.jinja").render(
-        title=title, connect=connect, style=Markup(style), script=Markup(script), data=Markup(script_text(content))
+        title=title, connect=connect, style=Markup(style), script=Markup(script), data=json_text(content)
     )
 
 

@@ -5,14 +5,15 @@ import shutil
 
 import pytest
 from browser import check_page, page_faults
+from page_text import check_text
 from safetensors.numpy import load_file, save_file
 from typer.testing import CliRunner
 
 import edp
 from edp.cli import app
 from edp.errors import ConfigError, DataError, EdpError, StorageError
-from edp.report import compare_runs, write_compare_page
-from edp.report.compare.page import error_sheet, model_sheet, render
+from edp.report import build_compare_page, compare_runs
+from edp.report.compare.page import error_table, model_table
 from edp.report.compare.runs import MEAN
 from edp.storage import write_json
 
@@ -138,7 +139,7 @@ def test_too_little_in_common_has_no_interval(make_run):
     comparison = compare_runs([run, changed(run, "second", [0.8, 0.8])])
     difference = comparison.differences(comparison.measures[0])["second"]
     assert (difference.low, difference.p, difference.told_apart) == (None, None, False)
-    assert "–" in error_sheet(comparison, comparison.measures[0]).texts()[1]
+    assert "–" in error_table(comparison, comparison.measures[0]).texts()[1]
 
 
 def test_outputs_of_several_units_stand_alone(pair):
@@ -218,7 +219,7 @@ def test_names_stay_text(pair):
             recordings[HOSTILE] = recordings.pop("trench_06")
 
         rewritten(run, renamed)
-    page = render(compare_runs([pair[0], other]))
+    page = build_compare_page(compare_runs([pair[0], other])).html()
     assert HOSTILE not in page
     assert "<b>&" not in page
     assert page.count("<script>") == 2
@@ -248,19 +249,23 @@ def test_python_gives_a_frame_and_a_page(pair, tmp_path):
 
 
 def test_costs_of_all_runs_are_listed(pair):
-    sheet = model_sheet(compare_runs(pair))
+    sheet = model_table(compare_runs(pair))
     assert [column.heading for column in sheet.columns][:3] == ["Run", "Model", "Parameters"]
     assert sheet.texts()[0][2] == "41,283"
 
 
+def test_the_text_of_the_page(pair):
+    check_text(build_compare_page(compare_runs(pair)).html(), "compare")
+
+
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, pair, tmp_path):
-    check_page(browser, write_compare_page(compare_runs(pair), tmp_path / "compare.html"), "comparison")
+    check_page(browser, build_compare_page(compare_runs(pair)).write(tmp_path / "compare.html"), "comparison")
 
 
 @pytest.mark.processes
 def test_numbers_of_an_axis_are_never_cut_short(browser, make_run, tmp_path):
     first, second = make_run("first"), make_run("second")
-    browser.open(write_compare_page(compare_runs([first, second]), tmp_path / "compare.html"))
+    browser.open(build_compare_page(compare_runs([first, second])).write(tmp_path / "compare.html"))
     browser.run("window.dispatchEvent(new Event('beforeprint'))")
     assert [fault for fault in page_faults(browser) if "number cut short" in fault] == []

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.recording import Recording
 from edp.report.animation.page import scene_of
 from edp.report.control.charts import control_charts, errors_chart, path_chart
-from edp.report.control.facts import ControlFacts, event_sheet, loop_sheet, tiles, verdict
-from edp.report.control.page import render
+from edp.report.control.facts import ControlFacts, event_table, loop_table, tiles, verdict
+from edp.report.control.page import build_control_page
 from edp.signals import VOCABULARY, Channel, Kind
 
 TICKS = 120
@@ -66,8 +67,8 @@ def test_the_page_says_what_was_violated_and_missed(facts):
     text = " ".join(verdict(facts))
     assert "Limits were violated at 8 ticks" in text
     assert "no answer at 3 ticks" in text
-    assert loop_sheet(facts).rows[0][-1] == "stroke 4"
-    assert event_sheet(facts).rows == ((HOSTILE, 7, 3, f"{HOSTILE} is missing"),)
+    assert loop_table(facts).rows[0][-1] == "stroke 4"
+    assert event_table(facts).rows == ((HOSTILE, 7, 3, f"{HOSTILE} is missing"),)
 
 
 def test_the_position_error_stands_before_the_distance_to_the_path(facts):
@@ -88,15 +89,19 @@ def test_figures_hold_the_loops(facts):
 
 
 def test_names_stay_text(facts):
-    page = render(facts)
+    page = build_control_page(facts).html()
     assert HOSTILE not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert 'id="front"' in page
     assert "http://" not in page.split("<script>")[0]
 
 
+def test_the_text_of_the_page(facts):
+    check_text(build_control_page(facts).html(), "control")
+
+
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, facts, tmp_path):
     page = tmp_path / "control.html"
-    page.write_text(render(facts))
+    build_control_page(facts).write(page)
     check_page(browser, page, "closed loops")

@@ -3,9 +3,10 @@
 import pytest
 from browser import check_page
 from fleet_reports import fleet_report
+from page_text import check_text
 
 from edp.report.fleet.facts import fleet_facts
-from edp.report.fleet.page import write_fleet_page
+from edp.report.fleet.page import build_fleet_page
 
 NAMES = [f"machine_of_the_customer_with_a_long_name_{number:02d}" for number in range(12)]
 
@@ -29,7 +30,11 @@ def content() -> dict[str, object]:
     }  # fmt: skip
 
 
+def test_the_text_of_the_page():
+    check_text(build_fleet_page(fleet_facts(fleet_report(content()), "rigs")).html(), "fleet")
+
+
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, tmp_path):
-    page = write_fleet_page(fleet_facts(fleet_report(content()), "<b>rigs</b>"), tmp_path / "fleet.html")
+    page = build_fleet_page(fleet_facts(fleet_report(content()), "<b>rigs</b>")).write(tmp_path / "fleet.html")
     check_page(browser, page, "fleet")

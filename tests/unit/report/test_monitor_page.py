@@ -5,13 +5,14 @@ import re
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.monitor.diagnosis.causes import Cause
 from edp.monitor.diagnosis.structure import Confusion
 from edp.monitor.traces import RecordingTrace, RunTraces
 from edp.report.monitor.drawing import POINTS, evidence, overview, timeline
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts, confusions_of, headline, verdict
-from edp.report.monitor.page import render, write_monitor_page
+from edp.report.monitor.page import build_monitor_page
 
 HOSTILE = "</title><script>alert(1)</script><img src=x onerror=alert(1)>"
 GROUPS = ("velocities", "head pressures", HOSTILE)
@@ -56,7 +57,7 @@ def test_the_headline_answers_first(facts):
     assert headline(facts) == "2 alarms in 16 min: head pressure of the boom reads 9.8 bar too high (2 times)"
     facts.alarms[:] = []
     assert headline(facts) == "No alarm in 16 min"
-    assert "No alarm" in render(facts)
+    assert "No alarm" in build_monitor_page(facts).html()
 
 
 def test_what_is_not_named_is_said(facts):
@@ -71,14 +72,14 @@ def test_pairs_that_are_not_told_apart_are_named_with_the_alarm(facts):
 
 
 def test_names_of_files_stay_text(facts):
-    page = render(facts)
+    page = build_monitor_page(facts).html()
     assert "<script" not in page
     assert "<img" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
 
 def test_the_page_asks_nothing_of_a_network_and_runs_nothing(facts, tmp_path):
-    page = write_monitor_page(facts, tmp_path / "page.html").read_text()
+    page = build_monitor_page(facts).write(tmp_path / "page.html").read_text()
     assert "default-src 'none'" in page
     assert not re.findall(r"(?:src|href)\s*=\s*\"(?!#)", page)
     assert "url(" not in page
@@ -93,7 +94,7 @@ def test_a_week_of_logs_stays_below_three_megabytes():
         recordings.append(RecordingTrace(f"shift_{n}", "", 2880.0, rough[:, :2], rough, ()))
     traces = RunTraces(1.0, ("cusum", "ewma"), tuple("abcdefgh"), tuple(recordings))
     alarms = [alarm(f"shift_{n}", sentence="x" * 200) for n in range(200)]
-    assert len(render(MonitorFacts("week", traces, alarms, "")).encode()) < 3_000_000
+    assert len(build_monitor_page(MonitorFacts("week", traces, alarms, "")).html().encode()) < 3_000_000
 
 
 def test_lines_and_cells_are_bounded_and_show_the_largest_values(facts):
@@ -126,8 +127,12 @@ def test_times_of_day_are_shown_where_the_start_is_known(facts):
     assert any(label.text == "0:00:00" for label in overview(facts).labels)
 
 
+def test_the_text_of_the_page(facts):
+    check_text(build_monitor_page(facts).html(), "monitor")
+
+
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, facts, tmp_path):
     page = tmp_path / "monitor.html"
-    page.write_text(render(facts))
+    build_monitor_page(facts).write(page)
     check_page(browser, page, "monitor", ("the boom", "boom head", "boom cylinder"))

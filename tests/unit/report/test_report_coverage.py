@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.data.coverage import cover
 from edp.data.splits import ByTime
@@ -12,7 +13,7 @@ from edp.recording import Recording
 from edp.report import build_coverage_page
 from edp.report.common.interactive import plots
 from edp.report.coverage.charts import coverage_charts
-from edp.report.coverage.page import headline, render_coverage, verdict
+from edp.report.coverage.page import headline, verdict
 from edp.signals import EXTRA_CHANNELS, TABLE_A1, VOCABULARY, Channel, Kind
 
 
@@ -32,7 +33,7 @@ def figures_of(text):
 def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
     recording = machine_like()
     found = cover([recording], split=ByTime().split([recording], 10))
-    path = build_coverage_page(found, tmp_path / "coverage.html", "a <b>data</b> set")
+    path = build_coverage_page(found, "a <b>data</b> set").write(tmp_path / "coverage.html")
     text = path.read_text(encoding="utf-8")
     assert "default-src 'none'" in text
     assert text.count("const Figure = ") == 1
@@ -69,7 +70,7 @@ def test_six_maps_show_every_cell_of_three_strokes():
 def test_what_a_recording_lacks_is_said_and_no_name_breaks_the_page(channels, absent):
     values = np.cumsum(np.random.default_rng(1).normal(size=(2000, len(channels))), axis=0).astype(np.float32)
     recording = Recording("r", tuple(Channel(name, kind) for name, kind in channels.items()), values, 50.0)
-    text = render_coverage(cover([recording]), "t")
+    text = build_coverage_page(cover([recording]), "t").html()
     assert absent in text
     assert figures_of(text)
     assert "nan" not in json.dumps(figures_of(text)).lower().replace("nanmax", "")
@@ -77,7 +78,7 @@ def test_what_a_recording_lacks_is_said_and_no_name_breaks_the_page(channels, ab
 
 def test_a_rig_without_strokes_has_no_sections_of_a_machine():
     recording = Recording("rig", (Channel("valve", Kind.VOLTAGE),), machine_like().values[:, :1].copy(), 100.0)
-    text = render_coverage(cover([recording]), "rig").split("<script>")[0]
+    text = build_coverage_page(cover([recording]), "rig").html().split("<script>")[0]
     for section in ("poses", "joint", "events"):
         assert f'id="{section}"' not in text
         assert f'href="#{section}"' not in text
@@ -94,9 +95,15 @@ def test_the_sentence_says_what_there_is():
     assert headline(bare).endswith("of the stroke.")
 
 
+def test_the_text_of_the_page():
+    recording = machine_like()
+    found = cover([recording], split=ByTime().split([recording], 10))
+    check_text(build_coverage_page(found, "data").html(), "coverage")
+
+
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, tmp_path):
     recording = machine_like()
     found = cover([recording], split=ByTime().split([recording], 10))
-    page = build_coverage_page(found, tmp_path / "coverage.html", "data")
+    page = build_coverage_page(found, "data").write(tmp_path / "coverage.html")
     check_page(browser, page, "coverage", ("Soil contact", "boom", "bucket"))

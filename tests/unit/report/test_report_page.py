@@ -4,11 +4,13 @@ from html.parser import HTMLParser
 
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.errors import StorageError
 from edp.report import build_report
 from edp.report.run.facts import MAKERS, read_facts
-from edp.report.run.page import context, render
+from edp.report.run.page import build_run_page
+from edp.report.run.tables import comparison_tables
 from edp.storage import write_json
 
 OWN = ("Boom cylinder", "Stick cylinder", "Bucket cylinder", "Cylinder velocities", "excavator")
@@ -60,7 +62,7 @@ def test_the_page_is_one_file_that_loads_nothing(run_folder):
 
 
 def test_the_page_says_the_verdict_and_every_section(run_folder):
-    page = Page(render(read_facts(run_folder)))
+    page = Page(build_run_page(read_facts(run_folder)).html())
     assert "At 100 ms ahead the network is off by" in page.text
     for heading in ("Against the baselines", "Prediction against truth", "Residuals", "Learning curves", "Footprint"):
         assert heading in page.text
@@ -71,7 +73,7 @@ def test_the_page_says_the_verdict_and_every_section(run_folder):
 
 
 def test_every_figure_has_its_place(run_folder):
-    text = render(read_facts(run_folder))
+    text = build_run_page(read_facts(run_folder)).html()
     specs = json.loads(Page(text).scripts[1])
     assert len(specs) == 7
     for spec in specs:
@@ -83,7 +85,7 @@ def test_every_figure_has_its_place(run_folder):
 @pytest.mark.parametrize("name", list(MAKERS))
 def test_a_missing_part_is_named_with_the_command_that_makes_it(run_folder, name):
     (run_folder / name).unlink()
-    page = Page(render(read_facts(run_folder)))
+    page = Page(build_run_page(read_facts(run_folder)).html())
     assert f"This run has no {name}" in page.text
     assert f"{MAKERS[name]} {run_folder}" in page.text
 
@@ -93,12 +95,12 @@ def test_one_part_alone_makes_a_page(run_folder, kept):
     for name in MAKERS:
         if name != kept:
             (run_folder / name).unlink()
-    assert "Learning curves" in Page(render(read_facts(run_folder))).text
+    assert "Learning curves" in Page(build_run_page(read_facts(run_folder)).html()).text
 
 
 def test_a_run_that_stopped_in_its_first_epoch_makes_a_page(run_folder):
     (run_folder / "history.jsonl").write_text('{"epoch": 1, "train_lo')
-    assert "holds no finished epoch" in Page(render(read_facts(run_folder))).text
+    assert "holds no finished epoch" in Page(build_run_page(read_facts(run_folder)).html()).text
 
 
 def test_names_from_files_cannot_become_markup(run_folder):
@@ -109,7 +111,7 @@ def test_names_from_files_cannot_become_markup(run_folder):
     recordings[evil] = recordings.pop(next(iter(recordings)))
     write_json(run_folder / "scores.json", scores)
     (run_folder / "config.toml").write_text(f'name = "{evil}"')
-    text = render(read_facts(run_folder), title=evil)
+    text = build_run_page(read_facts(run_folder), title=evil).html()
     page = Page(text)
     assert len(page.scripts) == 3
     assert "<script>alert" not in text
@@ -129,13 +131,13 @@ def test_unknown_keys_are_ignored_and_unscored_metrics_are_dashes(run_folder):
     scores["models"]["persistence"]["integrated"] = {"10": {}}
     scores["models"]["persistence"]["overall"]["10"]["mean"]["r2"] = None
     write_json(run_folder / "scores.json", scores)
-    table = context(read_facts(run_folder))["comparisons"][0]
-    r2 = [heading for heading, _ in table.columns].index("R²")
+    table = comparison_tables(read_facts(run_folder))[0]
+    r2 = [column.heading for column in table.columns].index("R²")
     assert next(row for row in table.rows if row[0] == "Persistence")[r2] == "–"
 
 
 def test_the_table_marks_the_network_and_leads_with_the_longest_horizon(run_folder):
-    tables = context(read_facts(run_folder))["comparisons"]
+    tables = comparison_tables(read_facts(run_folder))
     assert [table.caption for table in tables] == ["100 ms ahead", "10 ms ahead", "50 ms ahead"]
     assert all(table.rows[place][0] == "Hybrid TCN-LSTM" for table in tables for place in table.marked)
 
@@ -143,6 +145,14 @@ def test_the_table_marks_the_network_and_leads_with_the_longest_horizon(run_fold
 def test_a_page_that_cannot_be_written_says_so(run_folder):
     with pytest.raises(StorageError, match="cannot"):
         build_report(run_folder, output=run_folder / "config.toml" / "report.html")
+
+
+@pytest.mark.parametrize("missing", ["", "scores.json", "footprint.json"])
+def test_the_text_of_the_page(run_folder, missing):
+    if missing:
+        (run_folder / missing).unlink()
+    text = build_run_page(read_facts(run_folder), "Velocities").html().replace(str(run_folder), "RUN")
+    check_text(text, f"run{missing and '_without_' + missing.split('.')[0]}")
 
 
 @pytest.mark.processes

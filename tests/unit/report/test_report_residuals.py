@@ -12,7 +12,7 @@ from edp.report.common.interactive import plots
 from edp.report.run.charts import run_charts, signal_chart
 from edp.report.run.facts import read_facts
 from edp.report.run.figures import prediction_lines, residual_histograms
-from edp.report.run.page import render
+from edp.report.run.page import build_run_page
 from edp.report.run.residuals import correlations, correlogram, fit_table
 from edp.storage import write_json
 
@@ -20,7 +20,7 @@ from edp.storage import write_json
 def test_fit_is_that_of_system_identification(run_folder):
     facts = read_facts(run_folder)
     table = fit_table(facts)
-    assert [heading for heading, _ in table.columns] == ["Output", "10 ms ahead", "50 ms ahead", "100 ms ahead"]
+    assert [column.heading for column in table.columns] == ["Output", "10 ms ahead", "50 ms ahead", "100 ms ahead"]
     r2 = facts.models["network"]["overall"]["5"]["CylVels_2"]["r2"]
     assert float(table.rows[1][2]) == pytest.approx(100 * (1 - math.sqrt(1 - r2)), abs=0.06)
 
@@ -129,7 +129,7 @@ def test_raw_signals_stand_first_in_their_units(run_folder):
     chart = signal_chart(facts)
     assert [panel.title for panel in chart.panels] == ["</script><b>lever", "[bar]"]
     assert chart.panels[1].marks[0].y.max() == pytest.approx(200, rel=1e-3)
-    page = render(facts)
+    page = build_run_page(facts).html()
     assert page.index("Raw signals</h2>") < page.index("Against the baselines</h2>")
     assert "<b>lever" not in page
     assert {item.model for item in residual_histograms(facts)} == {"network", "ridge_arx"}

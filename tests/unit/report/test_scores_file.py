@@ -8,7 +8,7 @@ import pytest
 from edp.errors import EdpError, StorageError
 from edp.evaluation.scores_file import read_scores
 from edp.report.run.facts import read_facts
-from edp.report.run.page import context
+from edp.report.run.page import build_run_page
 from edp.storage import write_json
 
 OTHERS = (None, 10**400, "x", {"x": 5}, {"10": None})
@@ -64,7 +64,7 @@ def test_any_change_is_one_error_or_a_page(drawn, step):
             content = changed(scores, path, other)
             write_json(file, content) if isinstance(content, dict) else file.write_text(json.dumps(content))
             try:
-                context(read_facts(drawn))
+                build_run_page(read_facts(drawn)).html()
             except EdpError as error:
                 messages.append(str(error))
             except Exception as error:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 
 from edp.data.screening import (
     ChannelVerdict,
@@ -25,7 +26,7 @@ from edp.report import build_screening_page, write_screening_pictures
 from edp.report.common.interactive import plots
 from edp.report.common.picture import write_pictures
 from edp.report.screening.charts import screening_charts
-from edp.report.screening.page import headline, render_screening, sentence, verdict
+from edp.report.screening.page import headline, sentence, verdict
 from edp.report.screening.views import lag_ranges, lag_views, matrix_views, stability_views
 
 NAMES = ("v", "u<b>", "late", "noise")
@@ -99,7 +100,9 @@ def figures_of(text):
 
 
 def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
-    path = build_screening_page(screening(), tmp_path / "report.html", "a <b>data</b> set", None, TRIALS, ["A note."])
+    path = build_screening_page(screening(), "a <b>data</b> set", None, TRIALS, ["A note."]).write(
+        tmp_path / "report.html"
+    )
     text = path.read_text(encoding="utf-8")
     assert "default-src 'none'" in text
     assert "://" not in text.split("<script>")[0]
@@ -114,7 +117,7 @@ def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
 
 
 def test_choices_above_the_figures_name_the_traces_that_they_show():
-    for name, spec in figures_of(render_screening(screening(), "x")).items():
+    for name, spec in figures_of(build_screening_page(screening(), "x").html()).items():
         keys = set(spec["controls"])
         for trace in spec["figure"]["data"]:
             assert keys <= set(trace.get("meta", {})), name
@@ -126,7 +129,7 @@ def test_choices_above_the_figures_name_the_traces_that_they_show():
                 "kendall",
             ]
             assert [t["visible"] for t in spec["figure"]["data"]] == [True, False, False, False]
-    assert set(figures_of(render_screening(screening(), "x"))["stability"]["controls"]) == {"metric"}
+    assert set(figures_of(build_screening_page(screening(), "x").html())["stability"]["controls"]) == {"metric"}
 
 
 def test_headline_and_verdict():
@@ -175,7 +178,7 @@ def test_names_that_mean_something_elsewhere(tmp_path, odd):
     found = screening((odd, "b", "c", "d"))
     curves = tuple(replace(entry, target=odd) for entry in found.lags)
     found = replace(found, targets=(odd,), lags=curves)
-    assert "<script>;" not in render_screening(found, odd)
+    assert "<script>;" not in build_screening_page(found, odd).html()
     lags = [chart for chart in screening_charts(found) if chart.name == "lags"]
     first, again = ([path.read_bytes() for path in write_pictures(tmp_path / part, lags)] for part in "ab")
     assert first == again
@@ -184,7 +187,7 @@ def test_names_that_mean_something_elsewhere(tmp_path, odd):
 
 def test_a_screening_of_many_channels_stays_readable_and_small():
     names = ("v", *(f"channel_{i:03d}" for i in range(119)))
-    text = render_screening(screening(names), "many")
+    text = build_screening_page(screening(names), "many").html()
     specs = figures_of(text)
     assert specs["matrices"]["figure"]["layout"]["height"] == 1500
     assert len(specs["lags"]["figure"]["data"]) == 2 * 16  # a curve and its best lag
@@ -196,15 +199,19 @@ def test_nothing_but_a_proposal_is_a_page_too():
     found = screening()
     bare = replace(found, lags=(), stability=(), importance=(), values=(), clusters=(), flags=())
     assert list(plots(screening_charts(bare))) == ["matrices"]
-    text = render_screening(bare, "bare")
+    text = build_screening_page(bare, "bare").html()
     assert 'id="flags"' not in text
     assert 'id="clusters"' not in text
+
+
+def test_the_text_of_the_page():
+    check_text(build_screening_page(screening(), "data", None, TRIALS, ["A note."]).html(), "screening")
 
 
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, tmp_path):
     check_page(
         browser,
-        build_screening_page(screening(), tmp_path / "report.html", "data", None, TRIALS, ["A note."]),
+        build_screening_page(screening(), "data", None, TRIALS, ["A note."]).write(tmp_path / "report.html"),
         "screening",
     )

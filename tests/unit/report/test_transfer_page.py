@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 from safetensors.numpy import save_file
 
 from edp.errors import StorageError
 from edp.report import read_transfer, write_transfer_page
 from edp.report.transfer import facts as transfer_facts
-from edp.report.transfer.page import render
+from edp.report.transfer.page import build_transfer_page
 from edp.storage import write_json
 
 EVIL = "</script><script>alert(1)</script><b>&"
@@ -71,7 +72,7 @@ def folder(tmp_path):
 
 def test_the_table_has_the_form_and_figures_of_the_thesis(folder):
     facts = read_transfer(folder(content()))
-    sheet = transfer_facts.pair_sheet(facts, "10")
+    sheet = transfer_facts.pair_table(facts, "10")
     assert [column.heading for column in sheet.columns[:7]] == [
         "Model variant",
         "Target",
@@ -109,7 +110,7 @@ def test_names_from_files_end_no_element(folder):
     held["methods"]["direct"]["label"] = held["targets"][0]["description"] = EVIL
     held["notes"] = [EVIL]
     facts = read_transfer(folder(held, EVIL.replace("/", "")))
-    text = render(facts, transfer_facts.sheets_of(facts, "10"))
+    text = build_transfer_page(facts).html()
     assert "<script>alert" not in text
     assert "<b>&" not in text.replace("<b>" + facts.folder.name, "")
 
@@ -124,8 +125,8 @@ def test_what_is_not_there_is_not_shown(folder):
     facts = read_transfer(folder(held))
     assert transfer_facts.headline(facts).find("No epoch was better on the validation part") > 0
     assert "source" not in " ".join(transfer_facts.verdict(facts))
-    assert "MAE on the source" not in [c.heading for c in transfer_facts.method_sheet(facts, "10").columns]
-    assert "On the source" not in render(facts, transfer_facts.sheets_of(facts, "10"))
+    assert "MAE on the source" not in [c.heading for c in transfer_facts.method_table(facts, "10").columns]
+    assert "On the source" not in build_transfer_page(facts).html()
 
 
 def test_a_better_rival_is_named(folder):
@@ -155,6 +156,11 @@ def test_what_cannot_be_read_is_refused(folder, spoil, reason):
     spoil(place)
     with pytest.raises(StorageError, match=reason):
         read_transfer(place)
+
+
+def test_the_text_of_the_page(folder):
+    page = write_transfer_page(folder(content()), pictures=False)
+    check_text(page.read_text(encoding="utf-8").replace(page.parent.name, "logs"), "transfer")
 
 
 @pytest.mark.processes

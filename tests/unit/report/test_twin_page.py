@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import check_page
+from page_text import check_text
 from safetensors.numpy import save
 
 from edp.data.twin_channels import TwinChannels
@@ -14,8 +15,8 @@ from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores
 from edp.networks.twin import calibrate
 from edp.report.common.interactive import plots
 from edp.report.twin.charts import twin_charts
-from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles, verdict
-from edp.report.twin.page import render
+from edp.report.twin.facts import FreeRunFacts, free_run_tables, headline, read_free_runs, tiles, verdict
+from edp.report.twin.page import build_twin_page
 from edp.signals import Channel, Kind
 from edp.storage import read_json, write_json
 from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
@@ -63,7 +64,9 @@ def test_a_ground_is_told_with_what_it_explains(ground, says):
 
 
 def test_a_ground_of_a_stranger_is_text():
-    text = render(replace(facts_of(), provenance={"ground": {"kind": HOSTILE}, "ground_data": {"source": HOSTILE}}))
+    text = build_twin_page(
+        replace(facts_of(), provenance={"ground": {"kind": HOSTILE}, "ground_data": {"source": HOSTILE}})
+    ).html()
     assert "<img src=x" not in text
     assert not any("ground" in line for line in verdict(replace(facts_of(), provenance={"ground": [HOSTILE]})))
 
@@ -87,14 +90,14 @@ def test_actuators_of_different_units_stand_alone():
     key_figures = [(unit, what) for _, unit, what in tiles(facts)]
     assert key_figures[:2] == [("mm", "error of boom stroke after 1 s"), ("deg", "error of pose after 1 s")]
     assert not any("pressures" in what for _, what in key_figures)
-    sheet = sheets_of(facts)["actuators"]
+    sheet = free_run_tables(facts)["actuators"]
     assert [row[:2] for row in sheet.rows] == [(a, m) for a in ("boom", "swing") for m in ("twin", "static")]
     assert sheet.rows[0][2].endswith(" mm/s")
     assert sheet.rows[3][3].endswith(" deg")
-    page = render(facts)
+    page = build_twin_page(facts).html()
     assert "each actuator in its units" in page
     assert "The twin and its floors</caption>" not in page
-    headings = [column.heading for column in sheets_of(facts)["recordings"].columns]
+    headings = [column.heading for column in free_run_tables(facts)["recordings"].columns]
     assert headings == ["Recording", "Runs", "Diverged"]
 
 
@@ -111,7 +114,7 @@ def test_a_run_is_drawn_with_its_interval():
 
 def test_tables_say_what_the_scores_hold():
     facts = facts_of()
-    sheets = sheets_of(facts)
+    sheets = free_run_tables(facts)
     assert list(sheets) == ["models", "recordings", "driving", "situations", "intervals"]
     assert [row[0] for row in sheets["driving"].rows] == ["dig", "grade"]
     assert sheets["models"].rows[0][2] == facts.twin["velocity_mae"]["mean"]
@@ -123,17 +126,17 @@ def test_tables_say_what_the_scores_hold():
 def test_a_twin_without_strokes_has_a_page_too():
     facts = facts_of(strokes=False)
     assert "runs_strokes" not in plots_of(facts)
-    assert "Strokes off by" in render(facts)
+    assert "Strokes off by" in build_twin_page(facts).html()
 
 
 def test_plain_numbers_have_no_strokes_in_the_headline():
     facts = facts_of(strokes=False, name="level", kind=Kind.GENERIC)
     assert " level off by " in headline(facts)
-    assert "Strokes off by" not in render(facts)
+    assert "Strokes off by" not in build_twin_page(facts).html()
 
 
 def test_names_are_text_on_the_page():
-    page = render(facts_of(name=HOSTILE), title=HOSTILE)
+    page = build_twin_page(facts_of(name=HOSTILE), title=HOSTILE).html()
     assert "onerror=alert(1)>" not in page.replace("&gt;", "")
     assert "<img src=x" not in page
 
@@ -148,7 +151,7 @@ def folder(tmp_path):
 def test_what_was_written_is_read(folder):
     facts = read_free_runs(folder)
     assert facts.names == ["a", "boom"]
-    assert render(replace(facts, title="m22")).count('class="figure"') == 4
+    assert build_twin_page(replace(facts, title="m22")).html().count('class="figure"') == 4
 
 
 @pytest.mark.parametrize(
@@ -184,8 +187,12 @@ def test_damaged_runs_are_refused(folder):
         read_free_runs(folder)
 
 
+def test_the_text_of_the_page():
+    check_text(build_twin_page(facts_of(), "m22").html(), "twin")
+
+
 @pytest.mark.processes
 def test_the_page_in_a_browser(browser, tmp_path):
     page = tmp_path / "twin.html"
-    page.write_text(render(facts_of()))
+    build_twin_page(facts_of()).write(page)
     check_page(browser, page, "free runs", ("boom", "dig"))

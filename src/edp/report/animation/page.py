@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
-from edp.report.common.templates import asset, stylesheet, template
+from edp.report.common.templates import asset, json_text, stylesheet, template
 from edp.signals import GROUND_POINTS, display_offset
 from edp.storage import write_bytes
 from edp.wording import figure
@@ -250,7 +249,7 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
         name=scene.name,
         machine=f"{scene.machine.name}, {scene.machine.description}",
         stretch=f"{figure(scene.start_s)} to {figure(scene.start_s + seconds)} s",
-        style=Markup(stylesheet("animation.css")),
+        style=Markup(stylesheet("side_view.css", "animation.css")),
         **animation_parts(scene),
     )
     target = Path(output)
@@ -259,8 +258,13 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
 
 
 def animation_parts(scene: Scene) -> dict[str, Markup]:
-    """Script and data of a scene for a page with the elements of ``animation.html.jinja``."""
-    return {"script": Markup(asset("side_view.js") + asset("animation.js")), "data": Markup(script_text(_plain(scene)))}
+    """Return script and data of a scene for the macros of ``side_view.jinja``."""
+    return {"script": Markup(asset("side_view.js") + asset("animation.js")), "data": json_text(_plain(scene))}
+
+
+def side_view(scene: Scene) -> Markup:
+    """Return the side view of a scene as a part of a page with the style ``side_view.css``."""
+    return Markup(template("side_view.jinja").module.side_view(**animation_parts(scene)))  # type: ignore[attr-defined]
 
 
 def _plain(scene: Scene) -> dict[str, Any]:
@@ -308,10 +312,3 @@ def geometry_of(machine: Machine) -> dict[str, Any]:
         "bucket": asdict(machine.bucket),
         "foot": machine.chassis.boom_foot_height,
     }
-
-
-def script_text(value: Any) -> str:
-    """Plain JSON values as the text of a script element, which nothing in them can end."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    # A text in the data must not end the script element.
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup
 
 from edp.errors import count_of
+from edp.wording import unit_text
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
@@ -31,6 +35,12 @@ def stylesheet(*names: str) -> str:
     return "\n".join(asset(name) for name in ("palette.css", *names))
 
 
+def json_text(value: Any) -> Markup:
+    """Return plain values as JSON that cannot end its script element, whatever names they have."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
 def themed(colour: str) -> str:
     """Return a colour (``#26303a``) as the palette's variable for this colour, which has another value in the dark."""
     return f"var(--c{colour[1:].lower()}, {colour})" if _HEX.fullmatch(colour) else colour
@@ -49,5 +59,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["themed"] = themed
+    environment.filters["kind"] = lambda part: type(part).__name__
+    environment.filters["unit_text"] = unit_text
     environment.globals["count_of"] = count_of
     return environment

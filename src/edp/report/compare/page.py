@@ -2,51 +2,93 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from edp.report.common.sheets import Column, Sheet, Value, chance, figures
-from edp.report.common.templates import template
+from edp.errors import count_of
+from edp.report.common.page import Fold, Page, Section, Subsection
 from edp.report.compare.charts import compare_charts
 from edp.report.compare.paired import Comparison
 from edp.report.compare.runs import Measure
-from edp.report.run.page import shown
-from edp.storage import write_bytes
-from edp.wording import count_text, number, percent, unbroken
+from edp.table import Column, Table, Value, chance, figures
+from edp.wording import count_text, number, percent
+
+SHOWN_ERRORS = 4
+"""Tables of errors that are shown from the beginning."""
 
 
-def write_compare_page(comparison: Comparison, target: str | Path, title: str = "") -> Path:
-    """Write the page of a comparison.
-
-    Raises:
-        StorageError: the page cannot be written.
-    """
-    write_bytes(Path(target), render(comparison, title).encode("utf-8", "replace"))
-    return Path(target)
-
-
-def render(comparison: Comparison, title: str = "") -> str:
-    """The page's text."""
-    measure = comparison.measures[0]
-    tiles = [
-        (number(comparison.error(run, measure)), measure.unit, f"{run.name}: {measure.text()}")
-        for run in comparison.runs[:4]
-    ]
-    return template("compare.html.jinja").render(
+def build_compare_page(comparison: Comparison, title: str = "") -> Page:
+    """Return the page of a comparison; its title is the names of the first two runs if none is given."""
+    measure, first = comparison.measures[0], comparison.runs[0].name
+    charts = {chart.name: chart for chart in compare_charts(comparison)}
+    errors = [error_table(comparison, one) for one in comparison.measures]
+    runs, recordings = len(comparison.runs), len(comparison.recordings)
+    return Page(
         title=title or " and ".join(run.name for run in comparison.runs[:2]),
-        runs=len(comparison.runs),
-        count=len(comparison.recordings),
-        first=comparison.runs[0].name,
-        headline=unbroken(comparison.headline()),
-        remarks=comparison.remarks,
-        tiles=tiles,
-        tables=[error_sheet(comparison, one).table() for one in comparison.measures],
-        recordings=recording_sheet(comparison, measure).table(),
-        models=model_sheet(comparison).table(),
-        **shown(compare_charts(comparison)),
+        kind="comparison",
+        about=["comparison", f"{count_of(runs, 'run')} on {count_of(recordings, 'common test recording')}"],
+        headline=comparison.headline(),
+        verdict=comparison.remarks,
+        tiles=[
+            (number(comparison.error(run, measure)), measure.unit, f"{run.name}: {measure.text()}")
+            for run in comparison.runs[:4]
+        ],
+        sections=[
+            Section(
+                "errors",
+                f"Errors, and differences from {first}",
+                [
+                    "Means over the common test recordings, each of the same weight. A difference is paired: both runs "
+                    "answer for the same recording, so that hard recordings do not blur it. An interval that holds "
+                    "zero leaves open which run is better; p-values are two-sided and adjusted for the number of runs.",
+                    charts.get("change"),
+                    *errors[:SHOWN_ERRORS],
+                    Fold("The other errors", errors[SHOWN_ERRORS:]),
+                ],
+                "Errors",
+            ),
+            Section(
+                "horizon",
+                "By time ahead",
+                [
+                    "How fast the errors grow; lines that cross are runs for different purposes.",
+                    charts.get("horizon"),
+                ],
+            ),
+            Section(
+                "recordings",
+                "By recording",
+                [
+                    f"One row a common test recording, the easiest for {first} on top: a run that is better only on "
+                    "some kinds of recordings shows here.",
+                    charts.get("recordings"),
+                    Fold("The same in figures", [recording_table(comparison, measure)]),
+                ],
+            ),
+            Section(
+                "learning",
+                "Learning curves",
+                [
+                    "Each run on its own validation part; levels are comparable only where that part is the same.",
+                    charts.get("learning"),
+                ],
+            ),
+            Section(
+                "models",
+                "Size and cost",
+                [
+                    Subsection(
+                        [
+                            "Below and to the left is better: less error with less work. Cycles are estimates for the "
+                            "budget's core.",
+                            charts.get("cost"),
+                        ]
+                    ),
+                    model_table(comparison),
+                ],
+            ),
+        ],
     )
 
 
-def error_sheet(comparison: Comparison, measure: Measure) -> Sheet:
+def error_table(comparison: Comparison, measure: Measure) -> Table:
     """Each run's error and its paired difference from the first run."""
     differences = comparison.differences(measure)
     rows: list[tuple[Value, ...]] = []
@@ -68,10 +110,10 @@ def error_sheet(comparison: Comparison, measure: Measure) -> Sheet:
         Column("p", "Holm", chance),
         Column("Better on"),
     )
-    return Sheet("errors", measure.text(), columns, tuple(rows))
+    return Table(measure.text(), columns, tuple(rows), name="errors")
 
 
-def recording_sheet(comparison: Comparison, measure: Measure) -> Sheet:
+def recording_table(comparison: Comparison, measure: Measure) -> Table:
     """Each run's error on each common recording."""
     errors = {run.name: comparison.errors(run, measure).tolist() for run in comparison.runs}
     rows = tuple(
@@ -79,14 +121,14 @@ def recording_sheet(comparison: Comparison, measure: Measure) -> Sheet:
     )
     show = figures(value for values in errors.values() for value in values)
     columns = (Column("Recording"), *(Column(run.name, measure.unit, show) for run in comparison.runs))
-    return Sheet("recordings", measure.text(), columns, rows)
+    return Table(measure.text(), columns, rows, name="recordings")
 
 
-def model_sheet(comparison: Comparison) -> Sheet:
+def model_table(comparison: Comparison) -> Table:
     """What each run is, and what it takes."""
     costs = list(dict.fromkeys(cost for run in comparison.runs for cost in run.costs))
     rows = tuple(
         (run.name, run.label, *(count_text(run.costs[cost]) if cost in run.costs else None for cost in costs))
         for run in comparison.runs
     )
-    return Sheet("models", "Models", (Column("Run"), Column("Model"), *map(Column, costs)), rows)
+    return Table("Models", (Column("Run"), Column("Model"), *map(Column, costs)), rows, name="models")

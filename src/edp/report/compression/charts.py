@@ -31,11 +31,6 @@ STAGES: tuple[tuple[str, str, Symbol, float, str], ...] = (
 """Key of the scores, name, symbol, its size and its colour."""
 
 
-def compression_charts(facts: CompressionFacts) -> list[Chart]:
-    """Every figure."""
-    return [profile_chart(facts), front_chart(facts)]
-
-
 def profile_chart(facts: CompressionFacts) -> Chart:
     """Parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
     indices = facts.smallest()

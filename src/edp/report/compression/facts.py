@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edp.errors import count_of
 from edp.evaluation.compression import CompressedRow, CompressionResult, read_compression_result
-from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.table import Column, Table, Value, figures
 from edp.wording import listed, number, percent
 
 LIMITS = {"cycles": "cycles", "parameter_bytes": "parameters", "ram_bytes": "memory", "flash_bytes": "flash"}
@@ -56,7 +56,7 @@ def read_compression(folder: str | Path) -> CompressionFacts:
     return CompressionFacts(read_compression_result(folder), Path(folder))
 
 
-def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
+def front_table(facts: CompressionFacts, horizon: str) -> Table:
     """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
     result = facts.result
     teacher, unit = result.teacher.scores[horizon]["mae"], result.unit
@@ -80,22 +80,22 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
         )
     columns = (
         Column("Variant"),
-        Column("Made"),
+        Column("Made", is_text=True),
         Column("MAE", unit, figures([row[2] for row in rows])),
         Column("Δ MAE", "%", figures([row[3] for row in rows], signed=True, decimals=2)),
         Column("Parameters", "", figures([], decimals=0)),
         Column("Size", "MB", figures([], decimals=4)),
-        Column("Numbers"),
+        Column("Numbers", is_text=True),
         Column("MACs per window", "M", figures([], decimals=3)),
         Column("MACs per tick", "", figures([], decimals=0)),
         Column("Cycles, high", "", figures([], decimals=0)),
-        Column("Budget"),
+        Column("Budget", is_text=True),
     )
     caption = f"{facts.ahead(horizon)}, validation part"
-    return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(result.front))
+    return Table(caption, columns, tuple(rows), frozenset(result.front), name=f"k{horizon}")
 
 
-def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
+def held_out_table(facts: CompressionFacts) -> Table | None:
     """Teacher and chosen on the sealed test set."""
     scores = facts.result.held_out_test.scores
     if not scores:
@@ -115,7 +115,7 @@ def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
         Column("Composite, teacher", unit, figures([row[4] for row in rows])),
         Column("Composite, chosen", unit, figures([row[5] for row in rows])),
     )
-    return Sheet("held_out_test", "On recordings that took part in no choice", columns, tuple(rows))
+    return Table("On recordings that took part in no choice", columns, tuple(rows), name="held_out_test")
 
 
 def headline(facts: CompressionFacts) -> str:

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from edp.report.common.picture import write_pictures
-from edp.report.common.sheets import Sheet, write_sheets
-from edp.report.common.templates import template
+from edp.report.common.page import Page, Paragraph, Points, Section, write_report
 from edp.report.compression import facts as words
-from edp.report.compression.charts import compression_charts
-from edp.report.compression.facts import CompressionFacts, read_compression
-from edp.report.run.page import shown
-from edp.storage import write_bytes
+from edp.report.compression.charts import front_chart, profile_chart
+from edp.report.compression.facts import read_compression
 from edp.storage.paths import full_path
-from edp.wording import unbroken
 
 
 def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
@@ -27,36 +21,56 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
         StorageError: the folder holds no search, or a file cannot be written.
     """
     facts = read_compression(folder)
-    tables = sheets(facts)
-    page = facts.folder / "report.html"
-    write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
-    write_sheets(facts.folder / "tables", tables)
-    if pictures:
-        write_pictures(facts.folder / "pictures", compression_charts(facts))
-    return page
-
-
-def sheets(facts: CompressionFacts) -> list[Sheet]:
-    """A table a horizon, longest first, and that of the sealed test set."""
-    held_out = words.held_out_sheet(facts)
-    return [
-        *(words.table_sheet(facts, horizon) for horizon in reversed(facts.horizons)),
-        *([held_out] if held_out else []),
-    ]
-
-
-def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
-    """The page's text."""
-    context: dict[str, Any] = {
-        "title": full_path(facts.folder).name,
-        "headline": unbroken(words.headline(facts)),
-        "verdict": words.verdict(facts),
-        "tiles": words.tiles(facts),
-        "caveats": words.caveats(facts),
-        "tables": [sheet.table() for sheet in tables if sheet.name != "held_out_test"],
-        "held_out": next((sheet.table() for sheet in tables if sheet.name == "held_out_test"), None),
-        "opened": facts.result.held_out_test.opened,
-        "budget": facts.result.budget,
-        **shown(compression_charts(facts)),
-    }
-    return template("compression.html.jinja").render(**context)
+    tables = [words.front_table(facts, horizon) for horizon in reversed(facts.horizons)]
+    held_out = words.held_out_table(facts)
+    charts = [profile_chart(facts), front_chart(facts)]
+    page = Page(
+        title=full_path(facts.folder).name,
+        kind="compression",
+        about=["compression", facts.result.budget.name],
+        headline=words.headline(facts),
+        verdict=words.verdict(facts),
+        tiles=words.tiles(facts),
+        sections=[
+            Section(
+                "front",
+                "Error against cost",
+                [
+                    "Error on the validation part over that of the teacher in float32, the mean over horizons. Below "
+                    "and left is better; the step line joins those that no other one betters at no greater cost; the "
+                    "dotted line is the budget.",
+                    charts[1],
+                ],
+                "Front",
+            ),
+            Section(
+                "profile",
+                "Size profile",
+                [
+                    "Left: parameters as bars, mean absolute error before (in float32) and after (in the smallest "
+                    "format of the network), all on logarithmic axes. Right: the composite score.",
+                    charts[0],
+                ],
+            ),
+            Section(
+                "tables",
+                "All networks",
+                ["What no other network betters in error, cycles and bytes of parameters stands out.", *tables],
+                "Tables",
+            ),
+            Section(
+                "held-out",
+                "Sealed test set",
+                [Paragraph("Not opened: no network fits the budget.", "missing")]
+                if held_out is None
+                else [
+                    f"Opened on {facts.result.held_out_test.opened}, for the chosen network and the teacher.",
+                    held_out,
+                ],
+            ),
+            Section("reading", "What it can and cannot show", [Points(words.caveats(facts))], "What it can show"),
+        ],
+        footer="Its pictures and tables lie beside it.",
+    )
+    files = [*tables, held_out] if held_out else tables
+    return write_report(page, facts.folder / "report.html", files, charts if pictures else [])

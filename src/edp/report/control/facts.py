@@ -9,7 +9,7 @@ from typing import Any
 from edp.errors import count_of
 from edp.recording import Recording
 from edp.report.animation.page import Scene
-from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.table import Column, Table, Value, figures
 from edp.wording import MISSING, number
 
 
@@ -75,7 +75,7 @@ def tiles(facts: ControlFacts) -> list[tuple[str, str, str]]:
     return rows
 
 
-def loop_sheet(facts: ControlFacts) -> Sheet:
+def loop_table(facts: ControlFacts) -> Table:
     """A row of figures a loop."""
     heads = (
         ("Position rms", "mm", "position_rms_mm"),
@@ -94,23 +94,23 @@ def loop_sheet(facts: ControlFacts) -> Sheet:
         violated = ", ".join(f"{name} {ticks}" for name, ticks in score["violations"].items() if ticks) or MISSING
         rows.append((loop["name"], *(score[key] for _, _, key in heads), violated))
     shown = [Column(title, unit, figures(row[1 + n] for row in rows)) for n, (title, unit, _) in enumerate(heads)]
-    return Sheet("loops", "Loops", (Column("Loop"), *shown, Column("Violated, ticks")), tuple(rows))
+    return Table("Loops", (Column("Loop"), *shown, Column("Violated, ticks", is_text=True)), tuple(rows), name="loops")
 
 
-def event_sheet(facts: ControlFacts) -> Sheet:
+def event_table(facts: ControlFacts) -> Table:
     """What controllers logged."""
     rows: list[tuple[Value, ...]] = [
         (loop["name"], event["tick"], event["ticks"], event["text"]) for loop in facts.loops for event in loop["events"]
     ]
     whole = figures([], decimals=0)
-    heads = (Column("Loop"), Column("From tick", "", whole), Column("Ticks", "", whole), Column("Event"))
-    return Sheet("events", "Safe commands", heads, tuple(rows))
+    heads = (Column("Loop"), Column("From tick", "", whole), Column("Ticks", "", whole), Column("Event", is_text=True))
+    return Table("Safe commands", heads, tuple(rows), name="events")
 
 
-def solver_sheet(facts: ControlFacts) -> Sheet:
+def solver_table(facts: ControlFacts) -> Table:
     """Times of a step of the controller."""
     rows: list[tuple[Value, ...]] = [
         (loop["name"], *(loop["solve_us"][key] for key in ("median", "p99", "max"))) for loop in facts.loops
     ]
     shown = [Column(name, "µs", figures([], decimals=0)) for name in ("Median", "99 %", "Longest")]
-    return Sheet("solver", "Time of a step of the controller", (Column("Loop"), *shown), tuple(rows))
+    return Table("Time of a step of the controller", (Column("Loop"), *shown), tuple(rows), name="solver")

@@ -2,42 +2,53 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
-from edp.report.animation.page import animation_parts
-from edp.report.common.templates import template
+from edp.report.animation.page import side_view
+from edp.report.common.page import Page, Section
 from edp.report.control.charts import control_charts
-from edp.report.control.facts import ControlFacts, event_sheet, loop_sheet, solver_sheet, tiles, verdict
-from edp.report.run.page import shown
-from edp.storage import write_bytes
-from edp.wording import unbroken
+from edp.report.control.facts import ControlFacts, event_table, loop_table, solver_table, tiles, verdict
 
 
-def write_control_page(facts: ControlFacts, target: str | Path) -> Path:
-    """Write the page of loops.
-
-    Raises:
-        StorageError: the page cannot be written.
-    """
-    write_bytes(Path(target), render(facts).encode("utf-8", "replace"))
-    return Path(target)
-
-
-def render(facts: ControlFacts) -> str:
-    """The page's text."""
-    events = event_sheet(facts)
-    context: dict[str, Any] = {
-        "title": facts.title,
-        "headline": unbroken(facts.content["sentence"]),
-        "verdict": verdict(facts),
-        "tiles": tiles(facts),
-        "loops": loop_sheet(facts).table(),
-        "events": events.table() if events.rows else None,
-        "solver": solver_sheet(facts).table(),
-        "first": facts.loops[0]["name"],
-        "side": animation_parts(facts.scene),
-        "provenance": facts.provenance,
-        **shown(control_charts(facts)),
-    }
-    return template("control.html.jinja").render(**context)
+def build_control_page(facts: ControlFacts) -> Page:
+    """Return the page of loops."""
+    charts = {chart.name: chart for chart in control_charts(facts)}
+    return Page(
+        title=facts.title,
+        kind="closed loops",
+        about=["closed loops"],
+        headline=facts.content["sentence"],
+        verdict=verdict(facts),
+        tiles=tiles(facts),
+        sections=[
+            Section(
+                "paths",
+                "Path",
+                [
+                    "The tip from the side; axes have scales of their own, so that millimetres are seen.",
+                    charts["path"],
+                ],
+            ),
+            Section(
+                "error",
+                "Errors",
+                [
+                    "Distance of the tip to where the reference is at that time, and what each cylinder contributes.",
+                    charts["errors"],
+                    charts["strokes"],
+                ],
+            ),
+            Section("side", "Side view", [f"Loop {facts.loops[0]['name']}.", side_view(facts.scene)]),
+            Section("lever", "Levers", [charts["levers"]]),
+            Section("loops", "Loops", [loop_table(facts), event_table(facts)]),
+            Section(
+                "steps",
+                "Solver",
+                [
+                    "Time of a step of the controller on the computer that ran the loop.",
+                    charts["solver"],
+                    solver_table(facts),
+                ],
+            ),
+        ],
+        provenance=facts.provenance,
+        styles=("page.css", "side_view.css"),
+    )

@@ -2,62 +2,137 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from markupsafe import Markup
 
 from edp.data.coverage import INTEGRATED, Coverage
 from edp.data.coverage_targets import BEYOND, OCCUPANCY, wanted
 from edp.data.spectrum import FLAT_DB
 from edp.errors import count_of
 from edp.logs import DataQuality
-from edp.report.common.tables import TextTable
-from edp.report.common.templates import template
+from edp.report.common.page import Fold, Page, Paragraph, Part, Points, Section, Subsection
 from edp.report.coverage.charts import coverage_charts
-from edp.report.coverage.quality import quality_tables
-from edp.report.run.page import shown
-from edp.storage import write_bytes
-from edp.wording import MISSING, count_text, figure, listed, number, percent, unbroken
+from edp.report.coverage.quality import quality_section
+from edp.table import Column, Table
+from edp.wording import MISSING, count_text, figure, listed, number, percent
+
+JOINTS = {
+    "joint_command": "Command and motion",
+    "joint_head": "Head pressure and motion",
+    "joint_rod": "Rod pressure and motion",
+    "joint_velocities": "Two axes",
+}
+"""Heading of each joint histogram, by the name of its figure."""
+NO_COMMANDS = Markup(
+    "No channel of these recordings is known to command. Name them: <code>edp inspect DATA --inputs a,b</code>, or "
+    "give a signal map with their kinds."
+)
 
 
-def build_coverage_page(coverage: Coverage, output: str | Path, title: str, quality: DataQuality | None = None) -> Path:
-    """Write what a data set covers as one HTML file that opens with no network.
+def build_coverage_page(coverage: Coverage, title: str, quality: DataQuality | None = None) -> Page:
+    """Return the page of what a data set covers.
 
     Args:
-        coverage: what it covers.
-        output: where to write.
+        coverage: what the data set covers.
         title: name of the data set.
         quality: how good its recordings are.
-
-    Raises:
-        StorageError: the page cannot be written.
     """
-    target = Path(output)
-    write_bytes(target, render_coverage(coverage, title, quality).encode("utf-8", "replace"))
-    return target
+    charts = {chart.name: chart for chart in coverage_charts(coverage)}
+    constant = f"Constant, and left out: {', '.join(coverage.constant)}."
+    commands: list[Part | None] = [
+        Subsection(
+            [
+                "Power spectral density of each command; what lies far below the shaded band is hardly ever asked for, "
+                "so a model cannot learn the answer to it.",
+                charts.get("spectrum"),
+            ],
+            "Spectrum",
+        ),
+        Subsection(
+            [
+                "Smallest singular value of the Hankel matrix of the inputs, each brought to deviation 1: the weakest "
+                "direction in which the last so many samples of all inputs differ. At zero, models that differ in that "
+                "direction cannot be distinguished.",
+                charts.get("excitation"),
+            ],
+            "Persistent excitation",
+        ),
+        Paragraph(constant, "quiet") if coverage.constant else None,
+        activity_table(coverage),
+        together_table(coverage),
+        None if activity_table(coverage).rows else Paragraph(NO_COMMANDS, "missing"),
+    ]
+    return Page(
+        title=title,
+        kind="coverage",
+        about=[
+            "coverage",
+            f"{count_of(coverage.recordings, 'recording')}, {number(coverage.hours, 2)} h at "
+            f"{figure(coverage.rate_hz)} Hz",
+        ],
+        headline=headline(coverage),
+        verdict=verdict(coverage),
+        tiles=tiles(coverage),
+        sections=[
+            Section("wanted", "What is wanted", [wanted_table(coverage)], "Wanted"),
+            Section("commands", "How rich the commands are", commands, "Commands"),
+            Section("poses", "Where the machine has been", [_pose_text(coverage), charts.get("occupancy")], "Poses"),
+            Section(
+                "joint",
+                "What was seen together",
+                [
+                    "Share of the samples in each bin, on a logarithmic scale; a model is at home where there is "
+                    "colour. Pearson's correlation and the mutual information at the same instant stand above each "
+                    "map.",
+                    *(Subsection([charts.get(name)], heading) for name, heading in JOINTS.items()),
+                    Fold("The same in figures", [joints_table(coverage)]),
+                ],
+            ),
+            Section(
+                "events",
+                "Events",
+                [
+                    "Moments in which another part of the machine decides: a model that met few of them will be "
+                    "surprised.",
+                    events_table(coverage),
+                ],
+            ),
+            *([] if quality is None else [quality_section(quality)]),
+            Section(
+                "split",
+                "Tests and training",
+                [
+                    "Distance from each test sample to the nearest training sample, over commands now and 0.2 s "
+                    "earlier, velocities and pressures; beside it, as the yardstick, the distance from one half of the "
+                    "training recordings to the other.",
+                    distance_table(coverage),
+                ],
+            ),
+            Section(
+                "contradictions",
+                "Contradictions",
+                [Points([f"{_first_up(text)}." for text in coverage.contradictions])],
+            ),
+            Section("absent", "Not examined", [Points([f"{_first_up(text)}." for text in coverage.absent])]),
+        ],
+    )
 
 
-def render_coverage(coverage: Coverage, title: str, quality: DataQuality | None = None) -> str:
-    """The page's text."""
-    charts = coverage_charts(coverage)
-    context: dict[str, Any] = {
-        "title": title,
-        "size": f"{count_of(coverage.recordings, 'recording')}, {number(coverage.hours, 2)} h at "
-        f"{figure(coverage.rate_hz)} Hz",
-        "headline": unbroken(headline(coverage)),
-        "verdict": verdict(coverage),
-        "tiles": tiles(coverage),
-        **shown(charts),
-        "wanted": wanted_table(coverage),
-        "found": coverage,
-        "quality": {} if quality is None else quality_tables(quality),
-        "integrated": coverage.occupancy is not None and coverage.occupancy.source == INTEGRATED,
-        "activity": activity_table(coverage),
-        "together": together_table(coverage),
-        "events": events_table(coverage),
-        "joints": joints_table(coverage),
-        "distance": distance_table(coverage),
-    }
-    return template("coverage.html.jinja").render(**context)
+def _pose_text(coverage: Coverage) -> str:
+    """Return how the maps of strokes are read, and how strokes were found; empty without strokes."""
+    occupancy = coverage.occupancy
+    if occupancy is None:
+        return ""
+    text = "cells in a stronger colour were visited longer, empty ones never."
+    if occupancy.samples.ndim == 3:
+        text = f"One map for each sixth of {occupancy.names[0]}; {text}"
+    if occupancy.source == INTEGRATED:
+        text += (
+            " No stroke is recorded: velocities were integrated, each recording about its own mean, so that offsets "
+            "between recordings and drift are in the picture."
+        )
+    elif not occupancy.full_stroke:
+        text += " The full strokes are not known: the maps span the range that was seen."
+    return _first_up(text)
 
 
 def headline(coverage: Coverage) -> str:
@@ -117,7 +192,7 @@ def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def wanted_table(coverage: Coverage) -> TextTable | None:
+def wanted_table(coverage: Coverage) -> Table:
     """Figures beside what is wanted of them."""
     rows = tuple(
         (
@@ -128,49 +203,54 @@ def wanted_table(coverage: Coverage) -> TextTable | None:
         )
         for w in wanted(coverage)
     )
-    columns = (("Figure", ""), ("Here", ""), ("Wanted", ""), ("Verdict", ""))
-    return TextTable("Wanted of data to learn a machine from", columns, rows) if rows else None
+    columns = (Column("Figure"), Column("Here"), Column("Wanted"), Column("Verdict"))
+    return Table("Wanted of data to learn a machine from", columns, rows)
 
 
-def activity_table(coverage: Coverage) -> TextTable | None:
+def activity_table(coverage: Coverage) -> Table:
     """Commands by axis."""
     rows = tuple(
         (axis.axis, count_text(axis.reversals), count_text(axis.crossings), percent(axis.active))
         for axis in coverage.activity
         if axis.reversals is not None
     )
-    columns = (("Axis", ""), ("Reversals", ""), ("Left the dead band", "times"), ("Commanded", "of the time"))
-    return TextTable("Commands", columns, rows) if rows else None
+    columns = (
+        Column("Axis"),
+        Column("Reversals"),
+        Column("Left the dead band", "times"),
+        Column("Commanded", "of the time"),
+    )
+    return Table("Commands", columns, rows)
 
 
-def together_table(coverage: Coverage) -> TextTable | None:
+def together_table(coverage: Coverage) -> Table:
     """Axes in use at once."""
     rows = tuple((_first_up(name), percent(share)) for name, share in coverage.together.items())
-    return TextTable("In use at once", (("Commanded", ""), ("Share", "of the time")), rows) if rows else None
+    return Table("In use at once", (Column("Commanded"), Column("Share", "of the time")), rows)
 
 
-def events_table(coverage: Coverage) -> TextTable | None:
+def events_table(coverage: Coverage) -> Table:
     """Return the events in the recordings; None if the channels cannot show events."""
     rows = tuple(
         (_first_up(event.name), count_text(event.count), percent(event.share), event.note or "recorded")
         for event in coverage.events
         if event.count is not None
     )
-    columns = (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", ""))
-    return TextTable("How often", columns, rows) if rows else None
+    columns = (Column("Event"), Column("Count"), Column("Share", "of the time"), Column("Source"))
+    return Table("How often", columns, rows)
 
 
-def joints_table(coverage: Coverage) -> TextTable | None:
+def joints_table(coverage: Coverage) -> Table:
     """Joint histograms in figures."""
     rows = tuple(
         (f"{j.x} and {j.y}", percent(j.filled), number(j.correlation, 2), number(j.information, 2))
         for j in coverage.joints
     )
-    columns = (("Signals", ""), ("Bins filled", ""), ("Correlation", ""), ("Mutual information", "nat"))
-    return TextTable("Joint histograms in figures", columns, rows) if rows else None
+    columns = (Column("Signals"), Column("Bins filled"), Column("Correlation"), Column("Mutual information", "nat"))
+    return Table("Joint histograms in figures", columns, rows)
 
 
-def distance_table(coverage: Coverage) -> TextTable | None:
+def distance_table(coverage: Coverage) -> Table | None:
     """Distance from tests to training beside that within training."""
     far = coverage.distance
     if far is None:
@@ -179,8 +259,13 @@ def distance_table(coverage: Coverage) -> TextTable | None:
         ("From test to training", number(far.test[0], 2), number(far.test[1], 2), percent(far.beyond)),
         ("Within training", number(far.train[0], 2), number(far.train[1], 2), percent(0.05)),
     )
-    columns = (("Nearest neighbour", ""), ("Median", ""), ("95 % quantile", ""), ("Beyond 95 % of training", ""))
-    return TextTable(f"Distance in deviations of {far.signals} signals", columns, rows)
+    columns = (
+        Column("Nearest neighbour"),
+        Column("Median"),
+        Column("95 % quantile"),
+        Column("Beyond 95 % of training"),
+    )
+    return Table(f"Distance in deviations of {far.signals} signals", columns, rows)
 
 
 def _first_up(text: str) -> str:

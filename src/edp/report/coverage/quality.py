@@ -6,24 +6,31 @@ import math
 
 from edp.errors import count_of
 from edp.logs import DataQuality, Finding, QualityReport
-from edp.report.common.tables import TextTable
+from edp.report.common.page import Fold, Section
+from edp.table import Column, Table
 from edp.wording import MISSING, count_text, figure, number, percent
 
 SHOWN_CHANNELS = 400
 """Rows of the table of channels; the rest is in the JSON."""
 
 
-def quality_tables(quality: DataQuality) -> dict[str, TextTable]:
-    """Recordings, channels that are not good, and findings, by name; a table without rows is left out."""
-    tables = {
-        "recordings": recordings_table(quality),
-        "channels": channels_table(quality),
-        "findings": findings_table(quality),
-    }
-    return {name: table for name, table in tables.items() if table.rows}
+def quality_section(quality: DataQuality) -> Section:
+    """Return the section on the quality of recordings: recordings, channels that are not good, and findings."""
+    return Section(
+        "quality",
+        "Quality of the recordings",
+        [
+            "What the sensors and the logger did to the signals: steps of the numbers, noise at rest, how often a new "
+            "value comes, how long one value stands, and the share of the time at an end of the range.",
+            recordings_table(quality),
+            Fold("Channel by channel", [channels_table(quality)]),
+            findings_table(quality),
+        ],
+        "Quality",
+    )
 
 
-def recordings_table(quality: DataQuality) -> TextTable:
+def recordings_table(quality: DataQuality) -> Table:
     """A row for each recording."""
     rows = tuple(
         (
@@ -39,18 +46,33 @@ def recordings_table(quality: DataQuality) -> TextTable:
         for report in quality.reports
     )
     columns = (
-        ("Recording", ""), ("Length", "s"), ("Rate", "Hz"), ("Jitter", "steps"), ("Gaps", ""), ("Missing", "values"),
-        ("Warnings", ""), ("Verdict", ""),
-    )  # fmt: skip
-    return TextTable("Recordings", columns, rows)
+        Column("Recording"),
+        Column("Length", "s"),
+        Column("Rate", "Hz"),
+        Column("Jitter", "steps"),
+        Column("Gaps"),
+        Column("Missing", "values"),
+        Column("Warnings"),
+        Column("Verdict"),
+    )
+    return Table("Recordings", columns, rows)
 
 
-def channels_table(quality: DataQuality) -> TextTable:
+def channels_table(quality: DataQuality) -> Table:
     """Sensor facts of each channel, over all recordings: the worst of each."""
     columns = (
-        ("Channel", ""), ("Unit", ""), ("Min", ""), ("Max", ""), ("Step", ""), ("Noise", ""), ("SNR", "dB"),
-        ("New", "Hz"), ("Stuck", "s"), ("At ends", ""), ("Verdict", "worst"),
-    )  # fmt: skip
+        Column("Channel"),
+        Column("Unit"),
+        Column("Min"),
+        Column("Max"),
+        Column("Step"),
+        Column("Noise"),
+        Column("SNR", "dB"),
+        Column("New", "Hz"),
+        Column("Stuck", "s"),
+        Column("At ends"),
+        Column("Verdict", "worst"),
+    )
     names = list(dict.fromkeys(channel.name for report in quality.reports for channel in report.channels))
     rows = []
     for name in names[:SHOWN_CHANNELS]:
@@ -73,10 +95,10 @@ def channels_table(quality: DataQuality) -> TextTable:
                 worst,
             )
         )
-    return TextTable("Channels over all recordings", columns, tuple(rows))
+    return Table("Channels over all recordings", columns, tuple(rows))
 
 
-def findings_table(quality: DataQuality) -> TextTable:
+def findings_table(quality: DataQuality) -> Table:
     """Errors and warnings, equal ones of several recordings together, worst first; notes are in the JSON."""
     grouped: dict[tuple[str, str, str, str], list[str]] = {_key(finding): [] for finding in quality.findings}
     for report in quality.reports:
@@ -87,8 +109,8 @@ def findings_table(quality: DataQuality) -> TextTable:
         (channel or ("Whole log" if names else "Data set"), severity, what, _where(names), advice)
         for (severity, channel, what, advice), names in sorted(grouped.items(), key=lambda item: item[0][0])
     )
-    columns = (("Channel", ""), ("", ""), ("Finding", ""), ("Where", ""), ("What to do", ""))
-    return TextTable("Findings", columns, rows)
+    columns = tuple(Column(head, is_text=True) for head in ("Channel", "", "Finding", "Where", "What to do"))
+    return Table("Findings", columns, rows)
 
 
 def _key(finding: Finding) -> tuple[str, str, str, str]:

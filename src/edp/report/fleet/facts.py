@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from edp.errors import count_of
-from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.fleet.result import FleetReport, MachineErrors, ReportedMachine
+from edp.table import Column, Table, Value, figures
 from edp.wording import figure, number, percent
 
 WORST = 10
@@ -198,17 +198,21 @@ def tiles(facts: FleetFacts) -> list[tuple[str, str, str]]:
     ]
 
 
-def worst_sheet(facts: FleetFacts) -> Sheet:
+def worst_table(facts: FleetFacts) -> Table:
     """The worst machines, and why."""
     rows: list[tuple[Value, ...]] = [
         (row.name, row.mae, "; ".join(row.why) or "nothing stands out: the network is less exact here")
         for row in facts.rows[:WORST]
     ]
-    columns = (Column("Machine"), Column("Error", facts.unit, figures(row[1] for row in rows)), Column("Why"))
-    return Sheet("worst", f"The {len(rows)} machines with the largest error", columns, tuple(rows))
+    columns = (
+        Column("Machine"),
+        Column("Error", facts.unit, figures(row[1] for row in rows)),
+        Column("Why", is_text=True),
+    )
+    return Table(f"The {len(rows)} machines with the largest error", columns, tuple(rows), name="worst")
 
 
-def machine_sheet(facts: FleetFacts) -> Sheet:
+def machine_table(facts: FleetFacts) -> Table:
     """Every machine."""
     rows: list[tuple[Value, ...]] = [
         (row.name, row.minutes, row.mae, percent(row.skill), row.drift, "yes" if row.drifts else "", row.changes)
@@ -224,9 +228,9 @@ def machine_sheet(facts: FleetFacts) -> Sheet:
         Column("Changes told"),
     )
     marked = frozenset(n for n, row in enumerate(facts.rows) if row.drifts or row.changes)
-    return Sheet("machines", "All machines, the largest error first", columns, tuple(rows), marked)
+    return Table("All machines, the largest error first", columns, tuple(rows), marked, name="machines")
 
 
-def failed_sheet(facts: FleetFacts) -> Sheet:
+def failed_table(facts: FleetFacts) -> Table:
     """Machines that could not be judged."""
-    return Sheet("failed", "Machines that could not be judged", (Column("Machine"), Column("Why")), facts.failed)
+    return Table("Machines that could not be judged", (Column("Machine"), Column("Why", is_text=True)), facts.failed)

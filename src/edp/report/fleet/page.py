@@ -2,58 +2,73 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from edp import __version__
 from edp.report.common.chart import BLUE, MUTED, Bars, Chart, ChartAxis, DataSeries, GuideLine, Mark, Panel
-from edp.report.common.templates import template
-from edp.report.fleet.facts import FleetFacts, failed_sheet, headline, machine_sheet, tiles, verdict, worst_sheet
-from edp.report.run.page import shown
-from edp.storage import write_bytes
-from edp.wording import unbroken
+from edp.report.common.page import Page, Section
+from edp.report.fleet.facts import FleetFacts, failed_table, headline, machine_table, tiles, verdict, worst_table
 
 BINS = 24
 
 
-def write_fleet_page(facts: FleetFacts, target: str | Path) -> Path:
-    """Write the page of a fleet.
-
-    Raises:
-        StorageError: the page cannot be written.
-    """
-    write_bytes(Path(target), render(facts).encode("utf-8", "replace"))
-    return Path(target)
-
-
-def render(facts: FleetFacts) -> str:
-    """The page's text."""
+def build_fleet_page(facts: FleetFacts) -> Page:
+    """Return the page of a fleet."""
     report, network = facts.report, facts.report.network
-    return template("fleet.html.jinja").render(
+    return Page(
         title=facts.title,
-        network=network.label,
-        headline=unbroken(headline(facts)),
+        kind="fleet",
+        about=["fleet", network.label],
+        headline=headline(facts),
         verdict=verdict(facts),
         tiles=tiles(facts),
-        worst=worst_sheet(facts).table() if facts.rows else None,
-        machines=machine_sheet(facts).table() if facts.rows else None,
-        failed=failed_sheet(facts).table() if facts.failed else None,
+        sections=[
+            Section(
+                "worst",
+                "The worst, and why",
+                [
+                    "What departs from the other machines of the fleet. A reason is a pointer, not a proof: look at "
+                    "the machine's own report, and at its monitor, before anything is repaired.",
+                    worst_table(facts),
+                ],
+                "The worst",
+            ),
+            Section(
+                "errors",
+                "Errors",
+                [
+                    "Mean absolute error of each machine over its outputs and all ticks after a start-up of one "
+                    "window; dashed: the median machine.",
+                    errors_chart(facts) if facts.rows else None,
+                ],
+            ),
+            Section(
+                "drift",
+                "Drift",
+                [
+                    "The error of the second half of a machine's time over that of the first, by blocks of ten "
+                    "seconds. Other work in the second half looks the same as wear: a machine drifts here where the "
+                    "difference is larger than chance between blocks.",
+                    drift_chart(facts) if any(row.drift is not None for row in facts.rows) else None,
+                ],
+            ),
+            Section(
+                "machines",
+                "All machines",
+                [
+                    "Bold: machines that drift, or of which the monitor told a change.",
+                    machine_table(facts),
+                ],
+            ),
+            Section("failed", "Not judged", [failed_table(facts)]),
+        ],
         provenance=[
             ("Network", f"{network.path} ({network.weights})"),
             ("Store", report.store),
             ("Deltas", report.deltas or "none"),
             ("Monitor", report.monitor or "none"),
-            ("EDP", __version__),
+            ("EDP", report.edp),
         ],
-        **shown(fleet_charts(facts) if facts.rows else []),
     )
-
-
-def fleet_charts(facts: FleetFacts) -> list[Chart]:
-    """Every figure of the page: ``errors`` and ``drift``."""
-    drawn = [errors_chart(facts)]
-    return [*drawn, drift_chart(facts)] if any(row.drift is not None for row in facts.rows) else drawn
 
 
 def errors_chart(facts: FleetFacts) -> Chart:

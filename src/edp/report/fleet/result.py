@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from edp import __version__
@@ -145,6 +145,7 @@ class FleetReport:
         rate_hz: samples per second.
         targets: outputs.
         machines: in the order of the store.
+        edp: version that evaluated them.
     """
 
     network: ReportedNetwork
@@ -154,13 +155,14 @@ class FleetReport:
     horizon: int
     rate_hz: float
     targets: tuple[ReportedTarget, ...]
-    machines: tuple[ReportedMachine, ...] = field(default=())
+    machines: tuple[ReportedMachine, ...] = ()
+    edp: str = __version__
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of ``fleet_report.json``."""
         return {
             "schema": SCHEMA,
-            "edp": __version__,
+            "edp": self.edp,
             "network": asdict(self.network),
             "store": self.store,
             "deltas": self.deltas,

@@ -12,7 +12,7 @@ from edp.monitor.diagnosis.causes import NONE_OF_THESE, Cause
 from edp.monitor.diagnosis.sentences import clock
 from edp.monitor.diagnosis.structure import Confusion
 from edp.monitor.traces import RecordingTrace, RunTraces
-from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.table import Column, Table, Value, figures
 from edp.wording import MISSING, count_text, label_by_name, listed, number, short_labels
 
 MOST_ALARMS = 40
@@ -172,7 +172,7 @@ def tiles(facts: MonitorFacts) -> list[tuple[str, str, str]]:
 SEVERITIES = (("stop", "reasons to stop"), ("warning", "warnings"), ("note", "notes"))
 
 
-def alarm_sheet(facts: MonitorFacts) -> Sheet:
+def alarm_table(facts: MonitorFacts) -> Table:
     """A row an alarm."""
     rows: list[tuple[Value, ...]] = []
     labels = label_by_name(alarm.recording for alarm in facts.alarms)
@@ -186,13 +186,18 @@ def alarm_sheet(facts: MonitorFacts) -> Sheet:
         ))  # fmt: skip
     share = figures([], decimals=2)
     heads = (
-        Column("Recording"), Column("Since"), Column("Raised"), Column("Severity"), Column("Most likely"),
-        Column("Probability", "", share), Column("Over limit", "", share),
-    )  # fmt: skip
-    return Sheet("alarms", "Alarms in the order in which they were raised", heads, tuple(rows))
+        Column("Recording"),
+        Column("Since"),
+        Column("Raised"),
+        Column("Severity", is_text=True),
+        Column("Most likely", is_text=True),
+        Column("Probability", "", share),
+        Column("Over limit", "", share),
+    )
+    return Table("Alarms in the order in which they were raised", heads, tuple(rows), name="alarms")
 
 
-def cause_sheet(alarm: AlarmFacts) -> Sheet | None:
+def cause_table(alarm: AlarmFacts) -> Table | None:
     """What an alarm could be, the most likely cause first; None without a dictionary."""
     rows: list[tuple[Value, ...]] = [
         (
@@ -207,11 +212,11 @@ def cause_sheet(alarm: AlarmFacts) -> Sheet | None:
         return None
     heads = (
         Column("What it could be"),
-        Column("Part"),
-        Column("Where"),
+        Column("Part", is_text=True),
+        Column("Where", is_text=True),
         Column("Probability", "", figures([], False, 2)),
     )
-    return Sheet("causes", "Causes", heads, tuple(rows), frozenset({0}))
+    return Table("Causes", heads, tuple(rows), frozenset({0}), name="causes")
 
 
 def confusions_of(facts: MonitorFacts, alarm: AlarmFacts) -> list[str]:
@@ -229,14 +234,17 @@ def confusions_of(facts: MonitorFacts, alarm: AlarmFacts) -> list[str]:
     return lines
 
 
-def confusion_sheet(facts: MonitorFacts) -> Sheet:
+def confusion_table(facts: MonitorFacts) -> Table:
     """Faults that cannot be told apart, the worst pairs first."""
     rows: list[tuple[Value, ...]] = [
         (pair.first, pair.second, pair.error, pair.sensor or MISSING, pair.sensor_error) for pair in facts.confusions
     ]
     share = figures([], decimals=2)
     heads = (
-        Column("Fault"), Column("Not told apart from"), Column("Error between the two", "", share),
-        Column("Further sensor that separates them"), Column("Error with it", "", share),
-    )  # fmt: skip
-    return Sheet("confusions", "Faults that cannot be told apart with the present sensors", heads, tuple(rows))
+        Column("Fault"),
+        Column("Not told apart from", is_text=True),
+        Column("Error between the two", "", share),
+        Column("Further sensor that separates them", is_text=True),
+        Column("Error with it", "", share),
+    )
+    return Table("Faults that cannot be told apart with the present sensors", heads, tuple(rows), name="confusions")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
-from edp.report.common.tables import TextTable, comparison_tables
+from edp.evaluation.study import StudyFile
 from edp.report.run.facts import Facts
+from edp.report.run.tables import comparison_tables
 from edp.report.search import words
-from edp.report.search.facts import StudyFacts
-from edp.report.search.tables import phases_sheet
+from edp.report.search.tables import phases_table
+from edp.table import Table
 from edp.wording import printable
 
 TERMINAL = 80
@@ -18,19 +19,20 @@ _GAP = "  "
 _CELL = "padding:2px 10px;text-align:"
 
 
-def html_of(tables: Iterable[TextTable], title: str = "") -> str:
+def html_of(tables: Iterable[Table], title: str = "") -> str:
     """Tables one below the other, escaped; the rows of the network are bold."""
     parts = [f"<p><b>{_safe(title)}</b></p>"] if title else []
     for table in tables:
-        cells = "".join(_tag("th", _headed(*column), column_index) for column_index, column in enumerate(table.columns))
-        head = f"<thead><tr>{cells}</tr></thead>" if any(map(any, table.columns)) else ""
-        rows = "".join(_row(row, number in table.marked) for number, row in enumerate(table.rows))
+        heads = table.heads()
+        cells = "".join(_tag("th", head, column_index) for column_index, head in enumerate(heads))
+        head = f"<thead><tr>{cells}</tr></thead>" if any(heads) else ""
+        rows = "".join(_row(row, number in table.marked) for number, row in enumerate(table.texts()))
         caption = f"<caption>{_safe(table.caption)}</caption>" if table.caption else ""
         parts.append(f"<table>{caption}{head}<tbody>{rows}</tbody></table>")
     return f"<div>{''.join(parts)}</div>"
 
 
-def text_of(table: TextTable, width: int = TERMINAL) -> str:
+def text_of(table: Table, width: int = TERMINAL) -> str:
     """A table in columns of one width each, for a terminal.
 
     Headings are broken at spaces; columns that do not fit beside the others follow below, behind the names again.
@@ -39,10 +41,10 @@ def text_of(table: TextTable, width: int = TERMINAL) -> str:
         table: what is shown.
         width: characters of a line; only a single column that is wider goes beyond it.
     """
-    bodies = list(zip(*table.rows, strict=True)) or [()] * len(table.columns)
+    bodies = list(zip(*table.texts(), strict=True)) or [()] * len(table.columns)
     columns = [
-        [[printable(word) for word in _headed(*head).split(" ")], [printable(cell) for cell in cells]]
-        for head, cells in zip(table.columns, bodies, strict=True)
+        [[printable(word) for word in head.split(" ")], [printable(cell) for cell in cells]]
+        for head, cells in zip(table.heads(), bodies, strict=True)
     ]
     widths = [max(map(len, [*words, *cells])) for words, cells in columns]
     groups: list[list[int]] = [[]]
@@ -76,20 +78,16 @@ def _broken(words: Sequence[str], width: int) -> list[str]:
     return lines
 
 
-def score_tables(facts: Facts) -> list[TextTable]:
+def score_tables(facts: Facts) -> list[Table]:
     """A table for each horizon: every judged model, the best first."""
     return comparison_tables(facts)
 
 
-def study_html(study: StudyFacts) -> str:
+def study_html(study: StudyFile) -> str:
     """What a search came to, and how far its phases are."""
     sentences = " ".join([words.headline(study), *words.verdict(study)])
-    sheet = phases_sheet(study)
-    return f"<div><p>{_safe(sentences)}</p>{html_of([sheet.table()] if sheet is not None else [])}</div>"
-
-
-def _headed(heading: str, unit: str) -> str:
-    return f"{heading} [{unit}]" if unit else heading
+    phases = phases_table(study)
+    return f"<div><p>{_safe(sentences)}</p>{html_of([phases] if phases is not None else [])}</div>"
 
 
 def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:

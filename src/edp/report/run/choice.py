@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError, count_of
-from edp.report.common.tables import TextTable
 from edp.report.run.facts import NETWORK, Facts, Target, horizon_text, label_of, score
 from edp.report.run.figures import horizons_shown
 from edp.storage import read_object, write_json
 from edp.storage.paths import is_file_at
+from edp.table import Column, Table
 from edp.wording import MISSING, decimals_for, number, percent
 
 FILE = "auto.json"
@@ -131,7 +131,7 @@ def _is_skill(value: Any) -> bool:
     )
 
 
-def candidates_table(content: Mapping[str, Any]) -> TextTable:
+def candidates_table(content: Mapping[str, Any]) -> Table:
     """Each candidate's error on left-out data relative to the one that is kept."""
     chosen = content["chosen"]
     rows = []
@@ -140,11 +140,11 @@ def candidates_table(content: Mapping[str, Any]) -> TextTable:
         share = math.expm1(float(content["excess"][name]) - float(content["excess"][chosen]))
         rows.append((one["label"], f"{one['parameters']:,}", "kept" if name == chosen else percent(share, signed=True)))
     marked = frozenset(row for row, name in enumerate(content["candidates"]) if name == chosen)
-    columns = (("Model", ""), ("Parameters", ""), ("Error on left-out data", "against the one kept"))
-    return TextTable("The models that were tried", columns, tuple(rows), marked)
+    columns = (Column("Model"), Column("Parameters"), Column("Error on left-out data", "against the one kept"))
+    return Table("The models that were tried", columns, tuple(rows), marked)
 
 
-def model_tables(facts: Facts, content: Mapping[str, Any]) -> list[TextTable]:
+def model_tables(facts: Facts, content: Mapping[str, Any]) -> list[Table]:
     """Every model that was tried and every baseline, a table an output: left-out data beside the test recordings.
 
     A candidate's error on left-out data is its cross-validated promise, a baseline's is that on the validation part,
@@ -153,7 +153,7 @@ def model_tables(facts: Facts, content: Mapping[str, Any]) -> list[TextTable]:
     return [table for table in (_of_output(facts, content, target) for target in facts.targets) if table.rows]
 
 
-def _of_output(facts: Facts, content: Mapping[str, Any], target: Target) -> TextTable:
+def _of_output(facts: Facts, content: Mapping[str, Any], target: Target) -> Table:
     horizons = horizons_shown(facts)
     chosen = content["chosen"]
 
@@ -181,14 +181,16 @@ def _of_output(facts: Facts, content: Mapping[str, Any], target: Target) -> Text
         for label, values in rows
     )
     marked = frozenset(index for index, name in enumerate(content["candidates"]) if name == chosen)
-    columns = [("Model", "")]
+    columns = [Column("Model")]
     for k in horizons:
-        columns += [(f"{horizon_text(facts, k)} ahead, {part}", target.unit) for part in ("left-out data", "test")]
+        columns += [
+            Column(f"{horizon_text(facts, k)} ahead, {part}", target.unit) for part in ("left-out data", "test")
+        ]
     caption = f"{target.description}: RMSE of every model on left-out data and on the test recordings"
-    return TextTable(caption, tuple(columns), cells, marked)
+    return Table(caption, tuple(columns), cells, marked)
 
 
-def promise_table(facts: Facts, content: Mapping[str, Any]) -> TextTable | None:
+def promise_table(facts: Facts, content: Mapping[str, Any]) -> Table | None:
     """By output and horizon the error promised and that on the test recordings, both beside a simple model's."""
     promised, interval = content["candidates"][content["chosen"]]["promise"], content.get("interval")
     skill = content.get("skill") or {"against": FLOOR, "promise": {}, "interval": {"low": {}, "high": {}}}
@@ -222,16 +224,16 @@ def promise_table(facts: Facts, content: Mapping[str, Any]) -> TextTable | None:
         return None
     beside = "Error over the linear model's" if skill["against"] == FLOOR else "Error over persistence's"
     columns = (
-        ("Output", ""),
-        ("Unit", ""),
-        ("Promised (90 % of tests)", "RMSE"),
-        ("On the test recordings", "RMSE"),
-        ("Test against promise", ""),
-        (f"{beside}, promised (90 %)", ""),
-        ("the same, test", ""),
-        ("Present value kept, left-out data", "RMSE"),
+        Column("Output"),
+        Column("Unit"),
+        Column("Promised (90 % of tests)", "RMSE"),
+        Column("On the test recordings", "RMSE"),
+        Column("Test against promise"),
+        Column(f"{beside}, promised (90 %)"),
+        Column("the same, test"),
+        Column("Present value kept, left-out data", "RMSE"),
     )
-    return TextTable("What left-out data promised, and what came of it", columns, tuple(rows))
+    return Table("What left-out data promised, and what came of it", columns, tuple(rows))
 
 
 def promise_line(content: Mapping[str, Any]) -> str:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.report.common.chart import BLUE, Chart, ChartAxis, Control, DataSeries, GuideLine, Mark, Panel
-from edp.report.common.tables import TextTable
 from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, score
 from edp.report.run.figures import aligned, headline_first
+from edp.table import Column, Table
 from edp.wording import number
 
 LEAST_LAGS, LAGS_PER_HORIZON, MOST_LAGS = 40, 3, 400
@@ -19,7 +19,7 @@ WHITE = 2.576
 """Standard errors that hold 99 % of the correlations of white noise."""
 
 
-def fit_table(facts: Facts) -> TextTable | None:
+def fit_table(facts: Facts) -> Table | None:
     """Fit of the network by output and horizon; None where its scores hold no R².
 
     ``fit = 100 (1 - sqrt(1 - R²))`` %, which is 100 % less the root-mean-square error over the deviation of the truth:
@@ -40,8 +40,8 @@ def fit_table(facts: Facts) -> TextTable | None:
         rows.append((target.description, *cells))
     if not any_r2:
         return None
-    columns = (("Output", ""), *((f"{horizon_text(facts, k)} ahead", "%") for k in horizons))
-    return TextTable("Fit of the network by output", columns, tuple(rows))
+    columns = (Column("Output"), *(Column(f"{horizon_text(facts, k)} ahead", "%") for k in horizons))
+    return Table("Fit of the network by output", columns, tuple(rows))
 
 
 def correlations(facts: Facts, horizon: int, output: int) -> tuple[NDArray[np.float64], int]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edp.evaluation.guard import NETWORK
-from edp.report.common.sheets import Column, Sheet, Value, figures, plainly
+from edp.table import Column, Table, Value, figures, plainly
 from edp.wording import figure, percent
 
 WORDS = {
@@ -23,7 +23,7 @@ WORDS = {
 """How a table calls what `edp.evaluation.by_situation` tells apart."""
 
 
-def situation_sheet(scores: Mapping[str, Any], horizon: int) -> Sheet | None:
+def situation_table(scores: Mapping[str, Any], horizon: int) -> Table | None:
     """The network's error by situation beside the best baseline's, most of the error first; None without such scores.
 
     Args:
@@ -52,7 +52,7 @@ def situation_sheet(scores: Mapping[str, Any], horizon: int) -> Sheet | None:
     label = str(models[best].get("label") or best) if best else ""
     relative = (Column("Relative to", label),) if best else ()
     columns = (Column("Situation"), Column("Of the time"), Column("Of the error"), *errors_of, *relative)
-    return Sheet("situations", "Mean absolute error by what the axis does", columns, tuple(rows))
+    return Table("Mean absolute error by what the axis does", columns, tuple(rows), name="situations")
 
 
 def _best_baseline(models: Mapping[str, Any], horizon: int, targets: list[str]) -> str:
@@ -73,15 +73,15 @@ def _ratio(ours: list[float | None], theirs: list[float | None]) -> float | None
     return math.exp(sum(logs) / len(logs)) if logs else None
 
 
-def parts_sheet(foundation: Mapping[str, Any]) -> Sheet:
+def parts_table(foundation: Mapping[str, Any]) -> Table:
     """Machines, recordings and minutes of each part."""
     heads = ("machines", "recordings", "minutes")
     rows = tuple((part, *(facts[key] for key in heads)) for part, facts in foundation["data"].items())
     columns = (Column("Part"), *(Column(head.capitalize(), show=_short) for head in heads))
-    return Sheet("parts", f"{foundation['label']} over many machines", columns, rows)
+    return Table(f"{foundation['label']} over many machines", columns, rows, name="parts")
 
 
-def contexts_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Sheet:
+def contexts_table(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
     """Error by the time since the state was reset, always on the same ticks."""
     unseen = foundation["unseen"]
     rows: list[tuple[Value, ...]] = []
@@ -99,15 +99,15 @@ def contexts_sheet(foundation: Mapping[str, Any], unit: str = "report units") ->
         f"Machines that were never seen ({len(unseen['machines'])}), k = {foundation['horizon']}: error by the time "
         f"since the state was reset, {unseen['ticks']} ticks"
     )
-    return Sheet("contexts", caption, columns, tuple(rows))
+    return Table(caption, columns, tuple(rows), name="contexts")
 
 
 def _short(value: Value) -> str:
     return figure(value) if isinstance(value, int | float) else plainly(value)
 
 
-def machines_sheet(foundation: Mapping[str, Any], unit: str = "report units") -> Sheet:
+def machines_table(foundation: Mapping[str, Any], unit: str = "report units") -> Table:
     """Each machine that tests, the hardest first."""
     each = sorted(foundation["unseen"]["machines"].items(), key=lambda entry: -entry[1])
     columns = (Column("Machine"), Column("MAE", unit, figures([mae for _, mae in each])))
-    return Sheet("machines", "Machines that were never seen, the hardest first", columns, tuple(each))
+    return Table("Machines that were never seen, the hardest first", columns, tuple(each), name="machines")

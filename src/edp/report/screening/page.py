@@ -6,46 +6,172 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from markupsafe import Markup
+
 from edp.errors import count_of
 from edp.logs import DataQuality
+from edp.report.common.page import Fold, Page, Paragraph, Section, Subsection, Terms
 from edp.report.common.picture import write_pictures
-from edp.report.common.templates import template
-from edp.report.coverage.quality import quality_tables
-from edp.report.run.page import shown
-from edp.report.screening import tables as tables
+from edp.report.coverage.quality import quality_section
+from edp.report.screening import tables
 from edp.report.screening.charts import screening_charts
 from edp.report.screening.views import best_groups, joined
-from edp.storage import write_bytes
-from edp.wording import count_text, duration, figure, listed, number, setting_text, unbroken
+from edp.wording import count_text, duration, figure, listed, number, setting_text
 
 if TYPE_CHECKING:
     from edp.data.screening import ScreeningResult
 
+FLAGS_TEXT = Markup(
+    "A negative lag means that the channel shows the value that the other will have that many samples later; a leak of "
+    "the future is never available when a model runs. A command, or a faster sensor of the same, can resemble one "
+    "where the machine follows it exactly: name it as trusted (<code>--trusted</code>) if it is measured."
+)
+
 
 def build_screening_page(
     screening: ScreeningResult,
-    output: str | Path,
     title: str,
     quality: DataQuality | None = None,
     trials: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
-) -> Path:
-    """Write a screening as one HTML file that opens with no network.
+) -> Page:
+    """Return the page of a screening.
 
     Args:
         screening: the screening.
-        output: where to write.
         title: name of the data set.
         quality: how good its recordings are.
         trials: errors of a network on several feature sets (`edp.workflows.feature_selection.trials.Trials.to_json`).
         notes: what a reader must know of how the data were read.
-
-    Raises:
-        StorageError: the page cannot be written.
     """
-    target = Path(output)
-    write_bytes(target, render_screening(screening, title, quality, trials, notes).encode("utf-8", "replace"))
-    return target
+    charts = {chart.name: chart for chart in screening_charts(screening)}
+    hours = screening.samples / screening.rate_hz / 3600
+    ahead = f"{screening.horizon} samples ({figure(1e3 * screening.horizon / screening.rate_hz)} ms)"
+    dropped = tables.dropped_table(screening)
+    left_out = f"{count_of(len(dropped.rows), 'channel')} to leave out, and why"
+    options = sorted((key.replace("_", " "), setting_text(value)) for key, value in screening.options.items())
+    return Page(
+        title=title,
+        kind="screening",
+        about=[
+            "screening",
+            f"{count_of(len(screening.recordings), 'recording')}, {number(hours, 2)} h at "
+            f"{figure(screening.rate_hz)} Hz",
+        ],
+        headline=headline(screening),
+        verdict=verdict(screening, quality),
+        tiles=tiles(screening),
+        sections=[
+            Section(
+                "proposal",
+                "Proposal",
+                [
+                    f"For predicting {', '.join(screening.targets)}, {ahead} ahead. "
+                    f"{sentence(screening.proposal.window_reason)} A lag in brackets is not certain.",
+                    tables.kept_table(screening),
+                    Fold(left_out, [dropped], is_printed=False),
+                    *(Paragraph(note, "quiet") for note in notes),
+                ],
+            ),
+            *([] if trials is None else [_trials_section(trials)]),
+            Section(
+                "flags",
+                "Channels that something is wrong with",
+                [Paragraph(FLAGS_TEXT), tables.flags_table(screening)],
+                "Flags",
+            ),
+            Section(
+                "matrices",
+                "Dependence at the same instant",
+                [
+                    "Over all samples of all recordings. Rank correlations see any rising or falling relation, mutual "
+                    "information any relation at all; what lies below a few hundredths of a nat is chance. Zoom by "
+                    "dragging, double-click to return.",
+                    charts.get("matrices"),
+                ],
+                "Dependence",
+            ),
+            Section(
+                "lags",
+                "Lags",
+                [
+                    "Cross-correlation of channel and target: a maximum at −15 means that the target goes best with "
+                    "the channel of 15 samples before. In the legend, the best lag.",
+                    charts.get("lags"),
+                    tables.ranges_table(screening),
+                    Fold("Channel by channel", [tables.lags_table(screening)]),
+                ],
+            ),
+            Section(
+                "stability",
+                "Stability over the recordings",
+                [
+                    f"Mean of each metric over {len(screening.pieces)} stretches, with a deviation to both sides; the "
+                    "stroke is what unrelated stretches give. A channel whose bar reaches across zero owes its "
+                    "relation to some recordings only. Blue is proposed.",
+                    charts.get("stability"),
+                ],
+                "Stability",
+            ),
+            Section(
+                "importance",
+                "Importance together with all others",
+                [
+                    "How much the squared error of a random forest grows on held-out recordings where a group of "
+                    "collinear channels is shuffled together, as a share of the target's variance, with its 95 % "
+                    "interval.",
+                    charts.get("importance"),
+                    Subsection(
+                        [
+                            "Share of the remaining squared error that the channel's past takes away from a linear "
+                            "prediction which has the pasts of all other usable channels, on held-out stretches, with "
+                            "its 95 % interval.",
+                            charts.get("value"),
+                        ],
+                        "Value of a channel's past",
+                    ),
+                ],
+                "Importance",
+            ),
+            Section(
+                "clusters",
+                "Channels that go together",
+                [
+                    "Complete linkage on the absolute rank correlation: one of a group says nearly all that the group "
+                    "says.",
+                    tables.clusters_table(screening),
+                ],
+                "Clusters",
+            ),
+            *([] if quality is None else [quality_section(quality)]),
+            Section(
+                "how",
+                "How it was done",
+                [
+                    f"{count_of(screening.samples, 'sample')} of {count_of(len(screening.channels), 'channel')} in "
+                    f"{duration(sum(screening.seconds.values()))}.",
+                    tables.stages_table(screening),
+                    Fold("Options", [Terms(options)]),
+                ],
+                "How",
+            ),
+        ],
+        footer="Pictures of it lie beside it as SVG and PNG.",
+    )
+
+
+def _trials_section(trials: Mapping[str, Any]) -> Section:
+    return Section(
+        "trials",
+        "Held-out errors of the sets",
+        [
+            "The same network with the same budget, trained on each set and judged on recordings that neither it nor "
+            f"its early stopping saw ({', '.join(trials['held_out'])}).",
+            tables.trials_table(trials),
+            *(Paragraph(f"{note}.", "quiet") for note in trials["notes"]),
+        ],
+        "Proof",
+    )
 
 
 def write_screening_pictures(screening: ScreeningResult, folder: str | Path) -> list[Path]:
@@ -62,45 +188,6 @@ def write_screening_pictures(screening: ScreeningResult, folder: str | Path) -> 
         StorageError: the folder or a file cannot be written.
     """
     return write_pictures(folder, screening_charts(screening))
-
-
-def render_screening(
-    screening: ScreeningResult,
-    title: str,
-    quality: DataQuality | None = None,
-    trials: Mapping[str, Any] | None = None,
-    notes: Sequence[str] = (),
-) -> str:
-    """The page's text."""
-    charts = screening_charts(screening)
-    hours = screening.samples / screening.rate_hz / 3600
-    context: dict[str, Any] = {
-        "title": title,
-        "size": f"{count_of(len(screening.recordings), 'recording')}, {number(hours, 2)} h "
-        f"at {figure(screening.rate_hz)} Hz",
-        "headline": unbroken(headline(screening)),
-        "verdict": verdict(screening, quality),
-        "tiles": tiles(screening),
-        **shown(charts),
-        "found": screening,
-        "ahead": f"{screening.horizon} samples ({figure(1e3 * screening.horizon / screening.rate_hz)} ms)",
-        "kept": tables.kept_table(screening),
-        "dropped": tables.dropped_table(screening),
-        "flags": tables.flags_table(screening),
-        "ranges": tables.ranges_table(screening),
-        "lags": tables.lags_table(screening),
-        "clusters": tables.clusters_table(screening),
-        "stages": tables.stages_table(screening),
-        "trials": None if trials is None else tables.trials_table(trials),
-        "trial_notes": () if trials is None else tuple(trials["notes"]),
-        "held_out": () if trials is None else tuple(trials["held_out"]),
-        "quality": {} if quality is None else quality_tables(quality),
-        "options": sorted((key.replace("_", " "), setting_text(value)) for key, value in screening.options.items()),
-        "notes": tuple(notes),
-        "window_reason": sentence(screening.proposal.window_reason),
-        "seconds": duration(sum(screening.seconds.values())),
-    }
-    return template("screening.html.jinja").render(**context)
 
 
 def headline(screening: ScreeningResult) -> str:

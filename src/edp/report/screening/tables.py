@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from edp.report.common.tables import TextTable
 from edp.report.screening.views import lag_ranges
+from edp.table import Column, Table
 from edp.wording import MISSING, count_text, duration, interval, number, percent
 
 if TYPE_CHECKING:
@@ -25,25 +25,31 @@ FLAG_WORDS = {
 }
 
 
-def kept_table(screening: ScreeningResult) -> TextTable:
+def kept_table(screening: ScreeningResult) -> Table:
     """The proposed channels by rank."""
     return _choices(screening, "Keep", True)
 
 
-def dropped_table(screening: ScreeningResult) -> TextTable:
+def dropped_table(screening: ScreeningResult) -> Table:
     """The other channels by rank."""
     return _choices(screening, "Drop", False)
 
 
-def _choices(screening: ScreeningResult, caption: str, keep: bool) -> TextTable:
+def _choices(screening: ScreeningResult, caption: str, keep: bool) -> Table:
     groups = dict(zip(screening.channels, screening.groups))
     rows = tuple(
         (c.channel, groups.get(c.channel, MISSING), number(c.score, 2), _lag(screening, c), c.reason)
         for c in screening.proposal.choices
         if c.keep == keep
     )
-    columns = (("Channel", ""), ("Kind of signal", ""), ("Score", "0 to 1"), ("Best lag", "samples"), ("Why", ""))
-    return TextTable(caption, columns, rows)
+    columns = (
+        Column("Channel"),
+        Column("Kind of signal", is_text=True),
+        Column("Score", "0 to 1"),
+        Column("Best lag", "samples"),
+        Column("Why", is_text=True),
+    )
+    return Table(caption, columns, rows)
 
 
 def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
@@ -56,7 +62,7 @@ def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
     return text if best.certain else f"({text})"
 
 
-def flags_table(screening: ScreeningResult) -> TextTable:
+def flags_table(screening: ScreeningResult) -> Table:
     """What is wrong with channels, leaks of the future first."""
     order = list(FLAG_WORDS)
     ranked = sorted(screening.flags, key=lambda flag: (_place(order, flag), flag.channel))
@@ -70,8 +76,14 @@ def flags_table(screening: ScreeningResult) -> TextTable:
         )
         for flag in ranked
     )
-    columns = (("Channel", ""), ("What", ""), ("Of", ""), ("Lag", "samples"), ("Evidence", ""))
-    return TextTable("Flags", columns, rows)
+    columns = (
+        Column("Channel"),
+        Column("What", is_text=True),
+        Column("Of", is_text=True),
+        Column("Lag", "samples"),
+        Column("Evidence", is_text=True),
+    )
+    return Table("Flags", columns, rows)
 
 
 def _place(order: list[str], flag: Flag) -> int:
@@ -79,7 +91,7 @@ def _place(order: list[str], flag: Flag) -> int:
     return order.index(kind) if kind in order else len(order)
 
 
-def ranges_table(screening: ScreeningResult) -> TextTable:
+def ranges_table(screening: ScreeningResult) -> Table:
     """Best lags by kind of signal, in the form of the thesis's Table 4.2."""
     rows = tuple(
         (
@@ -92,15 +104,15 @@ def ranges_table(screening: ScreeningResult) -> TextTable:
         for row in lag_ranges(screening)
     )
     columns = (
-        ("Kind of signal", ""), ("Best lags", "samples"), ("Median", "samples"), ("Leads", "share"),
-        ("Certain", "channels"),
+        Column("Kind of signal"), Column("Best lags", "samples"), Column("Median", "samples"), Column("Leads", "share"),
+        Column("Certain", "channels"),
     )  # fmt: skip
-    return TextTable(
+    return Table(
         "Lags by kind of signal: each unflagged channel against the target that it goes best with", columns, rows
     )
 
 
-def lags_table(screening: ScreeningResult) -> TextTable:
+def lags_table(screening: ScreeningResult) -> Table:
     """Best lag of each channel against each target, with the correlation there; brackets where it is not certain."""
     rows = []
     by_pair = {(curve.channel, curve.target): curve for curve in screening.lags}
@@ -108,8 +120,8 @@ def lags_table(screening: ScreeningResult) -> TextTable:
         curves = [by_pair.get((channel, target)) for target in screening.targets]
         if any(curve is not None for curve in curves):
             rows.append((channel, *(_cell(channel, curve) for curve in curves)))
-    columns = (("Channel", ""), *((target, "lag, correlation") for target in screening.targets))
-    return TextTable("Lag and correlation against each target", columns, tuple(rows))
+    columns = (Column("Channel"), *(Column(target, "lag, correlation") for target in screening.targets))
+    return Table("Lag and correlation against each target", columns, tuple(rows))
 
 
 def _cell(channel: str, curve: LagCurve | None) -> str:
@@ -119,16 +131,20 @@ def _cell(channel: str, curve: LagCurve | None) -> str:
     return text if curve.certain else f"({text})"
 
 
-def clusters_table(screening: ScreeningResult) -> TextTable:
+def clusters_table(screening: ScreeningResult) -> Table:
     """Collinear channels."""
     rows = tuple(
         (cluster.representative, number(cluster.least, 2), ", ".join(cluster.members)) for cluster in screening.clusters
     )
-    columns = (("Speaks for all", ""), ("Least rank correlation", "of two members"), ("Members", ""))
-    return TextTable("Channels that go together", columns, rows)
+    columns = (
+        Column("Speaks for all"),
+        Column("Least rank correlation", "of two members"),
+        Column("Members", is_text=True),
+    )
+    return Table("Channels that go together", columns, rows)
 
 
-def trials_table(trials: Mapping[str, Any]) -> TextTable:
+def trials_table(trials: Mapping[str, Any]) -> Table:
     """Held-out error of one network on each feature set, as `edp.workflows.feature_selection.trials.Trials.to_json`
     gives it.
     """
@@ -150,13 +166,13 @@ def trials_table(trials: Mapping[str, Any]) -> TextTable:
             *(c for h in horizons for c in (number(trials["persistence"][h], 3), MISSING)),
         )
     )
-    columns: tuple[tuple[str, str], ...] = (("Feature set", ""), ("Channels", ""), ("Parameters", ""))
+    columns: tuple[Column, ...] = (Column("Feature set"), Column("Channels"), Column("Parameters"))
     for horizon in horizons:
-        columns += ((f"MAE, {horizon} ahead", unit), ("Against the first", "95 % interval"))
-    return TextTable("Held-out error of one network on each set", columns, tuple(rows), frozenset({0}))
+        columns += (Column(f"MAE, {horizon} ahead", unit), Column("Against the first", "95 % interval"))
+    return Table("Held-out error of one network on each set", columns, tuple(rows), frozenset({0}))
 
 
-def stages_table(screening: ScreeningResult) -> TextTable:
+def stages_table(screening: ScreeningResult) -> Table:
     """Where the time went."""
     rows = tuple((stage, duration(seconds)) for stage, seconds in screening.seconds.items())
-    return TextTable("Time of the stages", (("Stage", ""), ("Time", "")), rows)
+    return Table("Time of the stages", (Column("Stage"), Column("Time")), rows)

@@ -31,11 +31,6 @@ AHEAD, RECORDING = "horizon", "recording"
 DOMAINS = {TARGET: "On the target's logs", SOURCE: "On the source's recordings"}
 
 
-def transfer_charts(facts: Transfer) -> list[Chart]:
-    """Every figure of the page: before and after in one."""
-    return [prediction_chart(facts, facts.pair), error_chart(facts, facts.pair), method_chart(facts)]
-
-
 def picture_charts(facts: Transfer) -> list[Chart]:
     """The figures of the thesis, one for before and one for after; predictions of the first recording."""
     charts = []

@@ -15,10 +15,10 @@ from safetensors.numpy import load_file
 
 from edp.errors import StorageError, count_of
 from edp.evaluation.guard import ErrorRatios, ErrorVerdict, best_verdict, by_recording
-from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.storage import read_json
 from edp.storage.headers import check_files
 from edp.storage.paths import is_file_at
+from edp.table import Column, Table, Value, figures
 from edp.wording import listed, number, percent, quantity, unit_text
 
 RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 2
@@ -118,12 +118,12 @@ def read_transfer(folder: str | Path) -> Transfer:
     return Transfer(content, shown, Path(folder))
 
 
-def sheets_of(facts: Transfer, horizon: str) -> list[Sheet]:
+def transfer_tables(facts: Transfer, horizon: str) -> list[Table]:
     """The two tables of a horizon."""
-    return [pair_sheet(facts, horizon), method_sheet(facts, horizon)]
+    return [pair_table(facts, horizon), method_table(facts, horizon)]
 
 
-def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
+def pair_table(facts: Transfer, horizon: str) -> Table:
     """A table in the form of Table 4.10: before and after, by target, with bias and skew."""
     rows: list[tuple[Value, ...]] = []
     for method in facts.pair:
@@ -140,14 +140,14 @@ def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
         shows[column] = figures([], signed=True, decimals=2)
     columns = (
         Column("Model variant"),
-        Column("Target"),
+        Column("Target", is_text=True),
         *(Column(head, of, show) for (head, of), show in zip(heads, shows, strict=True)),
     )
     after = frozenset(range(len(facts.targets), 2 * len(facts.targets)))
-    return Sheet(f"pair_k{horizon}", f"{facts.ahead(horizon)}, test part of the logs", columns, tuple(rows), after)
+    return Table(f"{facts.ahead(horizon)}, test part of the logs", columns, tuple(rows), after, name=f"pair_k{horizon}")
 
 
-def method_sheet(facts: Transfer, horizon: str) -> Sheet:
+def method_table(facts: Transfer, horizon: str) -> Table:
     """All methods on the same ticks, least error first, in both domains where both were judged."""
     direct = float(facts.score(facts.content["before"], horizon)["mae"])
     both = SOURCE in facts.domains
@@ -183,7 +183,7 @@ def method_sheet(facts: Transfer, horizon: str) -> Sheet:
         *([Column("MAE on the source", unit, figures([row[8] for row in rows]))] if both else []),
     )
     mark = frozenset({names.index(facts.content["method"])})
-    return Sheet(f"methods_k{horizon}", f"{facts.ahead(horizon)}, means over targets", columns, tuple(rows), mark)
+    return Table(f"{facts.ahead(horizon)}, means over targets", columns, tuple(rows), mark, name=f"methods_k{horizon}")
 
 
 def transfer_verdict(facts: Transfer) -> ErrorVerdict | None:

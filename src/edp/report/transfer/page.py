@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from edp.report.common.picture import write_pictures
-from edp.report.common.sheets import Sheet, write_sheets
-from edp.report.common.templates import template
-from edp.report.run.page import shown
+from edp.report.common.page import Page, Points, Section, write_report
 from edp.report.transfer import facts as words
-from edp.report.transfer.charts import picture_charts, transfer_charts
+from edp.report.transfer.charts import error_chart, method_chart, picture_charts, prediction_chart
 from edp.report.transfer.facts import Transfer, read_transfer
-from edp.storage import write_bytes
 from edp.storage.paths import full_path
-from edp.wording import unbroken
 
 
 def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
@@ -27,27 +21,57 @@ def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
         StorageError: the folder holds no transfer, or a file cannot be written.
     """
     facts = read_transfer(folder)
-    tables = [sheet for horizon in reversed(facts.horizons) for sheet in words.sheets_of(facts, horizon)]
-    page = facts.folder / "transfer.html"
-    write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
-    write_sheets(facts.folder / "tables", tables)
-    if pictures:
-        write_pictures(facts.folder / "pictures", picture_charts(facts))
-    return page
+    tables = [table for horizon in reversed(facts.horizons) for table in words.transfer_tables(facts, horizon)]
+    drawn = picture_charts(facts) if pictures else []
+    return write_report(build_transfer_page(facts), facts.folder / "transfer.html", tables, drawn)
 
 
-def render(facts: Transfer, tables: list[Sheet]) -> str:
-    """The page's text."""
-    context: dict[str, Any] = {
-        "title": full_path(facts.folder).name,
-        "network": facts.content["network"],
-        "headline": unbroken(words.headline(facts)),
-        "verdict": words.verdict(facts),
-        "tiles": words.tiles(facts),
-        "caveats": words.caveats(facts),
-        "pairs": [sheet.table() for sheet in tables if sheet.name.startswith("pair")],
-        "methods": [sheet.table() for sheet in tables if sheet.name.startswith("methods")],
-        "both": words.SOURCE in facts.domains,
-        **shown(transfer_charts(facts)),
-    }
-    return template("transfer.html.jinja").render(**context)
+def build_transfer_page(facts: Transfer) -> Page:
+    """Return the page of a transfer."""
+    both = " On the source's own recordings too: what is gained in one domain may be lost in the other."
+    horizons = list(reversed(facts.horizons))
+    return Page(
+        title=full_path(facts.folder).name,
+        kind="transfer",
+        about=["transfer", facts.content["network"]],
+        headline=words.headline(facts),
+        verdict=words.verdict(facts),
+        tiles=words.tiles(facts),
+        sections=[
+            Section(
+                "pair",
+                "Before and after",
+                [
+                    "The network of the source as it is, and trained on; both on the same ticks of the target's test "
+                    "part. Bias is the mean of prediction minus truth; skew is the third standardised moment of the "
+                    "errors.",
+                    *(words.pair_table(facts, horizon) for horizon in horizons),
+                ],
+            ),
+            Section(
+                "predictions",
+                "Predictions",
+                ["The stretches of the test part in which the targets move most.", prediction_chart(facts, facts.pair)],
+            ),
+            Section(
+                "errors",
+                "Errors",
+                [
+                    "Share of samples by prediction minus truth. A curve that stands beside zero is a bias.",
+                    error_chart(facts, facts.pair),
+                ],
+            ),
+            Section(
+                "methods",
+                "All methods",
+                [
+                    f"Same logs, same split, same ticks.{both if words.SOURCE in facts.domains else ''}",
+                    method_chart(facts),
+                    *(words.method_table(facts, horizon) for horizon in horizons),
+                ],
+                "Methods",
+            ),
+            Section("reading", "What it can and cannot show", [Points(words.caveats(facts))], "What it can show"),
+        ],
+        footer="Its pictures and tables lie beside it.",
+    )

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from edp.evaluation.scores_file import COUNT, NUMBER, REAL, KeyedObject, Leaf, Listed, read_shaped
-from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.storage.paths import is_file_at
+from edp.table import Column, Table, Value, figures
 
 CANDIDATES = "candidates.json"
 MOST_CANDIDATES = 100
@@ -52,7 +52,7 @@ def choice_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
     return f"{text}; {least['label']} {beside} ({least['error']:.2f})."
 
 
-def candidate_sheet(rows: Sequence[Mapping[str, Any]]) -> Sheet:
+def candidate_sheet(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The candidates as a table, the chosen one marked."""
     lines: list[tuple[Value, ...]] = [(row["label"], row["error"], row["seconds"], row["why"]) for row in rows]
     marked = frozenset(i for i, row in enumerate(rows) if row["chosen"])
@@ -67,4 +67,4 @@ def candidate_sheet(rows: Sequence[Mapping[str, Any]]) -> Sheet:
     caption = (
         "Candidates on free runs that their fits had not seen: the simplest one that is as good as the best is kept"
     )
-    return Sheet("candidates", caption, heads, tuple(lines), marked)
+    return Table(caption, heads, tuple(lines), marked, name="candidates")

@@ -28,11 +28,11 @@ from edp.evaluation.scores_file import (
     Shape,
     read_shaped,
 )
-from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.storage import read_object
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_file_at
+from edp.table import Column, Table, Value, figures
 from edp.wording import figure, listed, number, percent, short_labels
 
 CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
@@ -332,7 +332,7 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     return rows
 
 
-def sheets_of(facts: FreeRunFacts) -> dict[str, Sheet]:
+def free_run_tables(facts: FreeRunFacts) -> dict[str, Table]:
     """Every table by name; those of which nothing is known are left out."""
     twin = facts.twin
     sheets = [
@@ -362,7 +362,7 @@ def _worst(summaries: Mapping[str, Any]) -> dict[str, Any]:
 
 def _summary_sheet(
     name: str, caption: str, first: str, summaries: Mapping[str, Any], marked: frozenset[int] = frozenset()
-) -> Sheet:
+) -> Table:
     """A row of errors for each of several sets of runs."""
     rows: list[tuple[Value, ...]] = []
     heads: list[tuple[str, str]] = []
@@ -380,10 +380,10 @@ def _summary_sheet(
     titles = [titles[i] for i in full]
     shown = [Column(title, u, figures(row[2 + i] for row in rows)) for i, (title, u) in enumerate(titles)]
     count = Column("Runs", "", figures([], decimals=0))
-    return Sheet(name, caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked)
+    return Table(caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked, name=name)
 
 
-def _situation_sheet(twin: Mapping[str, Any]) -> Sheet:
+def _situation_sheet(twin: Mapping[str, Any]) -> Table:
     rows: list[tuple[Value, ...]] = []
     for name, row in twin["situations"].items():
         strokes = row.get("stroke_error", {"mean": None, "unit": None})
@@ -394,10 +394,10 @@ def _situation_sheet(twin: Mapping[str, Any]) -> Sheet:
     titles = [("Velocity MAE", velocity), ("Stroke error", stroke), ("Pressure NRMSE", "")]
     shown = [Column(title, unit, figures(row[2 + i] for row in rows)) for i, (title, unit) in enumerate(titles)]
     heads = (Column("What the actuator did"), Column("Share of the time"), *shown)
-    return Sheet("situations", "At end stops, at rest and in motion", heads, tuple(rows))
+    return Table("At end stops, at rest and in motion", heads, tuple(rows), name="situations")
 
 
-def _coverage_sheet(intervals: Mapping[str, Any]) -> Sheet:
+def _coverage_sheet(intervals: Mapping[str, Any]) -> Table:
     parts = [part for part in PARTS if intervals["at"] and part in intervals["at"][0]]
     rows: list[tuple[Value, ...]] = []
     heads: list[Column] = [Column("After")]
@@ -409,10 +409,10 @@ def _coverage_sheet(intervals: Mapping[str, Any]) -> Sheet:
         cells = [cell for part in parts for cell in (percent(row[part]["share"]), row[part]["half_width"]["mean"])]
         rows.append((f"{figure(row['at_s'])} s", *cells))
     caption = f"Share of the free runs whose truth lies in intervals meant to hold {percent(intervals['coverage'])}"
-    return Sheet("intervals", caption, tuple(heads), tuple(rows))
+    return Table(caption, tuple(heads), tuple(rows), name="intervals")
 
 
-def _ahead_sheet(facts: FreeRunFacts) -> Sheet:
+def _ahead_sheet(facts: FreeRunFacts) -> Table:
     first = facts.twin["ahead"]
     caption = f"{figure(first['seconds'])} s ahead of measured ports, told the commands in between"
     if mixed_units(facts.twin):
@@ -425,10 +425,10 @@ def _ahead_sheet(facts: FreeRunFacts) -> Sheet:
     units = (first["velocity_mae"]["unit"] or "", first["stroke_error"]["unit"] or "", "")
     titles = ("Velocity MAE", "Stroke error", "Pressure NRMSE")
     shown = [Column(t, u, figures(r[1 + i] for r in rows)) for i, (t, u) in enumerate(zip(titles, units, strict=True))]
-    return Sheet("ahead", caption, (Column("Model"), *shown), tuple(rows), frozenset({0}))
+    return Table(caption, (Column("Model"), *shown), tuple(rows), frozenset({0}), name="ahead")
 
 
-def _beside_sheet(beside: Mapping[str, Any]) -> Sheet:
+def _beside_sheet(beside: Mapping[str, Any]) -> Table:
     rows: list[tuple[Value, ...]] = [
         (part, row["twin"]["unit"], row["twin"]["mean"], row["predictor"]["mean"])
         for part, row in beside["errors"].items()
@@ -443,7 +443,7 @@ def _beside_sheet(beside: Mapping[str, Any]) -> Sheet:
     caption = (
         f"Beside a look-ahead predictor, {figure(beside['seconds'])} s ahead at the same {beside['moments']:,} moments"
     )
-    return Sheet("beside", caption, heads, tuple(rows))
+    return Table(caption, heads, tuple(rows), name="beside")
 
 
 def mixed_units(scores: Mapping[str, Any]) -> bool:
@@ -451,7 +451,7 @@ def mixed_units(scores: Mapping[str, Any]) -> bool:
     return bool(scores["velocity_mae"].get("units"))
 
 
-def actuator_sheet(models: Mapping[str, Mapping[str, Any]]) -> Sheet:
+def actuator_sheet(models: Mapping[str, Mapping[str, Any]]) -> Table:
     """A row for each actuator and model: errors of its velocity, and of its stroke by time, with their units."""
     columns = {
         name: [("Velocity MAE", one["velocity_mae"])]
@@ -461,7 +461,7 @@ def actuator_sheet(models: Mapping[str, Mapping[str, Any]]) -> Sheet:
     return _by_actuator("actuators", "The twin and its floors, each actuator in its units", columns)
 
 
-def ahead_by_actuator(models: Mapping[str, Mapping[str, Any]], caption: str) -> Sheet:
+def ahead_by_actuator(models: Mapping[str, Mapping[str, Any]], caption: str) -> Table:
     """The same a few ticks ahead of measured ports."""
     columns = {
         name: [("Velocity MAE", one["ahead"]["velocity_mae"]), ("Stroke error", one["ahead"]["stroke_error"])]
@@ -471,7 +471,7 @@ def ahead_by_actuator(models: Mapping[str, Mapping[str, Any]], caption: str) -> 
     return _by_actuator("ahead", caption, columns)
 
 
-def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]]) -> Sheet:
+def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]]) -> Table:
     """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
     first = next(iter(columns.values()))
     rows: list[tuple[Value, ...]] = []
@@ -485,7 +485,7 @@ def _by_actuator(name: str, caption: str, columns: Mapping[str, Sequence[tuple[s
             rows.append((velocity, model, *cells))
     titles = [title for title, row in first if row["by_channel"]]
     heads = tuple(Column(title) for title in ("Actuator", "Model", *titles))
-    return Sheet(name, caption, heads, tuple(rows), frozenset(range(0, len(rows), len(columns))))
+    return Table(caption, heads, tuple(rows), frozenset(range(0, len(rows), len(columns))), name=name)
 
 
 def actuator_tiles(twin: Mapping[str, Any]) -> list[tuple[str, str, str]]:

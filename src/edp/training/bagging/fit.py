@@ -28,7 +28,7 @@ from edp.training.bagging.perceptrons import CheckedErrors, PerceptronLearner, l
 from edp.training.bagging.radial import RadialLearner
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.stacking import stacking_weights
-from edp.training.bagging.table import Table, committee_of, table_of
+from edp.training.bagging.table import BaggingTable, committee_of, table_of
 from edp.training.outcome import Fitted, TrainingProgress
 from edp.training.spec import TrainingSpec, check_training, thread_count
 
@@ -49,7 +49,7 @@ class Bagged:
     fitted: Fitted
     left_out: DoubleArray
     linear: DoubleArray
-    table: Table
+    table: BaggingTable
 
     def at_every_tick(self, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
         """Return left-out predictions of each segment at every sample, standardised ``(tick, output)``.
@@ -111,7 +111,7 @@ def fit_in_folds(
     return fitted
 
 
-def _fit_linear(net: Predictor, table: Table) -> FoldRidge:
+def _fit_linear(net: Predictor, table: BaggingTable) -> FoldRidge:
     """Fit the linear models: present values, then changes over more and more spans, then all columns."""
     bank = committee_of(net).bank
     counts = [*range(len(bank.lags) + 1), *([len(bank.spans)] if bank.smoothed else [])]

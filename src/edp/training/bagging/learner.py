@@ -14,7 +14,7 @@ from edp.data.lags import DoubleArray
 from edp.data.prepared import Prepared
 from edp.networks.predictor import Predictor
 from edp.training.bagging.spec import BaggingSpec
-from edp.training.bagging.table import Table
+from edp.training.bagging.table import BaggingTable
 from edp.training.outcome import TrainingProgress
 from edp.training.spec import TrainingSpec
 
@@ -36,7 +36,7 @@ class FoldFit:
     net: Predictor
     data: Prepared
     spec: TrainingSpec
-    table: Table
+    table: BaggingTable
     linear: FoldRidge
     tell: Callable[[TrainingProgress], None]
     history: list[dict[str, Any]] = field(default_factory=list)

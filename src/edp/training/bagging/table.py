@@ -34,7 +34,7 @@ few steps of noise or drift; a line through them says nothing of the axis in mot
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class BaggingTable:
     """Rows of all segments, concatenated.
 
     Attributes:
@@ -78,7 +78,7 @@ def committee_of(net: Predictor) -> Committee:
     return net.backbone
 
 
-def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
+def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> BaggingTable:
     """Rows of the training and validation parts as the network sees them; its bank then gives changes of unit spread.
 
     Raises:
@@ -132,13 +132,13 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     whole = _whole_recordings(stretches, data.test, lengths, spec.folds)
     starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), firsts, strict=True)
     if whole is not None:
-        return Table(columns, targets, whole, stride, tuple(starts))
+        return BaggingTable(columns, targets, whole, stride, tuple(starts))
     pieces = _pieces(rows / spec.folds, data.test, reach, stride)
     # Rows within the bank's reach and the largest horizon of a fold share samples with it. Beside pieces as short as
     # what tests there is the gap that lies beside that (`prepare`): wider ones would cost a third of what trains.
     gap = math.ceil(((net.spec.window if pieces > 1 else bank.reach) + reach) / stride)
     gap = min(gap, max(1, sum(lengths) // (4 * spec.folds * pieces)))
-    return Table(columns, targets, blocked_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
+    return BaggingTable(columns, targets, blocked_folds(lengths, spec.folds, gap, pieces), stride, tuple(starts))
 
 
 def _limits(columns: NDArray[np.float32], present: int) -> tuple[torch.Tensor, torch.Tensor]:

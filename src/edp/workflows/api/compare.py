@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from edp.report.common.tables import TextTable
-from edp.report.compare.page import error_sheet, write_compare_page
+from edp.report.compare.page import build_compare_page, error_table
 from edp.report.compare.paired import Comparison, compare_runs
 from edp.report.notebook import html_of, text_of
+from edp.table import Table
 from edp.workflows.api.frames import OneFrame
 
 
@@ -40,7 +40,7 @@ class ComparedRuns(OneFrame):
         Raises:
             StorageError: it cannot be written.
         """
-        return write_compare_page(self._comparison, target, title)
+        return build_compare_page(self._comparison, title).write(target)
 
     def _columns(self) -> dict[str, list[Any]]:
         of = self._comparison
@@ -56,8 +56,8 @@ class ComparedRuns(OneFrame):
                     columns[key].append(value)
         return columns
 
-    def _tables(self) -> list[TextTable]:
-        return [error_sheet(self._comparison, measure).table() for measure in self._comparison.measures]
+    def _tables(self) -> list[Table]:
+        return [error_table(self._comparison, measure) for measure in self._comparison.measures]
 
     def __repr__(self) -> str:
         """Return the headline and the tables as text."""

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError, closest, count_of
 from edp.recording import FloatArray, Recording
-from edp.report.common.tables import TextTable
 from edp.report.notebook import BandLine, html_of, prediction_figure, text_of
 from edp.report.run.figures import aligned
 from edp.signals import KINDS, Channel, Kind
+from edp.table import Column, Table
 from edp.wording import typed
 from edp.workflows.api.frames import OneFrame
 
@@ -118,13 +118,13 @@ class Predictions(OneFrame):
                         columns[f"{name} {word} {coverage:g}"] = np.concatenate(parts)
         return columns
 
-    def _table(self) -> TextTable:
+    def _table(self) -> Table:
         rows = tuple((entry.name, f"{entry.samples:,}", f"{entry.duration_s:,.1f}") for entry in self.recordings)
         targets = [f"{name} [{KINDS[kind].si_unit}]" for name, kind in zip(self.targets, self.kinds, strict=True)]
         ahead = f"{', '.join(map(str, self.horizons))} sample(s) ahead"
         intervals = "".join(f", interval {typed(coverage)}" for coverage in self.coverages)
         caption = f"Predictions of {', '.join(targets)}, {ahead}{intervals}"
-        return TextTable(caption, (("Recording", ""), ("Samples", ""), ("Duration", "s")), rows)
+        return Table(caption, (Column("Recording"), Column("Samples"), Column("Duration", "s")), rows)
 
     def __repr__(self) -> str:
         """Return a summary table as text."""

@@ -18,10 +18,10 @@ from edp.networks.predictor import Predictor
 from edp.networks.running import stream_intervals, stream_predictions
 from edp.recording import Recording
 from edp.report import Facts, read_facts
-from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, text_of
 from edp.signals import KINDS
 from edp.storage.paths import is_file_at
+from edp.table import Column, Table
 from edp.training import load_bundle
 from edp.wording import typed
 from edp.workflows import deployment, train_evaluate
@@ -208,7 +208,7 @@ class TrainedPredictor:
         judged = train_evaluate.judge_bundle(bundle, data, JudgeSpec(baselines=()))
         return JudgedScores(Facts(folder=self.folder, scores=judged.scores))
 
-    def _table(self) -> TextTable:
+    def _table(self) -> Table:
         ahead = ", ".join(f"{k} ({typed(1000 * k / self.rate_hz)} ms)" for k in self.horizons)
         parameters = sum(parameter.numel() for parameter in self._bundle.predictor.parameters())
         rows = (
@@ -218,7 +218,7 @@ class TrainedPredictor:
             ("Parameters", f"{parameters:,}"),
             ("Folder", str(self.folder)),
         )
-        return TextTable("Trained predictor", (("", ""), ("", "")), rows)
+        return Table("Trained predictor", (Column(""), Column("")), rows)
 
     def __repr__(self) -> str:
         """Return a summary table as text."""

@@ -17,11 +17,11 @@ from edp.logs.repair import Repair
 from edp.logs.source import DataSource, load_signal_map, map_of_table
 from edp.logs.store import is_store
 from edp.recording import FloatArray, Recording
-from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, recordings_figure, text_of
 from edp.settings.bounds import SEED, between, check_bounds
 from edp.settings.tree import build
 from edp.signals import SignalMap
+from edp.table import Column, Table
 from edp.wording import typed
 from edp.workflows.api.arguments import check_together, check_width, matrix_of, names_of, units_of
 from edp.workflows.api.frames import columns_of, frame_of
@@ -252,15 +252,15 @@ class Recordings(Sequence[Recording]):
         """Return recordings and channels as HTML for a notebook."""
         return html_of(self._tables())
 
-    def _tables(self) -> list[TextTable]:
+    def _tables(self) -> list[Table]:
         shown = self._recordings[:SHOWN_RECORDINGS]
         more = f", the first {len(shown)} of {len(self)}" if len(shown) < len(self) else ""
         rows = tuple((r.name, f"{r.samples:,}", f"{r.duration_s:,.1f}") for r in shown)
-        columns = (("Recording", ""), ("Samples", ""), ("Duration", "s"))
+        columns = (Column("Recording"), Column("Samples"), Column("Duration", "s"))
         channels = tuple((c.name, str(c.kind), c.unit, c.description) for c in self._recordings[0].channels)
         return [
-            TextTable(f"Recordings at {typed(self.rate_hz)} Hz{more}", columns, rows),
-            TextTable("Channels", (("Channel", ""), ("Kind", ""), ("SI unit", ""), ("Description", "")), channels),
+            Table(f"Recordings at {typed(self.rate_hz)} Hz{more}", columns, rows),
+            Table("Channels", (Column("Channel"), Column("Kind"), Column("SI unit"), Column("Description")), channels),
         ]
 
 

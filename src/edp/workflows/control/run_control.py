@@ -20,7 +20,7 @@ from edp.jobs import IN_PROCESS, Workers
 from edp.jobs.workers import UNITS, forget_units
 from edp.logs import write_recording
 from edp.progress import SILENT, Progress
-from edp.report import ControlFacts, write_control_page
+from edp.report import ControlFacts, build_control_page
 from edp.report.animation.page import scene_of
 from edp.report.common.provenance import provenance_rows
 from edp.storage import make_folder, write_json
@@ -96,7 +96,7 @@ def control_loops(
             "predictor": str(chosen.predictor or ""),
         }
         write_json(run.file(PROVENANCE), provenance)
-        page = write_control_page(_facts(run.path.name, content, results, provenance), run.file(PAGE))
+        page = build_control_page(_facts(run.path.name, content, results, provenance)).write(run.file(PAGE))
     forget_units(units)
     return ControlRun(content, results, page)
 

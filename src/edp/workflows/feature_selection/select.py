@@ -140,7 +140,7 @@ def select_features(
         files["pictures"] = folder / "pictures"
     title = source.short_name
     tried = None if trials is None else trials.to_json()
-    files["page"] = build_screening_page(screening, folder / "report.html", title, quality, tried, notes)
+    files["page"] = build_screening_page(screening, title, quality, tried, notes).write(folder / "report.html")
     return Selection(screening, quality, tuple(notes), sets, files, trials)
 
 

@@ -21,7 +21,7 @@ from edp.networks.running import stream_errors
 from edp.progress import SILENT, Progress
 from edp.recording import Recording
 from edp.report.fleet.facts import FleetFacts, fleet_facts
-from edp.report.fleet.page import write_fleet_page
+from edp.report.fleet.page import build_fleet_page
 from edp.report.fleet.result import (
     ErrorDrift,
     FleetReport,
@@ -112,7 +112,7 @@ def report_fleet(
     )
     write_json(folder / RESULT, report.to_json())
     facts = fleet_facts(report, full_path(Path(question.store)).name)
-    write_fleet_page(facts, folder / PAGE)
+    build_fleet_page(facts).write(folder / PAGE)
     forget_units(folder / UNITS)
     return facts
 

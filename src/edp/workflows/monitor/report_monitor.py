@@ -15,7 +15,7 @@ from edp.monitor.diagnosis.structure import MOST_PAIRS, confusion_of
 from edp.monitor.traces import read_traces
 from edp.report.common.provenance import provenance_rows
 from edp.report.monitor.facts import AlarmFacts, MonitorFacts
-from edp.report.monitor.page import write_monitor_page
+from edp.report.monitor.page import build_monitor_page
 from edp.storage import JSON_BYTES, object_with, parse_json, read_object, read_text
 from edp.storage.headers import check_files
 from edp.storage.paths import full_path, is_there
@@ -46,7 +46,7 @@ def report_monitor(
     """
     folder = Path(run)
     facts = read_run(folder, title)
-    return write_monitor_page(facts, Path(out) if out is not None else folder / PAGE), facts
+    return build_monitor_page(facts).write(Path(out) if out is not None else folder / PAGE), facts
 
 
 def read_run(folder: Path, title: str | None = None) -> MonitorFacts:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from edp.config.experiment import Experiment, experiment_toml
+from edp.config.experiment import Experiment, Table, experiment_toml
 from edp.data.frozen import ByFrozen, Session
 from edp.data.prepared import Prepared, prepare
 from edp.evaluation.footprint import footprint
@@ -101,7 +101,7 @@ def write_networks(
     return written
 
 
-def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: Prepared, facts: dict[str, Any]) -> None:
+def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: Prepared, facts: Table) -> None:
     # The recipe is part of the key: another recipe of the same settings is another run.
     key = run_key({"experiment": experiment_toml(experiment), "made by": facts["search"]}, data.digest)
     with Run.create(folder, "network", key, experiment_toml(experiment)) as run:
@@ -110,7 +110,7 @@ def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: P
         save_bundle(make_bundle(network, data, facts), run.file("bundle"))
 
 
-def _provenance(source: DataSource, experiment: Experiment, data: Prepared, recipe: Recipe) -> dict[str, Any]:
+def _provenance(source: DataSource, experiment: Experiment, data: Prepared, recipe: Recipe) -> Table:
     training, split = experiment.training, experiment.split
     frozen = split.frozen if isinstance(split, ByFrozen) else {}
     facts = {

@@ -18,7 +18,7 @@ from edp.logs.as_before import read_as_before
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
 from edp.recording import Recording
-from edp.report import FreeRunFacts, write_rollout_plots, write_twin_page
+from edp.report import FreeRunFacts, build_twin_page, write_rollout_plots
 from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
@@ -120,7 +120,7 @@ def rollout_log(run: str | Path, source: DataSource, request: RolloutRequest) ->
     if request.page is not None:
         content = {"channels": channel_facts(twin.channels), "models": {"twin": result.scores}}
         title = f"{recording.name} from {typed(result.start_s)} s"
-        write_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals)), request.page)
+        build_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals))).write(request.page)
     return result
 
 

@@ -1,47 +1,25 @@
-"""The tables of the report, worded: columns with units, cells as text, the network's row marked."""
+"""Tables and key figures of a run's page; the network's row is marked."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
+
+from markupsafe import Markup
 
 from edp.errors import count_of
 from edp.evaluation.guard import MEASURE, MEASURE_NAME
 from edp.report.run.facts import NETWORK, Facts, budget_rows, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
+from edp.table import Column, Table, Value
 from edp.wording import MISSING, count_text, decimals_for, duration, number, percent, unit_text
 
-
-@dataclass(frozen=True)
-class TextTable:
-    """Text in rows; the first column is a name, the others are right-aligned figures.
-
-    Attributes:
-        columns: (heading, unit) of each column.
-        marked: Places of the rows that are the network's.
-    """
-
-    caption: str
-    columns: tuple[tuple[str, str], ...]
-    rows: tuple[tuple[str, ...], ...]
-    marked: frozenset[int] = frozenset()
-
-    @property
-    def filled(self) -> TextTable:
-        """Table without the columns that are empty in every row, such as pressures of a machine without them."""
-        filled_places = [i for i in range(len(self.columns)) if not i or any(row[i] != MISSING for row in self.rows)]
-        if not self.rows or len(filled_places) == len(self.columns):
-            return self
-        columns = tuple(self.columns[i] for i in filled_places)
-        return replace(self, columns=columns, rows=tuple(tuple(row[i] for i in filled_places) for row in self.rows))
-
-
+FITS, EXCEEDS = "✓ fits", "✗ exceeds"
 _TILES = 3
 """Outputs that have a tile of their own where they have no common unit."""
 
 
-def comparison_tables(facts: Facts) -> list[TextTable]:
+def comparison_tables(facts: Facts) -> list[Table]:
     """Metrics of every model, one table per horizon, the headline's horizon first.
 
     Means over outputs where they have one unit, else the error of each output.
@@ -52,16 +30,16 @@ def comparison_tables(facts: Facts) -> list[TextTable]:
     return [table for table in (_comparison(facts, horizon) for horizon in order) if table.rows]
 
 
-def _comparison(facts: Facts, horizon: int) -> TextTable:
+def _comparison(facts: Facts, horizon: int) -> Table:
     rows = comparison_rows(facts, horizon)
     unit = facts.unit
     shown = [metric for metric in ("rmse", "mae", "p95", "p99", "composite") if _any(rows, metric)]
     places = {metric: decimals_for(row[metric] for row in rows) for metric in shown}
     names = {"mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99", "composite": "Composite"}
     with_bias, with_r2, with_time = _any(rows, "bias"), _any(rows, "r2"), _any(rows, "seconds")
-    columns = [("Model", ""), *((names[metric], unit) for metric in shown)]
-    columns += [("Bias", unit)] * with_bias + [("R²", "")] * with_r2
-    columns += [("Network relative to it", MEASURE_NAME)] + [("Fitted in", "")] * with_time
+    columns = [Column("Model"), *(Column(names[metric], unit) for metric in shown)]
+    columns += [Column("Bias", unit)] * with_bias + [Column("R²")] * with_r2
+    columns += [Column("Network relative to it", MEASURE_NAME)] + [Column("Fitted in")] * with_time
     lines = []
     for row in rows:
         cells = [row["label"], *(number(row[metric], places[metric]) for metric in shown)]
@@ -71,19 +49,19 @@ def _comparison(facts: Facts, horizon: int) -> TextTable:
         cells += [duration(row["seconds"])] * with_time
         lines.append(tuple(cells))
     marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
-    return TextTable(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
+    return Table(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
 
 
 def _any(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
     return any(row[key] is not None for row in rows)
 
 
-def output_table(facts: Facts) -> TextTable | None:
+def output_table(facts: Facts) -> Table | None:
     """Error by output at the longest horizon; None where `comparison_tables` shows it already."""
     return _by_output(facts, main_horizon(facts)) if facts.averaged else None
 
 
-def _by_output(facts: Facts, horizon: int | None) -> TextTable | None:
+def _by_output(facts: Facts, horizon: int | None) -> Table | None:
     rows = comparison_rows(facts, horizon)
     if horizon is None or not rows or len(facts.targets) < 2:
         return None
@@ -91,12 +69,12 @@ def _by_output(facts: Facts, horizon: int | None) -> TextTable | None:
     places = {name: decimals_for(row["outputs"][name] for row in rows) for name in names}
     lines = tuple((row["label"], *(number(row["outputs"][name], places[name]) for name in names)) for row in rows)
     units = [unit_text(target.unit) for target in facts.targets]
-    columns = (("Model", ""), *((target.description, unit) for target, unit in zip(facts.targets, units)))
+    columns = (Column("Model"), *(Column(target.description, unit) for target, unit in zip(facts.targets, units)))
     marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
-    return TextTable(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
+    return Table(f"{MEASURE_NAME} by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
 
 
-def interval_table(facts: Facts) -> TextTable | None:
+def interval_table(facts: Facts) -> Table | None:
     """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
     intervals = facts.models.get(NETWORK, {}).get("intervals", {})
     rows = [(k, row) for k in facts.horizons for row in intervals.get(str(k), ())]
@@ -112,7 +90,7 @@ def interval_table(facts: Facts) -> TextTable | None:
         )
         for k, row in rows
     )
-    columns = (("Interval", ""), ("Meant to hold", ""), ("Holds", ""), ("Mean width", facts.unit))
+    columns = (Column("Interval"), Column("Meant to hold"), Column("Holds"), Column("Mean width", facts.unit))
     caption = "The network's intervals: share of the truth inside, mean over outputs"
     scores = facts.models[NETWORK].get("weighted_interval_score", {})
     if scores:
@@ -122,10 +100,10 @@ def interval_table(facts: Facts) -> TextTable | None:
             if str(k) in scores
         )
         caption += f"; weighted interval score (a point's is its MAE) {listed}"
-    return TextTable(caption, columns, lines)
+    return Table(caption, columns, lines)
 
 
-def worst_recordings_table(facts: Facts, most: int = 10) -> TextTable | None:
+def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
     """The recordings on which the network does worst, worst first."""
     horizon = main_horizon(facts)
     if horizon is None or NETWORK not in facts.models:
@@ -137,64 +115,63 @@ def worst_recordings_table(facts: Facts, most: int = 10) -> TextTable | None:
     places = decimals_for(errors[NETWORK]) if NETWORK in errors else 2
     picked = list(range(len(order)))[::-1][:most]
     lines = tuple((order[i], *(number(errors[name][i], places) for name in models)) for i in picked)
-    columns = (("Recording", ""), *((label_of(facts, name), facts.unit) for name in models))
-    return TextTable(
+    columns = (Column("Recording"), *(Column(label_of(facts, name), facts.unit) for name in models))
+    return Table(
         f"The {count_of(len(picked), 'hardest recording')}, {horizon_text(facts, horizon)} ahead", columns, lines
     )
 
 
-@dataclass(frozen=True)
-class Check:
-    """One line of the budget: how much of it is used."""
-
-    what: str
-    value: str
-    limit: str
-    unit: str
-    share: float | None
-    fits: bool
-    note: str
-
-    @property
-    def share_text(self) -> str:
-        """The share used, as a percentage."""
-        return percent(self.share)
-
-
-def budget_checks(facts: Facts) -> list[Check]:
-    """The footprint against each limit of the budget."""
-    checks = []
+def budget_table(facts: Facts) -> Table:
+    """Return the footprint against each limit of the budget; a table without rows if there is no budget."""
+    rows = []
     for row in budget_rows(facts.footprint):
         value, limit = row.get("value"), row.get("limit")
         # No share of a limit that is zero or unknown.
         share = value / limit if value is not None and limit else None
-        checks.append(
-            Check(
-                str(row["what"]),
-                _amount(value),
-                _amount(limit),
-                str(row.get("unit") or ""),
-                share,
-                bool(row["fits"]),
-                str(row.get("note") or ""),
-            )
-        )
-    return checks
+        verdict, unit, note = FITS if row["fits"] else EXCEEDS, str(row.get("unit") or ""), str(row.get("note") or "")
+        rows.append((str(row["what"]), _amount(value), _amount(limit), unit, share, verdict, note))
+    columns = (
+        Column("Resource"),
+        Column("Needed"),
+        Column("Allowed"),
+        Column("Unit", is_text=True),
+        Column("Share used", show=_meter),
+        Column("Verdict", show=_coloured, is_text=True),
+        Column("Note", is_text=True),
+    )
+    return Table("Budget", columns, tuple(rows))
+
+
+def _meter(share: Value) -> Markup:
+    """Return a bar of the share of a limit that is used, and the share in percent."""
+    text = percent(share if isinstance(share, float) else None)
+    if not isinstance(share, float):
+        return Markup(text)
+    bar = Markup('<span class="meter{}"><i style="width: {}%"></i></span><span class="share">{}</span>')
+    return bar.format(" over" if share > 1.0 else "", round(min(100.0 * share, 100.0), 1), text)
+
+
+def _coloured(verdict: Value) -> Markup:
+    return Markup('<span class="fits{}">{}</span>').format(" over" if verdict == EXCEEDS else "", verdict)
 
 
 def _amount(value: float | None) -> str:
     return count_text(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
 
 
-def parts_table(facts: Facts) -> TextTable | None:
+def part_table(facts: Facts) -> Table | None:
     """Parameters and multiply-accumulates of each part of the network."""
     rows = (facts.footprint or {}).get("rows", [])
     if not rows:
         return None
     keys = [key for key in ("parameters", "macs_tick", "macs_window") if any(row.get(key) is not None for row in rows)]
-    names = {"parameters": ("Parameters", ""), "macs_tick": ("Per tick", "MAC"), "macs_window": ("Per window", "MAC")}
+    names = {
+        "parameters": Column("Parameters"),
+        "macs_tick": Column("Per tick", "MAC"),
+        "macs_window": Column("Per window", "MAC"),
+    }
     lines = tuple((str(row["part"]), *(count_text(row.get(key)) for key in keys)) for row in rows)
-    return TextTable("By part", (("Part", ""), *(names[key] for key in keys)), lines)
+    return Table("By part", (Column("Part"), *(names[key] for key in keys)), lines)
 
 
 def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
@@ -237,9 +214,9 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
         tiles.append((percent(best["change"], signed=True), "", f"error against {best['label']}, the best baseline"))
     elif ours and ours["r2"] is not None:
         tiles.append((number(ours["r2"], 4), "", "R²"))
-    checks = budget_checks(facts)
+    checks = budget_rows(facts.footprint)
     if checks:
-        fitting = sum(check.fits for check in checks)
+        fitting = sum(bool(check["fits"]) for check in checks)
         tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
     elif (facts.provenance or {}).get("parameters") is not None:
         tiles.append((count_text((facts.provenance or {})["parameters"]), "", "parameters"))
