@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
 from edp.signals import Channel
+from edp.storage.reading import Table
 
 FloatArray = NDArray[np.float32]
 MACHINE = "machine"
@@ -67,7 +68,7 @@ class Recording:
     values: FloatArray
     rate_hz: float
     source: str = ""
-    meta: Mapping[str, Any] = field(default_factory=dict)
+    meta: Table = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or self.values.shape[1] != len(self.channels):

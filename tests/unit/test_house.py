@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+OPEN_DICTIONARIES = 221
 WIDE_FUNCTIONS = 46
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
@@ -53,6 +54,11 @@ def test_files_have_one_reason_to_change(house):
 def test_functions_of_many_parameters_become_fewer(house):
     """The target is 0; whoever narrows a function lowers the number."""
     assert len(house.wide_functions) <= WIDE_FUNCTIONS, house.wide_functions
+
+
+def test_open_dictionaries_become_fewer(house):
+    """Whoever types one lowers the number: result files are dataclasses, and values that nobody reads are `object`."""
+    assert house.open_dictionaries <= OPEN_DICTIONARIES
 
 
 def test_no_public_class_name_stands_twice(house):

@@ -27,6 +27,7 @@ from edp.cli.options import (
 from edp.cli.progress import Display, StageDisplay
 from edp.cli.quality import AtMostOption, show_between, verdict_text
 from edp.errors import count_of
+from edp.storage.reading import Table
 from edp.wording import figure, number, percent
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ class ScreeningDisplay:
 
     def __init__(self, shown: Bars, steps: Steps) -> None:
         self.shown, self.steps = shown, steps
-        self.bars: dict[str, Any] = {}
+        self.bars: Table = {}
         self.began: dict[str, tuple[float, float]] = {}
         self.shares: dict[str, float] = {}
         self.trained = False
@@ -231,7 +232,7 @@ def _show_trials(selection: Selection) -> None:
     out.print()
 
 
-def facts_of(selection: Selection) -> dict[str, Any]:
+def facts_of(selection: Selection) -> Table:
     """Return the result for scripts; the full result is in the files."""
     proposal = selection.screening.proposal
     return {

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 from edp.cli.options import LogsArgument, MapOption, RepairOption, check_effects, source_of
 from edp.errors import count_of
+from edp.storage.reading import Table
 from edp.wording import number
 
 if TYPE_CHECKING:
@@ -262,7 +263,7 @@ def _deploying(result: SearchResult) -> str:
     return f"edp export {run} --to c --out firmware/predictor"
 
 
-def _show_status(progress: dict[str, Any]) -> None:
+def _show_status(progress: Table) -> None:
     counts = progress["counts"]
     running = f"process {progress['holder']}" if progress["holder"] else "nobody now"
     out.print(
